@@ -250,9 +250,11 @@ FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& 
     int32_t *FHASH_RESTRICT const near = sums.near, *FHASH_RESTRICT const wide = sums.wide;
     int32_t *FHASH_RESTRICT const sides = sums.sides;
     int32_t* FHASH_RESTRICT const nearest = sums.nearest;
-    for (int begin = 0; begin < lanes; begin += VECTOR) {
+    // The compiler makes vectors of inner loops only whose length is a constant, with -fwrapv.
+    for (int64_t begin = 0; begin < lanes; begin += VECTOR) {
         FHASH_INDEPENDENT
-        for (int x = begin; x < begin + VECTOR; x++) {
+        for (int i = 0; i < VECTOR; i++) {
+            const int64_t x = begin + i;
             const int a_sides = a[x - 1] + a[x + 1];
             const int b_sides = b[x - 1] + b[x + 1], b_near = bp[x] + bf[x] + bn[x] + bs[x];
             const int d_sides = d[x - 1] + d[x + 1], d_near = dn[x] + ds[x];
@@ -299,28 +301,30 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
         const uint16_t* const up = row.reference_y[k] > 0 ? p - other.stride[2] : nothing;
         const bool has_down = row.reference_y[k] + 1 < other.size[2];
         const uint16_t* const down = has_down ? p + other.stride[2] : nothing;
-        auto around = [&](int i) FHASH_LAMBDA {
+        auto around = [&](int64_t i) FHASH_LAMBDA {
             return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
         };
         if (shift == 0 && last >= n3 - 1) {
-            for (int begin = 0; begin < lanes; begin += VECTOR) {
+            for (int64_t begin = 0; begin < lanes; begin += VECTOR) {
                 FHASH_INDEPENDENT
-                for (int x = begin; x < begin + VECTOR; x++) {
+                for (int i = 0; i < VECTOR; i++) {
+                    const int64_t x = begin + i;
                     const int sum = around(x);
                     expected[x] += REFERENCE * p[x] + AROUND * sum;
                     others[x] += seven(sum) * scale;
                 }
                 if (k) continue;
                 FHASH_INDEPENDENT
-                for (int x = begin; x < begin + VECTOR; x++) parent[x] = twelve(around(x));
+                for (int i = 0; i < VECTOR; i++) parent[begin + i] = twelve(around(begin + i));
             }
             continue;
         }
         int32_t *FHASH_RESTRICT const share = sums.share, *FHASH_RESTRICT const level = sums.level;
         const int needed = min((n3 - 1) >> shift, last) + 1;
-        for (int begin = 0; begin < needed; begin += VECTOR / 2) {
+        for (int64_t begin = 0; begin < needed; begin += VECTOR / 2) {
             FHASH_INDEPENDENT
-            for (int i = begin; i < begin + VECTOR / 2; i++) {
+            for (int n = 0; n < VECTOR / 2; n++) {
+                const int64_t i = begin + n;
                 const int sum = around(i);
                 share[i] = REFERENCE * p[i] + AROUND * sum;
                 level[i] = twelve(sum);
@@ -329,9 +333,10 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
         int done = 0;
         if (shift == 1 && 2 * needed >= n3) {
             done = 2 * needed;
-            for (int begin = 0; begin < needed; begin += VECTOR / 2) {
+            for (int64_t begin = 0; begin < needed; begin += VECTOR / 2) {
                 FHASH_INDEPENDENT
-                for (int i = begin; i < begin + VECTOR / 2; i++) {
+                for (int n = 0; n < VECTOR / 2; n++) {
+                    const int64_t i = begin + n;
                     const int digit = min(level[i], 6) * scale;
                     expected[2 * i] += share[i];
                     expected[2 * i + 1] += share[i];
@@ -340,8 +345,10 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
                 }
                 if (k) continue;
                 FHASH_INDEPENDENT
-                for (int i = begin; i < begin + VECTOR / 2; i++)
+                for (int n = 0; n < VECTOR / 2; n++) {
+                    const int64_t i = begin + n;
                     parent[2 * i] = parent[2 * i + 1] = level[i];
+                }
             }
         }
         for (int x = done; x < n3; x++) {
