@@ -2,7 +2,7 @@
 
 Candidates are coded on a sample at one step. The cost J = bytes + squared error / (0.8 step^2)
 decides, so that a transform of less error for the same bytes wins as well. The plane, time and z
-are decided one after the other.
+are decided one after the other, and then whether time needs a transform at all.
 """
 
 from __future__ import annotations
@@ -76,6 +76,7 @@ def choose_transform(
         _plane_trials(shape, bases),
         _line_trials(0, shape, bases),
         _line_trials(1, shape, bases),
+        _time_again(shape),
     )
     for changes in groups:
         changed = [_changed(axes, change) for change in changes]
@@ -138,6 +139,9 @@ def rough_transform(
     if bases.possible(*shape[1:]):
         own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
         trials = [own] if best[2] is not None else [axes, own]
+        if 0 not in known and best[1][0].basis is None and bases.possible(shape[0]):
+            # A basis along time may be good with bases in space alone.
+            trials.append((bases.along(0), *own[1:]))
         best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
     return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
 
@@ -185,6 +189,7 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
         _plane_trials(shape, bases),
         _line_trials(0, shape, bases),
         _line_trials(1, shape, bases),
+        _time_again(shape),
     )
     trials = 1 + sum(_changed(axes, change) != axes for group in groups for change in group)
     return trials, len(bases.fitted)
@@ -281,6 +286,16 @@ def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransfor
             yield {2: along_y, 3: along_x}
     if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}
+
+
+def _time_again(shape: Shape) -> Iterator[dict[int, AxisTransform]]:
+    """Yield what is tried along time once more, after the choice along z.
+
+    Of a thin shell that moves, steps have nothing in common; beside a wavelet along z that does no
+    good either, this was not seen.
+    """
+    if shape[0] > 1:
+        yield {0: NONE}
 
 
 def _line_trials(axis: int, shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
