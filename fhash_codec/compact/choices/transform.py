@@ -78,7 +78,10 @@ def choose_transform(
         _line_trials(1, shape, bases),
         _time_again(shape),
     )
+    along_z = axes[1]
     for changes in groups:
+        if changes is groups[-1] and axes[1] is along_z:
+            break  # nothing is new since time was chosen
         changed = [_changed(axes, change) for change in changes]
         trials = [
             *([axes] if math.isinf(lowest) else []),
@@ -179,6 +182,8 @@ def own_or_found(
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
 
+    The second look at time, which few series have, is not counted.
+
     shape: of a tile.
     in_memory: whether the series is, so that bases are possible.
     """
@@ -189,7 +194,6 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
         _plane_trials(shape, bases),
         _line_trials(0, shape, bases),
         _line_trials(1, shape, bases),
-        _time_again(shape),
     )
     trials = 1 + sum(_changed(axes, change) != axes for group in groups for change in group)
     return trials, len(bases.fitted)
