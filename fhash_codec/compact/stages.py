@@ -76,6 +76,8 @@ Candidates are compared at equal quality, and the step is searched once more for
 """
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
+LOST = 0.5
+"""Distance in dB from the promise from which on bases made anew lack directions it needs."""
 SAME_STEP = 0.1
 """Difference of log steps below which bases are not made anew."""
 
@@ -233,8 +235,11 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
         refitted = refit(sample, settings)
         if refitted is settings:
             break
-        step_before = settings.step
+        step_before, before = settings.step, (settings, outcome)
         settings, outcome = find_step(sample, refitted, coding, goal, tried=tried, close=close)
+        if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
+            settings, outcome = before
+            break
         if abs(math.log(settings.step / step_before)) < SAME_STEP:
             break
     if task.config.effort > 1:
@@ -381,7 +386,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES:
+    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES or sample.is_single:
         settings = _transform_of_large_tile(task, attempt)
     else:
         settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding))

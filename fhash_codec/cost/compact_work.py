@@ -27,7 +27,8 @@ from fhash_codec.compact.choices.head_prospects import (
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.choices.search import EXCHANGE
-from fhash_codec.compact.choices.tilings import PICKED_VERTICES, largest_tile
+from fhash_codec.compact.choices.tiling_trials import PICKED_VERTICES
+from fhash_codec.compact.choices.tilings import largest_tile
 from fhash_codec.compact.choices.transform import count_trials
 from fhash_codec.compact.stages import (
     LARGE,

@@ -2,7 +2,7 @@
 
 Candidates are coded on a sample at one step. The cost J = bytes + squared error / (0.8 step^2)
 decides, so that a transform of less error for the same bytes wins as well. The plane, time and z
-are decided one after the other.
+are decided one after the other, and then whether time needs a transform at all.
 """
 
 from __future__ import annotations
@@ -76,8 +76,12 @@ def choose_transform(
         _plane_trials(shape, bases),
         _line_trials(0, shape, bases),
         _line_trials(1, shape, bases),
+        _time_again(shape),
     )
+    along_z = axes[1]
     for changes in groups:
+        if changes is groups[-1] and axes[1] is along_z:
+            break  # nothing is new since time was chosen
         changed = [_changed(axes, change) for change in changes]
         trials = [
             *([axes] if math.isinf(lowest) else []),
@@ -138,6 +142,9 @@ def rough_transform(
     if bases.possible(*shape[1:]):
         own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
         trials = [own] if best[2] is not None else [axes, own]
+        if 0 not in known and best[1][0].basis is None and bases.possible(shape[0]):
+            # A basis along time may be good with bases in space alone.
+            trials.append((bases.along(0), *own[1:]))
         best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
     return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
 
@@ -174,6 +181,8 @@ def own_or_found(
 
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
+
+    The second look at time, which few series have, is not counted.
 
     shape: of a tile.
     in_memory: whether the series is, so that bases are possible.
@@ -281,6 +290,16 @@ def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransfor
             yield {2: along_y, 3: along_x}
     if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}
+
+
+def _time_again(shape: Shape) -> Iterator[dict[int, AxisTransform]]:
+    """Yield what is tried along time once more, after the choice along z.
+
+    Of a thin shell that moves, steps have nothing in common; beside a wavelet along z that does no
+    good either, this was not seen.
+    """
+    if shape[0] > 1:
+        yield {0: NONE}
 
 
 def _line_trials(axis: int, shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:

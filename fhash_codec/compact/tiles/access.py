@@ -50,6 +50,8 @@ LENGTHS = (1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)
 """Lengths in steps that tiles are tried at, approximately."""
 EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
 """Edges in space in vertices that tiles are tried at, approximately."""
+SHORTEST = 8
+"""Vertices of a tile along the longest axis in space, at least, where it alone is cut."""
 CUT_IN_SPACE = 6.0
 """Share of the bytes that a cut across space costs, times the vertices between such cuts.
 
@@ -79,8 +81,8 @@ class Tiling:
     """Bytes as a multiple of those of the best tiling; foretold where none was tried, and None for
     tiles that were asked for."""
     trials: list[TilingTrial] = field(default_factory=list)
-    part: Shape | None = None
-    """Shape of the part that the tilings were tried on; None for the whole series."""
+    parts: list[Shape] = field(default_factory=list)
+    """Shapes of the parts that the tilings were tried on; none for the whole series."""
 
     @property
     def best(self) -> Shape | None:
@@ -96,8 +98,8 @@ class Tiling:
             f"{' x '.join(map(str, trial.tile))} at {trial.size / least:.2f}"
             for trial in self.trials
         )
-        part = "" if self.part is None else f", on {' x '.join(map(str, self.part))} vertices"
-        return f"tried {told}{part}"
+        parts = " and ".join(" x ".join(map(str, part)) for part in self.parts)
+        return f"tried {told}{f', on parts of {parts} vertices' if parts else ''}"
 
 
 def region_vertices(shape: Shape, tile: Shape, region: int = REGION) -> float:
@@ -124,12 +126,15 @@ def burden(access: str, price: float, work: float) -> float:
     return math.log(price) + WORTH[access] * math.log2(work)
 
 
-def tiles_to_try(shape: Shape, max_vertices: int) -> list[Shape]:
+def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> list[Shape]:
     """Return tiles of at most some vertices, those of the fastest region first.
 
     Axes in space are cut into parts of about one edge, time into parts of about one length. Of the
     tiles whose regions take no more than FAST_ENOUGH vertices, only the one of the slowest is
     among them.
+
+    slabs: whether there are also tiles with cuts across the longest axes in space alone: where all
+        of space is too much, these have the fewest cuts.
     """
     lengths = {_part(shape[0], length, even=False) for length in (shape[0], *LENGTHS)}
     spaces = {
@@ -137,11 +142,41 @@ def tiles_to_try(shape: Shape, max_vertices: int) -> list[Shape]:
         for z, y, x in [shape[1:]]
         for edge in (max(shape[1:]), *EDGES)
     }
+    if slabs:
+        spaces |= {slab for space in spaces for slab in _slabs(shape, space)}
     tiles: list[Shape] = [(t, *space) for t in lengths for space in spaces]
+    if slabs:
+        tiles += [tile for t in lengths for tile in _largest_slabs(shape, t, max_vertices)]
     tiles = [tile for tile in tiles if prod(tile) <= max_vertices]
-    tiles = sorted(tiles, key=lambda tile: (region_vertices(shape, tile), tile))
+    tiles = sorted(set(tiles), key=lambda tile: (region_vertices(shape, tile), tile))
     fast = sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles)
     return tiles[max(fast - 1, 0) :]
+
+
+def _slabs(shape: Shape, space: tuple[int, int, int]) -> list[tuple[int, int, int]]:
+    """Return parts of space with the cuts of one part across the one or two longest axes alone."""
+    longest = sorted(range(3), key=lambda axis: (shape[1 + axis], axis), reverse=True)
+    slabs = []
+    for cut in (longest[:1], longest[:2]):
+        z, y, x = (space[axis] if axis in cut else shape[1 + axis] for axis in range(3))
+        slabs.append((z, y, x))
+    return slabs
+
+
+def _largest_slabs(shape: Shape, steps: int, max_vertices: int) -> list[Shape]:
+    """Return tiles of some steps with cuts across the longest axis in space alone.
+
+    They are as large as they may be.
+    """
+    across = max((1, 2, 3), key=lambda axis: (shape[axis], axis))
+    most = max_vertices * shape[across] // (steps * prod(shape[1:]))
+    if not SHORTEST <= most < shape[across]:
+        return []
+    tile = [steps, *shape[1:]]
+    parts = -(-shape[across] // (most - most % 2))
+    tile[across] = _part(shape[across], -(-shape[across] // parts))
+    t, z, y, x = tile
+    return [(t, z, y, x)]
 
 
 def part_of(tile: Shape, vertices: int) -> Shape:

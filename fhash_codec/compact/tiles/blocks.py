@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from itertools import product
 from math import prod
@@ -70,7 +70,9 @@ class Blocks:
     Attributes:
         shape: vertices of the box over all steps.
         tile: vertices of a tile; the last tile along an axis may reach beyond the box.
-        grid: number of tiles along each axis.
+        grid: number of tiles along each axis; along t, of all boxes together.
+        weights: of each box of this shape, one after the other: boxes of the series that it stands
+            for. A series itself is one box.
         dtype: type of the source, in the byte order of this machine. It is an integer type also
             where missing values made floats of integers.
         complete: whether all vertices of the box are in the coreset at all steps.
@@ -81,14 +83,14 @@ class Blocks:
         self.dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
         self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.complete = extent.samples == prod(self.shape)
+        self.weights: tuple[int, ...] = (1,)
         self._box = _BoxInMemory()
         self._cut(tile)
 
     def _cut(self, tile: Shape) -> None:
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
-        self.grid: Index = tuple(
-            -(-length // n) for length, n in zip(self.shape, self.tile, strict=True)
-        )  # type: ignore[assignment]
+        t, z, y, x = (-(-length // n) for length, n in zip(self.shape, self.tile, strict=True))
+        self.grid: Index = (t * len(self.weights), z, y, x)
         self._last_layer: tuple[int, Tile] | None = None
 
     def retile(self, tile: Shape) -> Blocks:
@@ -110,22 +112,37 @@ class Blocks:
                 for length, n in zip(self.shape[1:], shape[1:], strict=True)
             )
         )
-        regions = [
-            tuple(slice(low, low + n) for low, n in zip(place, shape[1:], strict=True))
-            for place in places
-        ]
-        region = max(regions, key=lambda region: _variation(frame, region))
-        tiles = [self._step(first + number) for number in range(shape[0])]
-        values = np.stack([tile.values[region] for tile in tiles])
-        counted = None
-        if tiles[0].counted is not None:
-            counted = np.stack([tile.counted[region] for tile in tiles if tile.counted is not None])
+        z, y, x = max(
+            places, key=lambda place: _variation(frame, _region((0, *place), (1, *shape[1:]))[1:])
+        )
+        return self.boxes(shape, [(first, z, y, x)], [prod(self.shape) // prod(shape)])
+
+    def boxes(self, shape: Shape, places: Sequence[Index], weights: Sequence[int]) -> Blocks:
+        """Return parts of one shape as a series in memory of its own, each of them one tile.
+
+        places: first vertices of the parts; parts of the series' border end there.
+        weights: see the class.
+        """
+        values, masks = [], []
+        for place in places:
+            low = (min(at, m - n) for at, m, n in zip(place, self.shape, shape, strict=True))
+            steps, *region = _region((*low,), shape)
+            for step in range(steps.start, steps.stop):
+                frame = self._step(step)
+                values.append(frame.values[tuple(region)])
+                if frame.counted is not None:
+                    masks.append(frame.counted[tuple(region)])
+        counted = np.stack(masks) if masks else None
         other = copy(self)
-        other._box, other.shape = _BoxInMemory(), shape
+        other._box, other.shape, other.weights = _BoxInMemory(), shape, tuple(weights)
         other.complete = counted is None or bool(counted.all())
-        other._box.content = Tile(values, None if other.complete else counted)
+        other._box.content = Tile(np.stack(values), None if other.complete else counted)
         other._cut(shape)
         return other
+
+    def weight(self, index: Index) -> int:
+        """Return the weight of the box that a tile is of."""
+        return self.weights[index[0] * len(self.weights) // self.grid[0]]
 
     def _step(self, step: int) -> Tile:
         """Return values and mask (z, y, x) of one step."""
@@ -186,7 +203,9 @@ class Blocks:
 
     def _layer(self, t: int) -> Tile:
         """Return one layer of tiles, (up to tile t, z, y, x of the box)."""
-        steps = range(t * self.tile[0], min((t + 1) * self.tile[0], self.shape[0]))
+        box, number = divmod(t, self.grid[0] // len(self.weights))
+        first, last = number * self.tile[0], min((number + 1) * self.tile[0], self.shape[0])
+        steps = range(box * self.shape[0] + first, box * self.shape[0] + last)
         if self.in_memory:
             values, in_coreset = self._whole()
             span = slice(steps[0], steps[-1] + 1)
@@ -209,6 +228,11 @@ class Blocks:
         if self.complete:
             return Tile(values, None)
         return Tile(values, np.stack([self._extent.mask(step) for step in steps]))
+
+
+def _region(place: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
+    """Return the slices of a part by its first vertices."""
+    return tuple(slice(low, low + n) for low, n in zip(place, shape, strict=True))
 
 
 def _variation(frame: Tile, region: tuple[slice, ...]) -> float:

@@ -92,7 +92,8 @@ class Sample:
         count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
         chosen = _choose_tiles(len(indices), count, costs)
         tiles = [
-            (indices[number], blocks.read(indices[number]), weight) for number, weight in chosen
+            (index, blocks.read(index), weight * blocks.weight(index))
+            for index, weight in ((indices[number], weight) for number, weight in chosen)
         ]
         # At least one tile, even if no vertex counts.
         tiles = [entry for entry in tiles if not entry[1].is_empty] or tiles[:1]
@@ -111,6 +112,11 @@ class Sample:
     def allows_bases(self) -> bool:
         """Whether the series is in memory: bases of its own read all of it once more."""
         return self.blocks.in_memory
+
+    @property
+    def is_single(self) -> bool:
+        """Whether this is one tile of several, which may be unlike the others."""
+        return len(self.tiles) == 1 and not self.complete
 
     def wider(self, max_vertices: int) -> Sample:
         """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.

@@ -39,6 +39,9 @@ class Patterns:
     def indices(self) -> Iterator[Index]:
         return iter([(0, 0, 0, 0)])
 
+    def weight(self, index: Index) -> int:
+        return 1
+
     def read(self, index: Index) -> Tile:
         rng = np.random.default_rng(0)
         patterns = rng.normal(size=(12, 48)) * 0.7 ** np.arange(12)[:, None]

@@ -31,6 +31,9 @@ class Grid:
     def indices(self) -> Iterator[Index]:
         return iter([(0, 0, number, 0) for number in range(2)])
 
+    def weight(self, index: Index) -> int:
+        return 1
+
     def read(self, index: Index) -> Tile:
         t, z, y, x = np.indices(SHAPE)
         noise = np.random.default_rng(index[2]).normal(size=SHAPE)

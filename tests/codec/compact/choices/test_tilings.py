@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -132,17 +133,76 @@ def test_a_series_that_is_read_in_a_moment_is_one_tile(workers: ThreadPoolExecut
     assert (tiling.tile, tiling.price, tiling.trials) == (task.blocks.shape, 1.0, [])
 
 
-def test_a_large_series_is_tried_on_a_part(
+def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a series of a million vertices a large one."""
+    for module in (tilings, access):
+        monkeypatch.setattr(module, "MAX_WHOLE_VERTICES", 1 << 19)
+    monkeypatch.setattr(tilings, "MAX_VERTICES", 1 << 18)
+    monkeypatch.setattr(tilings, "COLUMN_VERTICES", 1 << 20)
+
+
+def slow_drift() -> Values:
+    """Noise in space that changes little with time: only long tiles know it."""
+    shape = (64, 32, 32, 32)
+    still = np.random.default_rng(5).normal(size=shape[1:])
+    moving = 0.02 * np.random.default_rng(6).normal(size=shape)
+    return (still + moving).astype(np.float32)
+
+
+def test_a_large_series_is_tried_on_parts_of_few_steps_and_of_many(
     workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
-    for module in (tilings, access):
-        monkeypatch.setattr(module, "MAX_WHOLE_VERTICES", 1 << 16)
-    monkeypatch.setattr(tilings, "MAX_VERTICES", 1 << 14)
-    tiling, task = chosen(waves((8, 16, 48, 48)), "balanced", workers)
-    assert tiling.part == largest_tile(task.blocks.shape)
-    assert all(n <= m for n, m in zip(tiling.tile, tiling.part, strict=True))
-    assert tiling.part in [trial.tile for trial in tiling.trials]
+    small_limits(monkeypatch)
+    tiling, task = chosen(slow_drift(), "balanced", workers, psnr=25.0)
+    base = largest_tile(task.blocks.shape)
+    assert tiling.parts[0] == base
+    assert base in [trial.tile for trial in tiling.trials]
+    assert any(part[0] > base[0] for part in tiling.parts[1:])
+    # Few steps alone, as one part of all space has them, would look at the still noise anew.
+    assert tiling.tile[0] > 2 * base[0]
+    prices = {trial.tile: trial.size for trial in tiling.trials}
+    assert prices[base] > 1.5 * prices[tiling.tile]
+
+
+def test_many_steps_of_a_large_series_are_for_nothing_in_noise(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_limits(monkeypatch)
+    values = np.random.default_rng(3).normal(size=(64, 32, 32, 32)).astype(np.float32)
+    tiling, task = chosen(values, "balanced", workers, psnr=25.0)
+    assert tiling.tile[0] <= largest_tile(task.blocks.shape)[0]
+    assert all(prod(trial.tile) <= 1 << 18 for trial in tiling.trials)
+
+
+def test_a_large_series_of_few_steps_has_one_part(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_limits(monkeypatch)
+    tiling, task = chosen(waves((2, 64, 80, 80)), "balanced", workers)
+    assert tiling.parts == [largest_tile(task.blocks.shape)]
+    assert tiling.parts[0] in [trial.tile for trial in tiling.trials]
+
+
+def test_no_layer_of_tiles_is_longer_than_the_cache_of_a_reader(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reader that goes from step to step would decode such tiles again for each step."""
+    small_limits(monkeypatch)
+    values = slow_drift()
+    steps = 24
+    monkeypatch.setattr(tilings, "CACHE_BYTES", steps * values[0].nbytes)
+    tiling, _ = chosen(values, "small", workers, psnr=25.0)
+    assert all(trial.tile[0] <= steps for trial in tiling.trials)
+
+
+def test_a_series_larger_than_memory_is_tried_on_windows(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_limits(monkeypatch)
+    monkeypatch.setattr("fhash_codec.compact.tiles.blocks.MAX_BYTES_IN_MEMORY", 1)
+    tiling, _ = chosen(slow_drift(), "balanced", workers, psnr=25.0)
+    assert tiling.price is not None
+    assert tiling.tile[0] > 8
 
 
 @pytest.mark.parametrize("promise", [{"max_error_rel": 0.01}, {"max_error": 0.0}, {"ratio": 20.0}])
@@ -153,6 +213,22 @@ def test_every_promise_has_a_price(
     tiling, _ = chosen(shell(), "balanced", workers, **promise)
     assert tiling.price is not None
     assert 1 <= tiling.price <= PRICES["balanced"]
+
+
+def test_steep_cuts_are_told_from_flat_ones() -> None:
+    """Four steps as good as twelve say little of one: further trials do."""
+    shape = (12, 8, 64, 64)
+    in_time, in_space = (4, 8, 64, 64), (12, 8, 32, 32)
+    cuts = [
+        tilings._Cuts(shape, in_time, (0,), 0.03),
+        tilings._Cuts(shape, in_space, (1, 2, 3), 0.1),
+    ]
+    found = {shape: 1.0, in_time: 1.03, in_space: 1.1, (1, 8, 64, 64): 1.4}
+    assert cuts[0].extra((1, 8, 64, 64)) < 0.15
+    tilings._fit(cuts, found)
+    assert cuts[0].extra((1, 8, 64, 64)) > 0.3
+    assert cuts[0].extra(in_time) < 0.06
+    assert cuts[1].extra(in_space) == pytest.approx(0.1, abs=0.03)
 
 
 def test_labels_are_tried_as_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,9 @@ class Hats:
     def indices(self) -> Iterator[Index]:
         return iter([(0, 0, 0, 0)])
 
+    def weight(self, index: Index) -> int:
+        return 1
+
     def read(self, index: Index) -> Tile:
         values = np.zeros((65, 65))
         values[::2, ::2] = np.random.default_rng(0).normal(size=(33, 33))
@@ -57,6 +60,9 @@ class FewShapes:
     def indices(self) -> Iterator[Index]:
         return iter([(0, 0, 0, 0)])
 
+    def weight(self, index: Index) -> int:
+        return 1
+
     def read(self, index: Index) -> Tile:
         rng = np.random.default_rng(1)
         values = rng.normal(size=(8 * 24, 2)) @ rng.normal(size=(2, 40))
@@ -85,3 +91,31 @@ def test_a_likely_transform_is_found_by_four_trials() -> None:
         )
         # A series that is not in memory has no bases, and keeps the usual transform.
         assert likely_transform(sample, settings, Coding()) == settings
+
+
+class MovingSpikes:
+    """Spikes that jump in time and in space: no transform of time or z does any good."""
+
+    shape = tile = (6, 12, 24, 24)
+    in_memory = False
+
+    def indices(self) -> Iterator[Index]:
+        return iter([(0, 0, 0, 0)])
+
+    def weight(self, index: Index) -> int:
+        return 1
+
+    def read(self, index: Index) -> Tile:
+        values = np.random.default_rng(4).normal(size=self.tile)
+        return Tile(np.where(np.abs(values) > 2.5, values, 0).astype(np.float32), None)
+
+
+def test_time_is_looked_at_again_after_z() -> None:
+    settings = TileSettings(
+        transform=usual_transform(MovingSpikes.tile), step=0.5, center=0.0, low=-5.0, high=5.0
+    )
+    with ThreadPoolExecutor(1) as workers:
+        sample = Sample(MovingSpikes(), 1 << 20, workers)
+        chosen, _ = choose_transform(sample, settings, Coding())
+    t, z, _, _ = chosen.transform.axes
+    assert (t.kind, z.kind) == ("none", "none")

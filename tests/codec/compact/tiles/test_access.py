@@ -90,11 +90,35 @@ def test_a_part_of_a_tile_is_as_large_as_it_may_be(tile: Shape) -> None:
     assert part_of(tile, prod(tile)) == tile
 
 
+def test_slabs_are_cut_across_the_longest_axes_alone() -> None:
+    shape, most = (81, 64, 64, 128), 4 << 20
+    plain, more = tiles_to_try(shape, most), tiles_to_try(shape, most, slabs=True)
+    assert len(set(more)) == len(more)
+    assert set(plain[1:]) <= set(more)
+    added = set(more) - set(plain)
+    assert added
+    for tile in added:
+        cut = [axis for axis in (1, 2, 3) if tile[axis] < shape[axis]]
+        assert cut in ([3], [2, 3])
+        assert prod(tile) <= most
+    # The largest of all steps is between two of the usual edges.
+    assert (81, 64, 64, 12) in added
+
+
+def test_one_axis_in_space_gives_no_slabs_twice() -> None:
+    shape = (8, 1, 1, 4096)
+    more = tiles_to_try(shape, 1 << 14, slabs=True)
+    assert len(set(more)) == len(more)
+    assert all(tile[1:3] == (1, 1) for tile in more)
+
+
 def test_a_choice_describes_itself() -> None:
     trials = [TilingTrial(tile=(4, 8, 8, 8), size=120.0), TilingTrial(tile=(4, 8, 8, 16), size=100)]
-    tiling = Tiling(tile=(4, 8, 8, 8), price=1.2, trials=trials, part=(4, 8, 8, 16))
+    tiling = Tiling(tile=(4, 8, 8, 8), price=1.2, trials=trials, parts=[(4, 8, 8, 16)])
     assert tiling.best == (4, 8, 8, 16)
-    told = "tried 4 x 8 x 8 x 8 at 1.20, 4 x 8 x 8 x 16 at 1.00, on 4 x 8 x 8 x 16 vertices"
+    told = (
+        "tried 4 x 8 x 8 x 8 at 1.20, 4 x 8 x 8 x 16 at 1.00, on parts of 4 x 8 x 8 x 16 vertices"
+    )
     assert tiling.describe() == told
     foretold = Tiling(tile=(4, 8, 8, 8), price=1.05)
     assert foretold.best is None

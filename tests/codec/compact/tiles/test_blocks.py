@@ -59,6 +59,35 @@ def test_a_tile_is_empty_where_no_vertex_counts() -> None:
 
 @pytest.mark.parametrize("in_memory", [True, False])
 @pytest.mark.parametrize("features", [("all",), ("interval:0:10",)])
+def test_boxes_are_parts_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, in_memory: bool, features: tuple[str, ...]
+) -> None:
+    if not in_memory:
+        monkeypatch.setattr("fhash_codec.compact.tiles.blocks.MAX_BYTES_IN_MEMORY", 1)
+    blocks = blocks_of((5, 3, 7, 4), features)
+    places = [(0, 0, 0, 4), (2, 3, 1, 0), (9, 9, 9, 9)]  # the last one ends at the border
+    boxes = blocks.boxes((3, 2, 4, 4), places, [2, 1, 5])
+    assert boxes.in_memory
+    assert (boxes.shape, boxes.tile, boxes.grid) == ((3, 2, 4, 4), (3, 2, 4, 4), (3, 1, 1, 1))
+    whole = blocks.retile(SHAPE).read((0, 0, 0, 0))
+    lows = [*places[:2], tuple(m - n for m, n in zip(SHAPE, (3, 2, 4, 4), strict=True))]
+    halves = boxes.retile((2, 2, 4, 2))  # two layers of each box: the second one is half full
+    assert halves.grid == (6, 1, 1, 2)
+    for number, low in enumerate(lows):
+        region = tuple(slice(at, at + n) for at, n in zip(low, (3, 2, 4, 4), strict=True))
+        part = boxes.read((number, 0, 0, 0))
+        np.testing.assert_array_equal(part.values, whole.values[region])
+        if part.counted is not None and whole.counted is not None:
+            np.testing.assert_array_equal(part.counted, whole.counted[region])
+        last = halves.read((2 * number + 1, 0, 0, 1))
+        np.testing.assert_array_equal(last.values[:1], whole.values[region][2:, :, :, 2:])
+        assert last.counted is not None
+        assert not last.counted[1:].any()
+        assert halves.weight((2 * number + 1, 0, 0, 1)) == [2, 1, 5][number]
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("features", [("all",), ("interval:0:10",)])
 def test_a_window_is_the_part_where_values_vary_most(
     monkeypatch: pytest.MonkeyPatch, in_memory: bool, features: tuple[str, ...]
 ) -> None:

@@ -28,6 +28,9 @@ class Row:
     def indices(self) -> Iterator[Index]:
         return iter([(0, 0, number, 0) for number in range(self.tiles)])
 
+    def weight(self, index: Index) -> int:
+        return 1
+
     def read(self, index: Index) -> Tile:
         return Tile(np.full(self.tile, index[2], np.float32), None)
 
