@@ -21,6 +21,7 @@ from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, total
+from fhash_codec.compact.tiles.known import TileRun
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
@@ -248,22 +249,11 @@ def _code_all(
 
     note: for the progress.
     """
-    blocks = coding_plan.blocks
-    filled_tiles: dict[Index, Tile] = {}
-    if coding_plan.sample is not None and coding_plan.coding.filled:
-        # Reuse the tiles that the search has already filled.
-        sample = coding_plan.sample
-        filled_tiles = dict(zip(sample.indices, sample.tiles, strict=True))
+    blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
-    def source(index: Index) -> Index | Tile:
-        """Return a tile, or its index where the workers may read it themselves."""
-        if index in filled_tiles:
-            return filled_tiles[index]
-        return index if blocks.in_memory else blocks.read(index)
-
-    keeps_decoded = coding_plan.keeps_decoded
-
-    def work(source: Index | Tile) -> tuple[bytes, Outcome, Values | None]:
+    def work(source: Index | Tile | TileRun) -> tuple[bytes, Outcome, Values | None]:
+        if isinstance(source, TileRun):
+            return source.stream, source.outcome, None
         tile = source if isinstance(source, Tile) else blocks.read(source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome, coded.decoded if keeps_decoded else None
@@ -271,7 +261,7 @@ def _code_all(
     streams: list[bytes] = []
     decoded_tiles: list[Values | None] = []
     outcomes: list[Outcome] = []
-    sources = (source(index) for index in blocks.indices())
+    sources = _sources(coding_plan)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
@@ -287,3 +277,25 @@ def _code_all(
         outcome=total(outcomes),
         decoded={index: values for index, values in kept if values is not None},
     )
+
+
+def _sources(coding_plan: CodingPlan) -> Iterator[Index | Tile | TileRun]:
+    """Yield what each tile is made of, in C order: its stream, where the search has coded it so.
+
+    Else it is the tile that the search has filled, or one that is read here, or its index where the
+    workers may read it themselves.
+    """
+    blocks, sample = coding_plan.blocks, coding_plan.sample
+    filled: dict[Index, Tile] = {}
+    known: dict[Index, TileRun] = {}
+    if sample is not None and coding_plan.coding.filled:
+        filled = dict(zip(sample.indices, sample.tiles, strict=True))
+        if not coding_plan.keeps_decoded:
+            known = sample.coded(coding_plan.settings, coding_plan.coding)
+    for index in blocks.indices():
+        if index in known:
+            yield known[index]
+        elif index in filled:
+            yield filled[index]
+        else:
+            yield index if blocks.in_memory else blocks.read(index)

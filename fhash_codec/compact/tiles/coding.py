@@ -99,6 +99,12 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         size = len(coded.data)
         return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
     coded = encode_tile(values, settings, coding, in_coreset=counted)
+    return coded, measured(tile, coded, settings, coding)
+
+
+def measured(tile: Tile, coded: CodedTile, settings: TileSettings, coding: Coding) -> Outcome:
+    """Return size and error of a tile that was coded with these settings."""
+    values, counted = tile
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
     bulk = coding.bulk
@@ -108,7 +114,7 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
     bulk_squares, bulk_count = sums.bulk_squares, sums.bulk_count
     if bulk is not None and bulk.alone:
         squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
-    outcome = Outcome(
+    return Outcome(
         size=len(coded.data),
         squares=squares / scale**2,
         count=count,
@@ -117,7 +123,6 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale**2,
         bulk_count=bulk_count,
     )
-    return coded, outcome
 
 
 def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> Outcome:

@@ -6,16 +6,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from math import prod
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.tiles.blocks import Blocks, Tile
-from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
+from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
+from fhash_codec.compact.tiles.coding import Coding, Outcome, code, measured, total
 from fhash_codec.compact.tiles.filling import fill
+from fhash_codec.compact.tiles.known import Known, Run, TileRun
 from fhash_formats.support.threads import map_ahead
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import CodedTile
 from fhash_formats.transform.tile.settings import TileSettings
 
 Result = TypeVar("Result")
@@ -58,6 +61,34 @@ def strata(costs: Sequence[float], max_tiles: int) -> list[tuple[int, int]]:
         members = order[groups == group]
         chosen.append((int(members[len(members) // 2]), len(members)))
     return sorted(chosen)
+
+
+class _Job(NamedTuple):
+    """A tile to be coded, or only to be decoded where its stream is known."""
+
+    tile: Tile
+    settings: TileSettings
+    coding: Coding
+    before: TileRun | None
+    """Its stream, and the outcome with this head or another."""
+
+    def coded(self) -> CodedTile:
+        """Return the coded tile."""
+        if self.before is None:
+            return code(self.tile, self.settings, self.coding)[0]
+        values, (stream, outcome) = self.tile.values, self.before
+        t, z, y, x = values.shape
+        decoded = decode_tile(stream, (t, z, y, x), values.dtype, self.settings)
+        return CodedTile(data=stream, decoded=decoded, nonzero=outcome.nonzero)
+
+    def run(self) -> TileRun:
+        """Return the tile as it is coded."""
+        if self.before is None:
+            coded, outcome = code(self.tile, self.settings, self.coding)
+            return TileRun(coded.data, outcome)
+        coded = self.coded()
+        outcome = measured(self.tile, coded, self.settings, self.coding)
+        return TileRun(coded.data, outcome)
 
 
 class Sample:
@@ -105,6 +136,7 @@ class Sample:
         self.grams = _grams.setdefault(blocks, {})
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[TileSettings, int] | None = None
+        self._known = Known()
         self.tick = tick
 
     @property
@@ -127,7 +159,7 @@ class Sample:
         if self.blocks.complete:
             return self
         other = copy(self)
-        other._filling = settings, density
+        other._filling, other._known = (settings, density), Known()
         filled = self._pool.map(lambda tile: fill(tile, settings, density), self._source)
         other.tiles = list(self._ticking(filled))
         return other
@@ -153,19 +185,47 @@ class Sample:
     def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
         """Return the outcome of `run` for each pair of settings and coding.
 
-        All trials run at once, so that a few large tiles keep all processors busy, too.
+        All trials run at once, so that a few large tiles keep all processors busy, too. What was
+        coded before is not coded again.
         """
-        jobs = [(tile, settings, coding) for settings, coding in trials for tile in self.tiles]
-        outcomes = list(self._ticking(self._pool.map(lambda job: code(*job)[1], jobs)))
-        number = len(self.tiles)
-        return [
-            total(outcomes[start : start + number], self.weights)
-            for start in range(0, len(outcomes), number)
+        runs = [self._known.run(*trial) for trial in trials]
+        new = [trial for trial, run in zip(trials, runs, strict=True) if run is None]
+        jobs = [
+            _Job(tile, *trial, before)
+            for trial in new
+            for tile, before in zip(self.tiles, self._before(*trial), strict=True)
         ]
+        results = list(self._ticking(self._pool.map(_Job.run, jobs)))
+        number = len(self.tiles)
+        fresh = [
+            Run(*trial, results[start : start + number])
+            for start, trial in zip(range(0, len(results), number), new, strict=True)
+        ]
+        for run in fresh:
+            self._known.keep(run)
+        found = iter(fresh)
+        whole = [next(found) if run is None else run for run in runs]
+        return [total([tile.outcome for tile in run.tiles], self.weights) for run in whole]
+
+    def coded(self, settings: TileSettings, coding: Coding) -> dict[Index, TileRun]:
+        """Return the tiles by their indices if they were coded so before, else nothing."""
+        run = self._known.run(settings, coding)
+        return {} if run is None else dict(zip(self.indices, run.tiles, strict=True))
 
     def decoded(self, settings: TileSettings, coding: Coding) -> list[npt.NDArray[np.float32]]:
         """Code and decode the tiles; the decoded values, float32."""
-        return self.map(lambda tile: code(tile, settings, coding)[0].decoded.astype(np.float32))
+        before = self._before(settings, coding)
+        jobs = [
+            _Job(tile, settings, coding, known)
+            for tile, known in zip(self.tiles, before, strict=True)
+        ]
+        results = self._pool.map(lambda job: job.coded().decoded.astype(np.float32), jobs)
+        return list(self._ticking(results))
+
+    def _before(self, settings: TileSettings, coding: Coding) -> Sequence[TileRun | None]:
+        """Return each tile as it was coded before, where it was, perhaps with another head."""
+        run = self._known.same_streams(settings, coding)
+        return [None] * len(self.tiles) if run is None else run.tiles
 
     def _ticking(self, results: Iterable[Result]) -> Iterator[Result]:
         """Yield results, and call `tick` after each has come."""
