@@ -12,6 +12,7 @@ from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.measure.sums import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.transform.tile import encoding
+from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -100,6 +101,13 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
     coded = encode_tile(values, settings, coding, in_coreset=counted)
     return coded, measured(tile, coded, settings, coding)
+
+
+def recoded(tile: Tile, data: bytes, settings: TileSettings, nonzero: int = 0) -> CodedTile:
+    """Return a tile whose stream is known, as these settings decode it."""
+    t, z, y, x = tile.values.shape
+    decoded = decode_tile(data, (t, z, y, x), tile.values.dtype, settings)
+    return CodedTile(data=data, decoded=decoded, nonzero=nonzero)
 
 
 def measured(tile: Tile, coded: CodedTile, settings: TileSettings, coding: Coding) -> Outcome:

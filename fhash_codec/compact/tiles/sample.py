@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
-from fhash_codec.compact.tiles.coding import Coding, Outcome, code, measured, total
+from fhash_codec.compact.tiles.coding import Coding, Outcome, code, measured, recoded, total
 from fhash_codec.compact.tiles.filling import fill
 from fhash_codec.compact.tiles.known import Known, Run, TileRun
 from fhash_formats.support.threads import map_ahead
-from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import CodedTile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -76,10 +75,8 @@ class _Job(NamedTuple):
         """Return the coded tile."""
         if self.before is None:
             return code(self.tile, self.settings, self.coding)[0]
-        values, (stream, outcome) = self.tile.values, self.before
-        t, z, y, x = values.shape
-        decoded = decode_tile(stream, (t, z, y, x), values.dtype, self.settings)
-        return CodedTile(data=stream, decoded=decoded, nonzero=outcome.nonzero)
+        stream, outcome = self.before
+        return recoded(self.tile, stream, self.settings, outcome.nonzero)
 
     def run(self) -> TileRun:
         """Return the tile as it is coded."""
