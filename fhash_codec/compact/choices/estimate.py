@@ -34,9 +34,9 @@ SPREAD = 0.1
 """Mean square of the error of the other coefficients, in squared steps."""
 ROUGH_VERTICES = 1 << 20
 """Vertices of the tiles whose coefficients give a first idea of the size."""
-TRIALS = 8
+TRIALS = 16
 """Tiles that are coded at most to measure the error of the estimate."""
-TRIAL_VERTICES = 1 << 18
+TRIAL_VERTICES = 1 << 16
 """Vertices of a tile coded for it; larger tiles are cut to about this size."""
 TRIAL_STEPS = 8
 """Time steps of such a smaller tile."""

@@ -30,11 +30,10 @@ def gram_of(planes: npt.NDArray[Any], center: float) -> Gram:
     """
     if planes.dtype not in (np.float32, np.float64):
         planes = planes.astype(np.float64)
-    before, length, after = planes.shape
     library = native.library()
     if library is not None:
         return _native(library, np.ascontiguousarray(planes), center)
-    sums: Gram = np.zeros((length, length))
+    sums: Gram = np.zeros((planes.shape[1], planes.shape[1]))
     for plane in planes:
         with np.errstate(over="ignore", invalid="ignore"):
             lines = plane.T.astype(np.float64) - center

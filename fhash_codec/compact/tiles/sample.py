@@ -12,12 +12,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
+from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
 from fhash_codec.compact.tiles.coding import Coding, Outcome, code, measured, recoded, total
 from fhash_codec.compact.tiles.filling import fill
 from fhash_codec.compact.tiles.known import Known, Run, TileRun
 from fhash_formats.support.threads import map_ahead
-from fhash_formats.transform.tile.encoding import CodedTile
 from fhash_formats.transform.tile.settings import TileSettings
 
 Result = TypeVar("Result")
@@ -71,21 +70,15 @@ class _Job(NamedTuple):
     before: TileRun | None
     """Its stream, and the outcome with this head or another."""
 
-    def coded(self) -> CodedTile:
-        """Return the coded tile."""
-        if self.before is None:
-            return code(self.tile, self.settings, self.coding)[0]
-        stream, outcome = self.before
-        return recoded(self.tile, stream, self.settings, outcome.nonzero)
-
-    def run(self) -> TileRun:
-        """Return the tile as it is coded."""
+    def run(self) -> tuple[TileRun, Values]:
+        """Return the tile as it is coded, and its decoded values."""
         if self.before is None:
             coded, outcome = code(self.tile, self.settings, self.coding)
-            return TileRun(coded.data, outcome)
-        coded = self.coded()
-        outcome = measured(self.tile, coded, self.settings, self.coding)
-        return TileRun(coded.data, outcome)
+        else:
+            stream, known = self.before
+            coded = recoded(self.tile, stream, self.settings, known.nonzero)
+            outcome = measured(self.tile, coded, self.settings, self.coding)
+        return TileRun(coded.data, outcome), coded.decoded
 
 
 class Sample:
@@ -192,7 +185,7 @@ class Sample:
             for trial in new
             for tile, before in zip(self.tiles, self._before(*trial), strict=True)
         ]
-        results = list(self._ticking(self._pool.map(_Job.run, jobs)))
+        results = list(self._ticking(self._pool.map(lambda job: job.run()[0], jobs)))
         number = len(self.tiles)
         fresh = [
             Run(*trial, results[start : start + number])
@@ -216,8 +209,9 @@ class Sample:
             _Job(tile, settings, coding, known)
             for tile, known in zip(self.tiles, before, strict=True)
         ]
-        results = self._pool.map(lambda job: job.coded().decoded.astype(np.float32), jobs)
-        return list(self._ticking(results))
+        runs = list(self._ticking(self._pool.map(_Job.run, jobs)))
+        self._known.keep(Run(settings, coding, [run for run, _ in runs]))
+        return [values.astype(np.float32) for _, values in runs]
 
     def _before(self, settings: TileSettings, coding: Coding) -> Sequence[TileRun | None]:
         """Return each tile as it was coded before, where it was, perhaps with another head."""
