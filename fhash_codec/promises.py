@@ -6,13 +6,17 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fhash_codec.compact.goal import DEFAULT_PSNR_BULK, RATIO_SLACK
+from fhash_codec.compact.choices.search import EXCHANGE
+from fhash_codec.compact.goal import DEFAULT_PSNR, DEFAULT_PSNR_BULK, RATIO_SLACK
 from fhash_codec.config import PROMISES, EncodeConfig
 
-__all__ = ["missed_promise", "remarks"]
+__all__ = ["decided_by_bulk", "missed_promise", "remarks"]
 
 FAR_BELOW = 15.0
 """dB by which the PSNR of the bulk may be below that of the whole range without a remark."""
+
+DECIDED = 0.3
+"""dB by which a PSNR must exceed its promise, and the other one may, where that one decided."""
 
 
 def missed_promise(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
@@ -56,6 +60,30 @@ def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
             f"the file is {figures['ratio']:.4g} times smaller than the data, "
             f"{config.ratio:g} times were asked for: {why}"
         )
+
+
+def decided_by_bulk(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+    """Text on a file that is larger for its bulk's sake; None where that did not decide.
+
+    figures: of the file, as in `report`.
+    """
+    given = [name for name in PROMISES if getattr(config, name) is not None]
+    psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
+    if config.profile != "compact" or None in (psnr, psnr_bulk):
+        return None
+    if given not in ([], ["psnr", "psnr_bulk"]):
+        return None
+    whole = DEFAULT_PSNR if config.psnr is None else config.psnr
+    bulk = DEFAULT_PSNR_BULK if config.psnr_bulk is None else config.psnr_bulk
+    if psnr < whole + DECIDED or psnr_bulk > bulk + DECIDED:
+        return None
+    low, high = figures["quality"]["bulk"]["range"]
+    share = 1 - 2 ** (-(psnr - whole) / EXCHANGE)
+    return (
+        f"the bulk decided: {bulk:g} dB within it, from {low:g} to {high:g}, took {psnr:.1f} dB "
+        f"over all values, where {whole:g} are promised; that is about {share:.0%} of the file, "
+        f"and --psnr {whole:g} alone leaves it out"
+    )
 
 
 def _mending(config: EncodeConfig) -> str:

@@ -13,14 +13,23 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import prod
 
-from fhash_codec.compact.choices.search import SLOPE
+from fhash_codec.compact.choices.head_prospects import head_bytes
+from fhash_codec.compact.choices.search import EXCHANGE, SLOPE
 from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
-from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, total
+from fhash_codec.compact.tiles.coding import (
+    MIN_STEP_SHARE,
+    Outcome,
+    code,
+    measured,
+    recoded,
+    total,
+)
+from fhash_codec.compact.tiles.known import TileRun
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
@@ -47,9 +56,14 @@ QUICK_EXCESS = 0.35
 MARGIN = 0.005
 """dB added to the PSNR in the second pass; doubled in each further one."""
 UNLIKE = 0.3
-"""dB by which all tiles may be worse than the sample before the head is dropped."""
+"""dB by which all tiles may be worse than the sample before the gain of the head is looked at."""
+NEAR_MISS = 0.1
+"""dB by which the search may miss the promise so that a finer step is tried, and no other plan."""
 FIRST_FINER = 1.1
-"""Factor of the first finer step where the search has missed the promise; then its square."""
+"""Factor of the first finer step where the search has missed the promise, at most; then its square.
+
+After a near miss it is the one that should do, by half of the usual slope.
+"""
 MAX_FINER = 2.0
 """Largest such factor."""
 REFIT_RATIO = 1.5
@@ -168,7 +182,7 @@ def _code_to_psnr(
     best: CodedTable | None = None
     for simpler_plan in _simpler_plans(coding_plan):
         best = _search_psnr(simpler_plan, aim, best, workers, progress)
-        if aim.psnr_of(best.outcome) >= aim.min_psnr:
+        if aim.psnr_of(best.outcome) >= aim.min_psnr - NEAR_MISS:
             break
     assert best is not None
     return _rescued(best, aim, workers, progress)
@@ -181,7 +195,8 @@ def _rescued(
 
     At the level of the noise of a series the PSNR hardly depends on the step, and then much.
     """
-    table, finer = best, FIRST_FINER
+    missing = aim.min_psnr - aim.psnr_of(best.outcome)
+    table, finer = best, min(FIRST_FINER, math.exp(2 * (missing + 2 * MARGIN) / SLOPE))
     while aim.psnr_of(table.outcome) < aim.min_psnr:
         settings = table.plan.settings
         require_reach(table.plan.goal, settings, table.outcome)
@@ -217,8 +232,9 @@ def _search_psnr(
             break
         require_reach(coding_plan.goal, coding_plan.settings, table.outcome)
         settings = coding_plan.settings
-        if psnr < aim.min_psnr - UNLIKE and attempt == 0 and settings.head is not None:
-            break  # the head does not hold for all tiles
+        unlike = psnr < aim.min_psnr - UNLIKE and attempt == 0
+        if unlike and not _head_holds(table, aim, workers):
+            break
         search.add(settings.step, psnr)
         step = search.step_for(aim.next_target(psnr, attempt))
         coding_plan = replace(coding_plan, settings=replace(settings, step=step))
@@ -227,6 +243,32 @@ def _search_psnr(
             coding_plan = replace(coding_plan, settings=refitted)
     assert best is not None
     return best
+
+
+def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bool:
+    """Whether the head of a table, if any, saves more bytes in all tiles than it takes.
+
+    It may gain much there although all tiles are worse than the sample. What the tiles are without
+    it is measured by decoding them once more.
+    """
+    settings, blocks = table.plan.settings, table.plan.blocks
+    if settings.head is None:
+        return True
+    plain = replace(settings, head=None)
+
+    def measure(job: tuple[bytes, Index | Tile]) -> Outcome:
+        stream, source = job
+        tile = source if isinstance(source, Tile) else blocks.read(source)
+        return measured(tile, recoded(tile, stream, plain), plain, table.plan.coding)
+
+    tiles = (index if blocks.in_memory else blocks.read(index) for index in blocks.indices())
+    jobs = zip(table.streams, tiles, strict=True)
+    with stage("coding", "gain of the head in all tiles"):
+        without = total(list(map_ahead(workers, measure, jobs, 2 * usable_threads())))
+    gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
+    size = table.outcome.size
+    own = len(settings.head.to_bytes()) + head_bytes(size)
+    return size * (2 ** (gain / EXCHANGE) - 1) > own
 
 
 def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:
@@ -248,22 +290,11 @@ def _code_all(
 
     note: for the progress.
     """
-    blocks = coding_plan.blocks
-    filled_tiles: dict[Index, Tile] = {}
-    if coding_plan.sample is not None and coding_plan.coding.filled:
-        # Reuse the tiles that the search has already filled.
-        sample = coding_plan.sample
-        filled_tiles = dict(zip(sample.indices, sample.tiles, strict=True))
+    blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
-    def source(index: Index) -> Index | Tile:
-        """Return a tile, or its index where the workers may read it themselves."""
-        if index in filled_tiles:
-            return filled_tiles[index]
-        return index if blocks.in_memory else blocks.read(index)
-
-    keeps_decoded = coding_plan.keeps_decoded
-
-    def work(source: Index | Tile) -> tuple[bytes, Outcome, Values | None]:
+    def work(source: Index | Tile | TileRun) -> tuple[bytes, Outcome, Values | None]:
+        if isinstance(source, TileRun):
+            return source.stream, source.outcome, None
         tile = source if isinstance(source, Tile) else blocks.read(source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome, coded.decoded if keeps_decoded else None
@@ -271,7 +302,7 @@ def _code_all(
     streams: list[bytes] = []
     decoded_tiles: list[Values | None] = []
     outcomes: list[Outcome] = []
-    sources = (source(index) for index in blocks.indices())
+    sources = _sources(coding_plan)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
@@ -287,3 +318,25 @@ def _code_all(
         outcome=total(outcomes),
         decoded={index: values for index, values in kept if values is not None},
     )
+
+
+def _sources(coding_plan: CodingPlan) -> Iterator[Index | Tile | TileRun]:
+    """Yield what each tile is made of, in C order: its stream, where the search has coded it so.
+
+    Else it is the tile that the search has filled, or one that is read here, or its index where the
+    workers may read it themselves.
+    """
+    blocks, sample = coding_plan.blocks, coding_plan.sample
+    filled: dict[Index, Tile] = {}
+    known: dict[Index, TileRun] = {}
+    if sample is not None and coding_plan.coding.filled:
+        filled = dict(zip(sample.indices, sample.tiles, strict=True))
+        if not coding_plan.keeps_decoded:
+            known = sample.coded(coding_plan.settings, coding_plan.coding)
+    for index in blocks.indices():
+        if index in known:
+            yield known[index]
+        elif index in filled:
+            yield filled[index]
+        else:
+            yield index if blocks.in_memory else blocks.read(index)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from math import prod
 
+from fhash_codec.compact.choices.coarser_bases import LEAST
 from fhash_codec.compact.choices.head import (
     MIN_BYTES,
     MIN_GAIN,
@@ -26,10 +27,11 @@ from fhash_codec.compact.choices.head_prospects import (
 )
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
+from fhash_codec.compact.choices.quantiser import allows_trellis
 from fhash_codec.compact.choices.search import EXCHANGE
 from fhash_codec.compact.choices.tiling_trials import PICKED_VERTICES
 from fhash_codec.compact.choices.tilings import largest_tile
-from fhash_codec.compact.choices.transform import count_trials
+from fhash_codec.compact.choices.transform import basis_bytes, count_trials
 from fhash_codec.compact.stages import (
     LARGE,
     MAX_SEARCHED_VERTICES,
@@ -70,8 +72,15 @@ BOUND_TRIALS = 8
 """Trials of a search for the step under a bound."""
 SIZE_TRIES = 3
 """Trials of a search for the step of a size."""
-PASSES = 1.2
-"""Times that all tiles are coded for a PSNR, where the step was searched on all of them."""
+QUANTISER_TRIES = 3
+"""Codings of the sample by which the quantiser is chosen for a PSNR; the last begins the search."""
+QUANTISER_TRIES_OF_BOUND = 2
+"""Such codings under a bound."""
+COARSER_TRIES = 4
+"""Codings of the sample with coarser bases of the data's own, where these are tried."""
+PASSES = 0.2
+"""Times that all tiles are coded for a PSNR, where the step was searched on all of them: the search
+has coded them already, with the step that mostly keeps the promise."""
 SAMPLED_PASSES = 2.0
 """Times that all tiles are coded for a PSNR, where the step was searched on a sample."""
 SIZE_PASSES = 2.0
@@ -108,6 +117,13 @@ class _Work:
         threads = usable_threads()
         rounds = math.ceil(jobs / threads) if jobs < 4 * threads else jobs / threads
         return rounds * prod(tile) * rate
+
+    @property
+    def coded_anew(self) -> bool:
+        """Whether all tiles must be coded once more after the search under a bound."""
+        blocks, vertices = self.look.task.blocks, self.vertices
+        filled_anew = not blocks.complete and blocks.dtype.kind != "f"
+        return filled_anew or vertices > MAX_SEARCHED_VERTICES or self.config.effort == 1
 
     def tries(self, usual: float) -> float:
         """Trials of a search for the step, one after the other; `usual` for a PSNR."""
@@ -158,7 +174,7 @@ def stage_seconds(
     goal = look.task.goal
     passes = PASSES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLED_PASSES
     if goal.psnr is None:
-        passes = 1.0 if goal.error is not None else SIZE_PASSES
+        passes = float(work.coded_anew) if goal.error is not None else SIZE_PASSES
     return seconds | {"coding": passes * _all_tiles(work, final)}
 
 
@@ -206,7 +222,18 @@ def _choices(work: _Work) -> dict[str, float]:
     usual = NEAR_TRIES if searched == tried and config.effort > 1 else TRIES
     refits = NEAR_REFIT_TRIES if config.effort >= MIN_HEAD_EFFORT else REFIT_TRIES
     tries = work.tries(usual + (refits if rates.has_bases else 0))
+    if allows_trellis(look.attempt.settings, look.task.goal, config.effort):
+        quantisers = QUANTISER_TRIES if look.task.goal.error is None else QUANTISER_TRIES_OF_BOUND
+        tries += quantisers - 1
     seconds["step"] = tries * once
+    taken = basis_bytes(rates.settings.transform)
+    if (
+        config.effort > 1
+        and look.task.goal.size is None
+        and taken >= LEAST * (work.bytes_of_tiles + taken)
+        and taken
+    ):
+        seconds["coarser bases"] = min(COARSER_TRIES, work.tries(COARSER_TRIES)) * once
     return seconds
 
 
@@ -234,7 +261,10 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     size = work.bytes_of_tiles
     if size < MIN_BYTES:
         return {}
-    pairs = work.wall(rates.search, tile, searched)
+    strict = bool(look.task.goal.error)
+    # Without a bound the tiles are coded already, and are only decoded.
+    known = rates.search if strict else rates.decode
+    pairs = work.wall(known, tile, searched)
     seconds = {"head trial": pairs + _training(head, TRIAL_BUDGET, 1.0, 1.0)}
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:
@@ -256,10 +286,9 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     alone = max(max(parts), sum(parts) / threads)
     again = gain > NEAR_GAIN or searched < work.tiles(tile)
     wider = work.wall(rates.search, tile, work.tiles(tile, TRAINING_VERTICES)) if again else 0.0
-    strict = bool(look.task.goal.error)
     looks = 0 if strict and len(shapes) == 1 else len(shapes)
-    tries = looks + work.tries(HEAD_TRIES)
-    search = tries * work.wall(rates.search + head.final, tile, searched)
+    search = work.tries(HEAD_TRIES) * work.wall(rates.search + head.final, tile, searched)
+    search += looks * work.wall((known if again else rates.search) + head.final, tile, searched)
     return seconds | {"head": wider + alone + search}
 
 

@@ -1,5 +1,5 @@
-"""Loader of the codec's native library: the C++ of the ray marcher, of the quality figures
-and of the training of heads.
+"""Loader of the codec's native library: the C++ of the ray marcher, of the quality figures,
+of the products of lines and of the training of heads.
 
 It is a library beside that of `fhash_formats.native`, loaded in the same way and switched off by
 the same `FHASH_NATIVE=0`. Each of the two may be missing without the other: whoever calls a
@@ -16,7 +16,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 4
+ABI_VERSION = 5
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -51,6 +51,8 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_histogram_{kind}": _HISTOGRAM for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
+    # gram.cpp
+    **{f"fhash_gram_{kind}": (*(ARRAY, INTEGER, INTEGER, INTEGER), REAL, ARRAY) for kind in _KINDS},
     # head_inputs.cpp
     "fhash_head_inputs": (
         *(*(ARRAY,) * 4, INTEGER, ARRAY, ARRAY, INTEGER),

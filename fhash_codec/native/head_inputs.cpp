@@ -1,11 +1,20 @@
 // Inputs of the neighbourhood head for voxels drawn from a tile. compact/choices/head_samples.py
 // states where they go, and computes the same numbers in numpy; head_portable.py in fhash_formats
 // states what they are.
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <vector>
 
 #include "core.hpp"
+#include "guard.hpp"
+
+#if defined(__GNUC__)
+#define FHASH_PREFETCH(address) __builtin_prefetch(address)
+#else
+#define FHASH_PREFETCH(address) ((void)(address))
+#endif
 
 namespace {
 
@@ -19,27 +28,31 @@ constexpr int NEIGHBOURS = 26;
 constexpr int INPUTS = NEIGHBOURS + 2;
 constexpr int REACH = 2;         // of the farthest neighbour along an axis
 constexpr int32_t LIMIT = 4095;  // magnitude of an input
+constexpr int64_t AHEAD = 3;     // voxels whose surroundings are fetched before they are used
 constexpr int64_t BAD_ARGUMENT = -1;
 
 // The range that values are clipped to, and the scales of their differences and of their place.
 struct Range {
     float low, high, inverse, unit;
 
-    float clipped(float value) const {
+    FHASH_INLINE float clipped(float value) const {
         const float raised = value > low ? value : low;
         return raised < high ? raised : high;
     }
 
-    static int16_t compressed(float scaled) {
+    FHASH_INLINE static int16_t compressed(float scaled) {
         const float magnitude = std::fabs(scaled) + 1.0f;
         int32_t octaves;
         std::memcpy(&octaves, &magnitude, sizeof octaves);
         octaves = (octaves - 0x3F800000) >> 14;
         octaves = octaves < LIMIT ? octaves : LIMIT;
-        return (int16_t)(std::signbit(scaled) ? -octaves : octaves);
+        int32_t bits;
+        std::memcpy(&bits, &scaled, sizeof bits);
+        const int32_t sign = bits >> 31;  // -1 where the sign is set, also that of a zero
+        return (int16_t)((octaves ^ sign) - sign);
     }
 
-    int16_t located(float value) const {
+    FHASH_INLINE int16_t located(float value) const {
         const float position = (value - low) * unit + 0.5f;
         return (int16_t)((int32_t)(position < 1024.0f ? position : 1024.0f) - 512);
     }
@@ -66,10 +79,114 @@ struct Around {
     }
 };
 
+// Largest magnitude of some offsets along each axis.
+struct Farthest {
+    int64_t along[AXES] = {0, 0, 0, 0};
+
+    Farthest(const int64_t* offsets, int64_t count) {
+        for (int64_t i = 0; i < count * AXES; ++i) {
+            const int64_t step = offsets[i] < 0 ? -offsets[i] : offsets[i];
+            along[i % AXES] = step > along[i % AXES] ? step : along[i % AXES];
+        }
+    }
+};
+
 bool reaches(const int64_t* offsets, int64_t count) {
     for (int64_t i = 0; i < count * AXES; ++i)
         if (offsets[i] < -REACH || offsets[i] > REACH) return false;
     return true;
+}
+
+// The drawn voxels of a tile, and the places around each that its inputs look at.
+struct Drawn {
+    const float* decoded;
+    const int64_t *shape, *places, *slots;
+    int64_t count;
+    const int64_t *neighbours, *offsets;
+    int64_t looked_at;
+};
+
+// First places of the rows that the inputs of a voxel look at, relative to it.
+std::vector<int64_t> rows_of(const Drawn& drawn, const int64_t* far, const int64_t* strides) {
+    std::vector<int64_t> rows;
+    for (int64_t l = 0; l < drawn.looked_at; ++l)
+        for (int k = 0; k < NEIGHBOURS; ++k) {
+            int64_t row = far[k] - drawn.neighbours[k * AXES + 3];
+            for (int axis = 0; axis + 1 < AXES; ++axis)
+                row += drawn.offsets[l * AXES + axis] * strides[axis];
+            rows.push_back(row);
+        }
+    std::sort(rows.begin(), rows.end());
+    rows.erase(std::unique(rows.begin(), rows.end()), rows.end());
+    return rows;
+}
+
+// Inputs of all voxels. Their places around a voxel are at fixed distances where it is not near an
+// end of the tile.
+FHASH_INLINE void write_inputs(const Drawn& drawn, const Range& range, int16_t* out) {
+    const int64_t *const shape = drawn.shape, looked_at = drawn.looked_at;
+    const int64_t strides[AXES] = {shape[1] * shape[2] * shape[3], shape[2] * shape[3], shape[3],
+                                   1};
+    const int64_t own[AXES] = {0, 0, 0, 0};
+    const Farthest near(drawn.neighbours, NEIGHBOURS), seen(drawn.offsets, looked_at);
+    int64_t far[NEIGHBOURS];
+    for (int k = 0; k < NEIGHBOURS; ++k) {
+        far[k] = 0;
+        for (int axis = 0; axis < AXES; ++axis)
+            far[k] += drawn.neighbours[k * AXES + axis] * strides[axis];
+    }
+    const int64_t size = strides[0] * shape[0];
+    const std::vector<int64_t> rows = rows_of(drawn, far, strides);
+    for (int64_t i = 0; i < drawn.count; ++i) {
+        if (i + AHEAD < drawn.count) {
+            int64_t next = 0;
+            for (int axis = 0; axis < AXES; ++axis)
+                next += drawn.places[axis * drawn.count + i + AHEAD] * strides[axis];
+            for (const int64_t row : rows)
+                FHASH_PREFETCH(drawn.decoded + inside(next + row, size));
+        }
+        int16_t* const slot =
+            out + drawn.slots[i] / BLOCK * INPUTS * looked_at * BLOCK + drawn.slots[i] % BLOCK;
+        int64_t place[AXES];
+        for (int axis = 0; axis < AXES; ++axis) place[axis] = drawn.places[axis * drawn.count + i];
+        bool inner = true;  // all that is looked at lies inside the tile
+        for (int axis = 0; axis < AXES; ++axis) {
+            const int64_t reach = near.along[axis] + seen.along[axis];
+            inner &= place[axis] >= reach && place[axis] + reach < shape[axis];
+        }
+        for (int64_t l = 0; l < looked_at; ++l) {
+            int64_t voxel[AXES], at = 0;
+            for (int axis = 0; axis < AXES; ++axis) {
+                voxel[axis] = inside(place[axis] + drawn.offsets[l * AXES + axis], shape[axis]);
+                at += voxel[axis] * strides[axis];
+            }
+            float values[NEIGHBOURS];
+            if (inner) {
+                for (int k = 0; k < NEIGHBOURS; ++k) values[k] = drawn.decoded[at + far[k]];
+            } else {
+                const Around around(voxel, shape, strides);
+                at = around(own);
+                for (int k = 0; k < NEIGHBOURS; ++k)
+                    values[k] = drawn.decoded[around(drawn.neighbours + k * AXES)];
+            }
+            const float centre = range.clipped(drawn.decoded[at]);
+            int16_t inputs[NEIGHBOURS];
+            for (int k = 0; k < NEIGHBOURS; ++k)
+                inputs[k] = Range::compressed((range.clipped(values[k]) - centre) * range.inverse);
+            int16_t* const to = slot + l * BLOCK;
+            for (int k = 0; k < NEIGHBOURS; ++k) to[k * looked_at * BLOCK] = inputs[k];
+            to[NEIGHBOURS * looked_at * BLOCK] = range.located(centre);
+            to[(NEIGHBOURS + 1) * looked_at * BLOCK] =
+                Range::compressed((centre - range.low) * range.inverse);
+        }
+    }
+}
+
+FHASH_CLONES int64_t write_inputs_cloned(const Drawn& drawn, const Range& range, int16_t* out) {
+    return guarded([&]() FHASH_LAMBDA {
+        write_inputs(drawn, range, out);
+        return (int64_t)0;
+    });
 }
 
 }  // namespace
@@ -87,28 +204,6 @@ FHASH_EXPORT int64_t fhash_head_inputs(const float* decoded, const int64_t* shap
                                        double unit, int16_t* out) {
     if (!reaches(neighbours, NEIGHBOURS) || !reaches(offsets, looked_at)) return BAD_ARGUMENT;
     const Range range = {(float)low, (float)high, (float)inverse, (float)unit};
-    const int64_t strides[AXES] = {shape[1] * shape[2] * shape[3], shape[2] * shape[3], shape[3],
-                                   1};
-    for (int64_t i = 0; i < count; ++i) {
-        const int64_t block = slots[i] / BLOCK;
-        int16_t* const slot = out + block * INPUTS * looked_at * BLOCK + slots[i] % BLOCK;
-        for (int64_t l = 0; l < looked_at; ++l) {
-            int64_t voxel[AXES];
-            for (int axis = 0; axis < AXES; ++axis)
-                voxel[axis] =
-                    inside(places[axis * count + i] + offsets[l * AXES + axis], shape[axis]);
-            const Around around(voxel, shape, strides);
-            const int64_t own[AXES] = {0, 0, 0, 0};
-            const float centre = range.clipped(decoded[around(own)]);
-            int16_t* const to = slot + l * BLOCK;
-            for (int k = 0; k < NEIGHBOURS; ++k) {
-                const float value = range.clipped(decoded[around(neighbours + k * AXES)]);
-                to[k * looked_at * BLOCK] = Range::compressed((value - centre) * range.inverse);
-            }
-            to[NEIGHBOURS * looked_at * BLOCK] = range.located(centre);
-            to[(NEIGHBOURS + 1) * looked_at * BLOCK] =
-                Range::compressed((centre - range.low) * range.inverse);
-        }
-    }
-    return 0;
+    return write_inputs_cloned(
+        {decoded, shape, places, slots, count, neighbours, offsets, looked_at}, range, out);
 }

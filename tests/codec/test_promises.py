@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fhash_codec import EncodeConfig
-from fhash_codec.promises import FAR_BELOW, missed_promise, remarks
+from fhash_codec.promises import DECIDED, FAR_BELOW, decided_by_bulk, missed_promise, remarks
 
 
 def figures(**others):
@@ -77,3 +77,26 @@ def test_a_file_much_smaller_than_asked_for_is_remarked(ratio, count, rmse, why)
     lines = list(remarks(EncodeConfig(ratio=30.0), figures(ratio=ratio, rmse=rmse)))
     assert len(lines) == count
     assert all(why in line and "30 times were asked for" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("config", "psnr", "psnr_bulk", "decided"),
+    [
+        ({}, 54.5, 40.0, True),
+        ({}, 50.1, 40.0, False),
+        ({}, 54.5, 40.1 + DECIDED, False),
+        ({"psnr": 45.0, "psnr_bulk": 41.0}, 49.5, 41.0, True),
+        ({"psnr": 45.0}, 49.5, 40.0, False),
+        ({"psnr_bulk": 41.0}, 49.5, 41.0, False),
+        ({"max_error": 1.0}, 54.5, 40.0, False),
+        ({}, 54.5, None, False),
+    ],
+)
+def test_a_bulk_that_decided_says_what_it_took(config, psnr, psnr_bulk, decided) -> None:
+    line = decided_by_bulk(EncodeConfig(**config), figures(psnr=psnr, psnr_bulk=psnr_bulk))
+    assert (line is not None) == decided
+    if line is not None:
+        asked = config.get("psnr", 50)
+        assert f"--psnr {asked:g} alone leaves it out" in line
+        assert "about 50 % of the file" in line.replace("50%", "50 %")
+        assert "from 1 to 2" in line

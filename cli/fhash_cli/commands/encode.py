@@ -100,6 +100,7 @@ def command(
     profile compact the same command starts again.
     """
     import fhash_codec
+    from fhash_codec.promises import decided_by_bulk
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
@@ -131,6 +132,8 @@ def command(
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
+    if not quiet and missed is None and (line := decided_by_bulk(config, report)) is not None:
+        say(line)
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.gram import Gram, gram_of
 from fhash_codec.compact.choices.quantiser import plain_step
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
@@ -20,8 +21,6 @@ from fhash_formats.transform.tile.settings import TileSettings
 __all__ = ["MAX_BASIS_LENGTH", "Bases", "CountedBases", "Gram", "Result", "TileSample"]
 
 Result = TypeVar("Result")
-Gram = npt.NDArray[np.float64]
-"""Products of lines (length, length)."""
 MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 
@@ -92,16 +91,9 @@ class Bases:
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> Gram:
         """Return the products of the lines of a tile along an axis, (length, length)."""
         # Values that do not count are kept: zeroing them would create an edge that dominates.
-        planes = _some_lines(values, axis, self._lines).astype(np.float64)
-        planes -= self._settings.center
-        planes[~np.isfinite(planes)] = 0.0
+        planes = _some_lines(values, axis, self._lines)
         share = values.size / planes.size
-        if planes.shape[2] == 1:
-            last: Gram = planes[:, :, 0].T @ planes[:, :, 0]
-            return last * share
-        columns = planes.transpose(1, 0, 2).reshape(planes.shape[1], -1)
-        gram: Gram = columns @ columns.T
-        return gram * share
+        return gram_of(planes, self._settings.center) * share
 
 
 def _some_lines(

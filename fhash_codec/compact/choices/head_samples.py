@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_formats.transform.entropy.coder import checked
 from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
 from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
 
@@ -191,19 +192,23 @@ def _fill_slots(
             first += piece.shape[2]
         return
     inverse, unit = _scales(value_range)
+    # In the order of the slots: a voxel has its inputs in many places, near those of the next slot.
+    order = np.argsort(slots)
     arrays: tuple[npt.NDArray[Any], ...] = (
         np.ascontiguousarray(decoded, dtype=np.float32),
         np.array(decoded.shape, np.int64),
-        np.ascontiguousarray(places, np.int64),
-        np.ascontiguousarray(slots, np.int64),
+        np.ascontiguousarray(places[:, order], np.int64),
+        np.ascontiguousarray(slots[order], np.int64),
         np.array(OFFSETS, np.int64),
         np.array(offsets, np.int64),
     )
     tile, shape, at, to, neighbours, seen = (ctypes.c_void_p(each.ctypes.data) for each in arrays)
-    code = library.fhash_head_inputs(
-        *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
-        *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
-        ctypes.c_void_p(inputs.ctypes.data),
+    code = checked(
+        library.fhash_head_inputs(
+            *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
+            *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
+            ctypes.c_void_p(inputs.ctypes.data),
+        )
     )
     assert code == 0, "offsets within the reach of a head"
 

@@ -180,7 +180,7 @@ def tiled_labels(task: PlanTask, trial: LabelTrial) -> Attempt:
     if task.fixed_tile is None:
         tiling = _tiling(task, settings, attempt.coding, outcome.size)
         sample = Sample(task.blocks.retile(tiling.tile), LOOK_VERTICES, task.workers)
-        sizes = {trial.tile: trial.size for trial in tiling.trials if tiling.part is None}
+        sizes = {trial.tile: trial.size for trial in tiling.trials if not tiling.parts}
         outcome = replace(outcome, size=round(sizes.get(tiling.tile, outcome.size)))
     settings = replace(
         settings,

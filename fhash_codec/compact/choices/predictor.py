@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.gram import gram_of
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Mask, Tile
 from fhash_codec.compact.tiles.sample import Sample
@@ -309,9 +310,10 @@ def _robust_solution(equations: npt.NDArray[np.float64]) -> npt.NDArray[np.float
     if len(equations) < 4 * count:
         return solution
     for _ in range(ROUNDS):
-        scaled = taps * importance[:, None]
-        gram = scaled.T @ taps
+        # Not by a library for matrices, whose threads would wait for processors.
+        products = gram_of((equations * np.sqrt(importance)[:, None])[:, :, None], 0.0)
+        gram = products[:-1, :-1]
         gram[np.diag_indices(count)] += RIDGE * np.trace(gram) / count + 1e-6
-        solution = np.asarray(np.linalg.solve(gram, scaled.T @ target), dtype=np.float64)
-        importance = 1.0 / ((target - taps @ solution) ** 2 + 0.5)
+        solution = np.asarray(np.linalg.solve(gram, products[:-1, -1]), dtype=np.float64)
+        importance = 1.0 / ((target - np.einsum("ij,j->i", taps, solution)) ** 2 + 0.5)
     return solution

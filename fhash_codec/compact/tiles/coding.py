@@ -12,6 +12,7 @@ from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.measure.sums import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.transform.tile import encoding
+from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -99,6 +100,19 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         size = len(coded.data)
         return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
     coded = encode_tile(values, settings, coding, in_coreset=counted)
+    return coded, measured(tile, coded, settings, coding)
+
+
+def recoded(tile: Tile, data: bytes, settings: TileSettings, nonzero: int = 0) -> CodedTile:
+    """Return a tile whose stream is known, as these settings decode it."""
+    t, z, y, x = tile.values.shape
+    decoded = decode_tile(data, (t, z, y, x), tile.values.dtype, settings)
+    return CodedTile(data=data, decoded=decoded, nonzero=nonzero)
+
+
+def measured(tile: Tile, coded: CodedTile, settings: TileSettings, coding: Coding) -> Outcome:
+    """Return size and error of a tile that was coded with these settings."""
+    values, counted = tile
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
     bulk = coding.bulk
@@ -108,7 +122,7 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
     bulk_squares, bulk_count = sums.bulk_squares, sums.bulk_count
     if bulk is not None and bulk.alone:
         squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
-    outcome = Outcome(
+    return Outcome(
         size=len(coded.data),
         squares=squares / scale**2,
         count=count,
@@ -117,7 +131,6 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale**2,
         bulk_count=bulk_count,
     )
-    return coded, outcome
 
 
 def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> Outcome:

@@ -6,15 +6,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from math import prod
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.tiles.blocks import Blocks, Tile
-from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
+from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
+from fhash_codec.compact.tiles.coding import Coding, Outcome, code, measured, recoded, total
 from fhash_codec.compact.tiles.filling import fill
+from fhash_codec.compact.tiles.known import Known, Run, TileRun
 from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -58,6 +59,26 @@ def strata(costs: Sequence[float], max_tiles: int) -> list[tuple[int, int]]:
         members = order[groups == group]
         chosen.append((int(members[len(members) // 2]), len(members)))
     return sorted(chosen)
+
+
+class _Job(NamedTuple):
+    """A tile to be coded, or only to be decoded where its stream is known."""
+
+    tile: Tile
+    settings: TileSettings
+    coding: Coding
+    before: TileRun | None
+    """Its stream, and the outcome with this head or another."""
+
+    def run(self) -> tuple[TileRun, Values]:
+        """Return the tile as it is coded, and its decoded values."""
+        if self.before is None:
+            coded, outcome = code(self.tile, self.settings, self.coding)
+        else:
+            stream, known = self.before
+            coded = recoded(self.tile, stream, self.settings, known.nonzero)
+            outcome = measured(self.tile, coded, self.settings, self.coding)
+        return TileRun(coded.data, outcome), coded.decoded
 
 
 class Sample:
@@ -106,6 +127,7 @@ class Sample:
         self.grams = _grams.setdefault(blocks, {})
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[TileSettings, int] | None = None
+        self._known = Known()
         self.tick = tick
 
     @property
@@ -133,7 +155,7 @@ class Sample:
         if self.blocks.complete:
             return self
         other = copy(self)
-        other._filling = settings, density
+        other._filling, other._known = (settings, density), Known()
         filled = self._pool.map(lambda tile: fill(tile, settings, density), self._source)
         other.tiles = list(self._ticking(filled))
         return other
@@ -159,19 +181,48 @@ class Sample:
     def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
         """Return the outcome of `run` for each pair of settings and coding.
 
-        All trials run at once, so that a few large tiles keep all processors busy, too.
+        All trials run at once, so that a few large tiles keep all processors busy, too. What was
+        coded before is not coded again.
         """
-        jobs = [(tile, settings, coding) for settings, coding in trials for tile in self.tiles]
-        outcomes = list(self._ticking(self._pool.map(lambda job: code(*job)[1], jobs)))
-        number = len(self.tiles)
-        return [
-            total(outcomes[start : start + number], self.weights)
-            for start in range(0, len(outcomes), number)
+        runs = [self._known.run(*trial) for trial in trials]
+        new = [trial for trial, run in zip(trials, runs, strict=True) if run is None]
+        jobs = [
+            _Job(tile, *trial, before)
+            for trial in new
+            for tile, before in zip(self.tiles, self._before(*trial), strict=True)
         ]
+        results = list(self._ticking(self._pool.map(lambda job: job.run()[0], jobs)))
+        number = len(self.tiles)
+        fresh = [
+            Run(*trial, results[start : start + number])
+            for start, trial in zip(range(0, len(results), number), new, strict=True)
+        ]
+        for run in fresh:
+            self._known.keep(run)
+        found = iter(fresh)
+        whole = [next(found) if run is None else run for run in runs]
+        return [total([tile.outcome for tile in run.tiles], self.weights) for run in whole]
+
+    def coded(self, settings: TileSettings, coding: Coding) -> dict[Index, TileRun]:
+        """Return the tiles by their indices if they were coded so before, else nothing."""
+        run = self._known.run(settings, coding)
+        return {} if run is None else dict(zip(self.indices, run.tiles, strict=True))
 
     def decoded(self, settings: TileSettings, coding: Coding) -> list[npt.NDArray[np.float32]]:
         """Code and decode the tiles; the decoded values, float32."""
-        return self.map(lambda tile: code(tile, settings, coding)[0].decoded.astype(np.float32))
+        before = self._before(settings, coding)
+        jobs = [
+            _Job(tile, settings, coding, known)
+            for tile, known in zip(self.tiles, before, strict=True)
+        ]
+        runs = list(self._ticking(self._pool.map(_Job.run, jobs)))
+        self._known.keep(Run(settings, coding, [run for run, _ in runs]))
+        return [values.astype(np.float32) for _, values in runs]
+
+    def _before(self, settings: TileSettings, coding: Coding) -> Sequence[TileRun | None]:
+        """Return each tile as it was coded before, where it was, perhaps with another head."""
+        run = self._known.same_streams(settings, coding)
+        return [None] * len(self.tiles) if run is None else run.tiles
 
     def _ticking(self, results: Iterable[Result]) -> Iterator[Result]:
         """Yield results, and call `tick` after each has come."""

@@ -190,9 +190,7 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
         )
     if not np.isfinite(gram).all() or not (math.isfinite(step) and step > 0):
         raise InputError(f"a basis needs finite data and a positive step, not {step!r}")
-    values, vectors = np.linalg.eigh(gram)
-    amplitudes = np.sqrt(np.maximum(values[::-1], 0.0))
-    spectra = vectors[:, ::-1].T @ np.array(_dct(len(gram))).T
+    amplitudes, spectra = _modes(gram.tobytes(), len(gram))
     rows: list[NDArray[np.int32]] = []
     exponents: list[int] = []
     span = np.zeros((0, len(gram)))  # orthonormal basis of the rows so far
@@ -215,6 +213,17 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
     return Basis(
         integers=np.array(rows, np.int32).reshape(len(rows), len(gram)), exponents=tuple(exponents)
     )
+
+
+@lru_cache(maxsize=32)
+def _modes(gram: bytes, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The amplitudes of the modes of a Gram matrix, the largest first, and their DCTs as rows.
+
+    They are kept for the next step that a basis is fitted for.
+    """
+    values, vectors = np.linalg.eigh(np.frombuffer(gram).reshape(n, n))
+    spectra = vectors[:, ::-1].T @ np.array(_dct(n)).T
+    return np.sqrt(np.maximum(values[::-1], 0.0)), spectra
 
 
 def _shrink(exponent: int) -> float:

@@ -53,6 +53,9 @@ Mask = npt.NDArray[np.bool_]
 _END_MARGIN = 1e-4
 """Values within this share of the range from one of its ends count as lying at that end."""
 
+_FEW = 0.03
+"""Share of a tile's values that must be free to change, so that changing them is worth its time."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Coding:
@@ -338,14 +341,19 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     low = settings.low - settings.center + margin
     high = settings.high - settings.center - margin
     coefficients = transform.forward(target)
-    for _ in range(task.coding.rounds):
+    ends = (target <= settings.dtype.type(low)) | (target >= settings.dtype.type(high))
+    free = np.count_nonzero(ends if task.counted is None else ends | ~task.counted)
+    for _ in range(task.coding.rounds if free > _FEW * target.size else 0):
         integers = choose_integers(coefficients, settings, task.coding.weight)
         if integers is None:
             break
         rebuilt = transform.inverse(
             dequantise(integers, settings.step, settings.offsets, settings.dtype)
         )
-        if not free_values(target, rebuilt, task.counted, low, high):
+        freed = free_values(target, rebuilt, task.counted, low, high)
+        if not freed:
             break
         coefficients = transform.forward(target)
+        if freed < _FEW * target.size:
+            break
     return coefficients

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from untrained_heads import some_head
 
 from fhash_codec.compact.choices.transform import usual_transform
+from fhash_codec.compact.tiles import sample as sample_module
 from fhash_codec.compact.tiles.blocks import Index, Tile
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding
 from fhash_codec.compact.tiles.sample import Sample, spread_order, strata
@@ -122,3 +125,30 @@ def test_every_filling_begins_with_the_source() -> None:
         twice = sample.filled(FILL_SETTINGS, 1).filled(FILL_SETTINGS, 2)
     for first, second in zip(once.tiles, twice.tiles, strict=True):
         np.testing.assert_array_equal(first.values, second.values)
+
+
+def test_what_was_coded_before_is_not_coded_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams are taken as they are, and a head that joins is measured on them."""
+    coded: list[TileSettings] = []
+    original = sample_module.code
+
+    def counted(tile: Tile, settings: TileSettings, coding: Coding) -> Any:
+        coded.append(settings)
+        return original(tile, settings, coding)
+
+    monkeypatch.setattr(sample_module, "code", counted)
+    settings = replace(SETTINGS, high=4.0)
+    headed = replace(settings, head=some_head())
+    with ThreadPoolExecutor(1) as workers:
+        sample, fresh = (Sample(Row(4), 4_000, workers) for _ in range(2))
+        first = sample.run(settings, Coding())
+        assert len(coded) == 4
+        assert sample.run(replace(settings), Coding()) == first
+        values = sample.decoded(settings, Coding())
+        with_head = sample.run(headed, Coding())
+        assert len(coded) == 4
+        assert set(sample.coded(settings, Coding())) == set(sample.indices)
+        assert sample.coded(replace(settings, step=2.0), Coding()) == {}
+        assert fresh.run(headed, Coding()) == with_head
+        for known, new in zip(values, fresh.decoded(settings, Coding()), strict=True):
+            np.testing.assert_array_equal(known, new)
