@@ -9,9 +9,8 @@ import math
 from dataclasses import replace
 from math import prod
 
-import numpy as np
-
 from fhash_codec.compact.attempt import Attempt, PlanTask
+from fhash_codec.compact.choices.center import mean_center, plateau_center
 from fhash_codec.compact.choices.coarser_bases import coarser_bases
 from fhash_codec.compact.choices.estimate import tile_costs
 from fhash_codec.compact.choices.fillings import choose_filling
@@ -83,7 +82,7 @@ SAME_STEP = 0.1
 
 
 def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
-    """Return settings to begin with: the usual transform, the mean as centre, a guessed step."""
+    """Return settings to begin with: the usual transform, a centre, a guessed step."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers, tick=task.parts.tick)
     goal, value_range = task.goal, task.value_range
     if goal.psnr is not None:
@@ -92,19 +91,13 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         step = 2.5 * goal.error
     else:
         step = goal.data_range * 0.05
-    center = value_range.low + goal.data_range / 2
-    with np.errstate(all="ignore"):
-        means = [
-            float(np.mean(values if counted is None else values[counted], dtype=np.float64))
-            for values, counted in sample.tiles
-        ]
-    mean = float(np.average(means, weights=sample.weights))
-    center = mean if math.isfinite(mean) else center
+    # From effort 2 on the centre is chosen once more, on the chosen tiles.
+    plateau = plateau_center(sample, value_range) if task.config.effort == 1 else None
     coder, residual_coder = coders_of(task.config.effort)
     settings = TileSettings(
         transform=usual_transform(sample.blocks.tile),
         step=1.0,
-        center=float(np.float32(center)) if abs(center) < 3e38 else center,
+        center=mean_center(sample, value_range) if plateau is None else plateau,
         low=value_range.low,
         high=value_range.high,
         offsets=OFFSETS,
@@ -137,6 +130,9 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
     with stage("sample", SAMPLE_WHY):
         sample = _sample(task, tiled, settings, TRIAL_VERTICES)
+    # Tiles were chosen about the mean: about the plateau of a shock wave their trials misled.
+    plateau = plateau_center(sample, task.value_range)
+    settings = settings if plateau is None else replace(settings, center=plateau)
     attempt = replace(attempt, sample=sample, settings=settings, tiling=tiling)
     if task.config.effort == 1:
         skip("transform", "effort 1 tries none; from 2 on")
