@@ -15,6 +15,7 @@ from fhash_codec.compact.choices.search import EXCHANGE, exchange, step_after_ga
 from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import (
     basis_bytes,
+    refit,
     rough_transform,
     usual_transform,
     wavelet,
@@ -98,6 +99,10 @@ class Trials:
         coding = replace(self._coding, error=None)
         sample = self._sample(self.shape, 1 << 62)
         found, outcome = find_step(sample, found, coding, goal, tries=2, tried=self._settled)
+        # Bases made for the finer step of the first guess would take too many bytes beside others.
+        refitted = refit(sample, found)
+        if refitted is not found:
+            found, outcome = find_step(sample, refitted, coding, goal, tries=2, tried=self._settled)
         self._settings = replace(found, transform=settings.transform)
         self._note(sample, outcome, found)
         return self._settings
