@@ -7,20 +7,33 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import pytest
 
 from fhash_codec.compact.attempt import GainLog, PlanTask
+from fhash_codec.compact.choices.head_samples import Pair
+from fhash_codec.compact.choices.head_training import train_head
+from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.stages import first_settings
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.compact.tiles_to_promise import SAFE, _Aim, _code_to_psnr, code_series
+from fhash_codec.compact.tiles.coding import Coding, Outcome, recoded
+from fhash_codec.compact.tiles_to_promise import (
+    SAFE,
+    _Aim,
+    _code_all,
+    _code_to_psnr,
+    _head_holds,
+    code_series,
+)
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
+from fhash_formats.transform.head.head import NeighbourHead
+from fhash_formats.transform.tile.settings import TileSettings
 
 Field = Callable[..., npt.NDArray[Any]]
 
@@ -48,6 +61,48 @@ def test_an_aim_is_met_from_above_only(quick: bool) -> None:
     assert not aim.is_met(41.0, 0)
     assert aim.is_met(41.0, 1)
     assert aim.next_target(39.0, 0) > aim.min_psnr
+
+
+def moving_sphere() -> npt.NDArray[Any]:
+    """A sphere (4, 24, 32, 32) of sharp edge, which a transform smears and a head mends."""
+    t, z, y, x = np.indices((4, 24, 32, 32))
+    far = np.sqrt((z - 12) ** 2 + (y - 16) ** 2 + (x - 10 - 3 * t) ** 2)
+    return np.tanh(9 - far).astype(np.float32)
+
+
+def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
+    """One that was trained on the tiles saves more than it takes; one for noise does not."""
+    series = ArraySeries(moving_sphere())
+    config = EncodeConfig(psnr=38.0, effort=2, tile="2x24x32x32", without=("transform",))
+    aim = _Aim(psnr=38.0, data_range=2.0, quick=False)
+    with ThreadPoolExecutor(2) as workers:
+        selection = select_features(series, config, silent)
+        table = code_series(series, selection, config, silent)
+        blocks, settings = table.plan.blocks, table.plan.settings
+        assert _head_holds(table, aim, workers)  # it has none
+        pairs = []
+        for index, stream in zip(blocks.indices(), table.streams, strict=True):
+            tile = blocks.read(index)
+            pairs.append(Pair(recoded(tile, stream, settings).decoded, tile.values, None))
+        head = trained(pairs, settings)
+        assert _head_holds(_recoded(table, replace(settings, head=head), workers), aim, workers)
+        noise = np.random.default_rng(0).normal(size=(2, 24, 32, 32)).astype(np.float32)
+        head = trained([Pair(noise, -noise, None)], settings)
+        table = _recoded(table, replace(settings, head=head), workers)
+        assert not _head_holds(table, aim, workers)
+
+
+def trained(pairs: list[Pair], settings: TileSettings) -> NeighbourHead:
+    """A small head for some tiles."""
+    low, high = settings.low, settings.high
+    found = train_head(pairs, low=low, high=high, updates=300, samples=60_000, hidden=(4, 4))
+    assert found is not None
+    return found.head
+
+
+def _recoded(table: CodedTable, settings: TileSettings, workers: ThreadPoolExecutor) -> CodedTable:
+    """All tiles of a table with other settings."""
+    return _code_all(replace(table.plan, settings=settings, sample=None), workers, silent)
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0])
