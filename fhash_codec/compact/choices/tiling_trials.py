@@ -102,7 +102,7 @@ class Trials:
         # Bases made for the finer step of the first guess would take too many bytes beside others.
         refitted = refit(sample, found)
         if refitted is not found:
-            found, outcome = find_step(sample, refitted, coding, goal, tries=2, tried=self._settled)
+            found, outcome = refitted, sample.run(refitted, coding)
         self._settings = replace(found, transform=settings.transform)
         self._note(sample, outcome, found)
         return self._settings

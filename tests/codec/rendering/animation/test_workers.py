@@ -58,7 +58,8 @@ def test_what_a_process_raises_is_raised_here_and_none_is_left(volume: Volume) -
 
 
 def test_a_process_that_ends_by_itself_is_an_error(volume: Volume) -> None:
-    rendered = rendered_by_workers(volume, [SMALL] * 4, 1)
+    # More pictures than the pipe holds, so that the process cannot be ready before it is killed.
+    rendered = rendered_by_workers(volume, [SMALL] * 300, 1)
     next(rendered)
     for child in multiprocessing.active_children():
         assert child.pid is not None
