@@ -125,7 +125,7 @@ def plan(
     with stage("first guess", "mean and approximate bytes, by which tiles are chosen"):
         settings = first_settings(task, tiled)
     trial = _label_trial(task, tiled, settings)
-    if trial is not None and trial.clearly and goal.lossless:
+    if trial is not None and trial.clearly:
         parts.end()
         return _label_plan(task, tiled_labels(task, trial))
     if _can_estimate(task, tiled, settings) and not _beats_estimate(trial, task, tiled, settings):

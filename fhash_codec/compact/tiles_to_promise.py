@@ -258,11 +258,11 @@ def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bo
 
     def measure(job: tuple[bytes, Index | Tile]) -> Outcome:
         stream, source = job
-        tile = source if isinstance(source, Tile) else blocks.read(source)
+        tile = _tile_of(blocks, source)
         return measured(tile, recoded(tile, stream, plain), plain, table.plan.coding)
 
-    tiles = (index if blocks.in_memory else blocks.read(index) for index in blocks.indices())
-    jobs = zip(table.streams, tiles, strict=True)
+    sources = (_readable(blocks, index) for index in blocks.indices())
+    jobs = zip(table.streams, sources, strict=True)
     with stage("coding", "gain of the head in all tiles"):
         without = total(list(map_ahead(workers, measure, jobs, 2 * usable_threads())))
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
@@ -295,7 +295,7 @@ def _code_all(
     def work(source: Index | Tile | TileRun) -> tuple[bytes, Outcome, Values | None]:
         if isinstance(source, TileRun):
             return source.stream, source.outcome, None
-        tile = source if isinstance(source, Tile) else blocks.read(source)
+        tile = _tile_of(blocks, source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome, coded.decoded if keeps_decoded else None
 
@@ -339,4 +339,14 @@ def _sources(coding_plan: CodingPlan) -> Iterator[Index | Tile | TileRun]:
         elif index in filled:
             yield filled[index]
         else:
-            yield index if blocks.in_memory else blocks.read(index)
+            yield _readable(blocks, index)
+
+
+def _readable(blocks: Blocks, index: Index) -> Index | Tile:
+    """Return a tile, or its index where the workers may read it themselves."""
+    return index if blocks.in_memory else blocks.read(index)
+
+
+def _tile_of(blocks: Blocks, source: Index | Tile) -> Tile:
+    """Return the tile that `_readable` stands for."""
+    return source if isinstance(source, Tile) else blocks.read(source)

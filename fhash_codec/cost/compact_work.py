@@ -148,12 +148,12 @@ def stage_seconds(
     if labels is not None:
         seconds["labels"] = look.labelling
     if labels is not None and (
-        (labels.clearly and look.task.goal.lossless)
+        labels.clearly
         or is_hopeless(
             labels.attempt.outcome.size, look.attempt.outcome.size, labels.entropy, labels.rank
         )
     ):
-        if not (labels.clearly and look.task.goal.lossless):
+        if not labels.clearly:
             seconds["first guess"] = look.guessing
         return seconds | {"coding": _all_tiles(work, rates.final)}
     if _estimated(look, config):

@@ -24,7 +24,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.transform.axes.basis import MAX_LENGTH
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.labelled import has_regions
+from fhash_formats.transform.tile.labelled import has_regions, surely_exceeds
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
@@ -56,7 +56,7 @@ class LabelTrial:
 
     Attributes:
         attempt: tiles that were looked at, and settings.
-        clearly: whether nothing else that is exact can take fewer bytes.
+        clearly: whether nothing else can take fewer bytes; never where values need not be exact.
         entropy: bytes of the values by how often each occurs in its tile, whatever stands around.
         rank: see `rank_share`.
     """
@@ -123,14 +123,10 @@ def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     # Vertices that are not occupied take a label of their own.
     spare = not tiled.complete
     for tile in sample.tiles:
-        # A look at some values is enough for most tiles of other data.
-        few = np.unique(tile.values.reshape(-1)[:: max(1, tile.values.size // 4096)])
-        if few.size > MAX_NARROW - spare and not has_regions(tile.values):
+        most = MAX_LABELS if has_regions(tile.values) else MAX_NARROW
+        if surely_exceeds(tile.values, most - spare):
             continue
-        distinct = np.unique(tile.values).size
-        if distinct <= MAX_NARROW - spare:
-            return True
-        if distinct <= MAX_LABELS - spare and has_regions(tile.values):
+        if np.unique(tile.values).size <= most - spare:
             return True
     return False
 
@@ -155,7 +151,7 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
             if counted is None or counted.any()
         ]
     )
-    clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
+    clearly = task.goal.lossless and CLEARLY * outcome.size <= sample.run(settings, exact).size
     task.gains.note("labels", outcome)
     attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
     return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planned import plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.attempt import GainLog, PlanTask
 from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort
-from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import (
     choose_step,
     choose_tiles,
@@ -25,30 +24,13 @@ from fhash_codec.compact.stages import (
     try_head,
     try_predictor,
 )
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.coreset.selection import select_features
-from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
 
 Field = Callable[..., npt.NDArray[Any]]
 
 
 def test_the_stages_follow_each_other_and_leave_out_what_does_not_apply(field: Field) -> None:
-    series = ArraySeries(field((4, 8, 12, 16)))
-    config = EncodeConfig(effort=2, psnr=45.0)
-    selection = select_features(series, config, silent)
-    value_range = selection.scanned.value_range
     with ThreadPoolExecutor(2) as workers:
-        task = PlanTask(
-            blocks=Blocks(series, selection.extent, series.shape),
-            value_range=value_range,
-            features=selection.features,
-            config=config,
-            goal=goal_of(config, value_range, 1, 0),
-            fixed_tile=(4, 8, 6, 8),
-            workers=workers,
-            gains=GainLog(100),
-        )
+        task = plan_task(field((4, 8, 12, 16)), workers, fixed_tile=(4, 8, 6, 8), psnr=45.0)
         tiled = task.blocks.retile((4, 8, 6, 8))
         guess = first_guess(task, tiled, first_settings(task, tiled))
         attempt = choose_tiles(task, guess)

@@ -35,13 +35,15 @@ from fhash_formats.transform.tile.sections import (
 )
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["build_labelled_stream", "has_regions", "unpack_labelled"]
+__all__ = ["build_labelled_stream", "has_regions", "surely_exceeds", "unpack_labelled"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
 REGION_SHARE = 0.5
 """Share of vertices with an equal neighbour from which on many different values may be labels."""
+_LOOK = 4096
+"""Values that are looked at, at least, where there are as many."""
 _HEAD = 8
 """Bytes before the palette."""
 
@@ -53,6 +55,15 @@ def has_regions(values: Values) -> bool:
         moved, marks = np.moveaxis(values, axis, 0), np.moveaxis(equal, axis, 0)
         marks[1:] |= moved[1:] == moved[:-1]
     return bool(equal.mean() >= REGION_SHARE)
+
+
+def surely_exceeds(values: Values, most: int) -> bool:
+    """Whether a look at some of the values finds more than `most` different ones.
+
+    That is enough for most tiles that have no labels.
+    """
+    flat = values.reshape(-1)
+    return bool(np.unique(flat[:: max(1, flat.size // _LOOK)]).size > most)
 
 
 def build_labelled_stream(
@@ -69,8 +80,7 @@ def build_labelled_stream(
     most = MAX_LABELS if many else MAX_NARROW
     bits = np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}").reshape(-1)
     kept = bits if occupied is None else bits[occupied.reshape(-1)]
-    # A look at some values is enough for most tiles of other data.
-    if np.unique(kept[:: max(1, kept.size // 4096)]).size > most:
+    if surely_exceeds(kept, most):
         return None
     palette = np.unique(kept)
     count = palette.size + (occupied is not None)

@@ -9,16 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planned import plan_task, waves
 
-from fhash_codec import EncodeConfig
-from fhash_codec.compact.attempt import GainLog, PlanTask
 from fhash_codec.compact.choices.tiling_trials import FAR, Trials
-from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import first_guess, first_settings
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.coreset.selection import select_features
-from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
 
 Values = npt.NDArray[Any]
 
@@ -29,27 +23,10 @@ def workers() -> Iterator[ThreadPoolExecutor]:
         yield pool
 
 
-def waves(shape: tuple[int, int, int, int]) -> Values:
-    t, z, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
-    values = np.sin(0.21 * x + 0.1 * t) + np.cos(0.17 * y - 0.2 * t) * np.sin(0.3 * z + 0.05 * t)
-    return (values + 0.02 * np.random.default_rng(1).normal(size=shape)).astype(np.float32)
-
-
 def trials_on(
     values: Values, workers: ThreadPoolExecutor, boxes: int = 0, **promise: float
 ) -> Trials:
-    series, config = ArraySeries(values), EncodeConfig(effort=2, **(promise or {"psnr": 40.0}))
-    selection = select_features(series, config, silent)
-    task = PlanTask(
-        blocks=Blocks(series, selection.extent, series.shape),
-        value_range=selection.scanned.value_range,
-        features=selection.features,
-        config=config,
-        goal=goal_of(config, selection.scanned.value_range, 1, 0),
-        fixed_tile=None,
-        workers=workers,
-        gains=GainLog(100),
-    )
+    task = plan_task(values, workers, **promise)
     guess = first_guess(task, task.blocks, first_settings(task, task.blocks))
     blocks = task.blocks
     if boxes:

@@ -11,21 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planned import plan_task, waves
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.attempt import GainLog, PlanTask
+from fhash_codec.compact.attempt import PlanTask
 from fhash_codec.compact.choices import tilings
 from fhash_codec.compact.choices.tilings import choose_tiling, largest_tile
-from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import first_guess, first_settings
 from fhash_codec.compact.tiles import access
 from fhash_codec.compact.tiles.access import PRICES, Tiling, region_vertices
-from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.config import ACCESSES
-from fhash_codec.coreset.selection import select_features
-from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
 
 Values = npt.NDArray[Any]
 
@@ -41,12 +37,6 @@ def shell() -> Values:
 
 def noise() -> Values:
     return np.random.default_rng(3).normal(size=(4, 24, 32, 32)).astype(np.float32)
-
-
-def waves(shape: tuple[int, int, int, int]) -> Values:
-    t, z, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
-    values = np.sin(0.21 * x + 0.1 * t) + np.cos(0.17 * y - 0.2 * t) * np.sin(0.3 * z + 0.05 * t)
-    return (values + 0.02 * np.random.default_rng(1).normal(size=shape)).astype(np.float32)
 
 
 def labels() -> Values:
@@ -71,18 +61,7 @@ def workers() -> Iterator[ThreadPoolExecutor]:
 def chosen(
     values: Values, wish: str, workers: ThreadPoolExecutor, **promise: Any
 ) -> tuple[Tiling, PlanTask]:
-    series, config = ArraySeries(values), EncodeConfig(effort=2, **(promise or {"psnr": 40.0}))
-    selection = select_features(series, config, silent)
-    task = PlanTask(
-        blocks=Blocks(series, selection.extent, series.shape),
-        value_range=selection.scanned.value_range,
-        features=selection.features,
-        config=config,
-        goal=goal_of(config, selection.scanned.value_range, 1, 0),
-        fixed_tile=None,
-        workers=workers,
-        gains=GainLog(100),
-    )
+    task = plan_task(values, workers, **promise)
     guess = first_guess(task, task.blocks, first_settings(task, task.blocks))
     return choose_tiling(task, guess.settings, guess.coding, wish), task
 
