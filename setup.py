@@ -1,4 +1,4 @@
-"""The two native extensions: the C++ of `fhash_formats.native` and that of `fhash_codec.native`.
+"""The native extensions: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
 
 The rest of the build is described in pyproject.toml. The extensions are optional. Without a C++17
 compiler the build says so and goes on: the package then computes the same in numpy, more slowly.
@@ -14,6 +14,8 @@ FORMATS = Path("formats/fhash_formats/native")
 """Sources of the file format's library; the codec's library includes core.hpp and guard.hpp."""
 CODEC = Path("fhash_codec/native")
 """Sources of the codec's library."""
+NETWORK = CODEC / "network"
+"""Sources of the library that trains and evaluates the paper's network."""
 
 # No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on
 # every machine. That nothing traps, and loops marked as independent, change no bit; without them
@@ -30,6 +32,8 @@ GNU_FLAGS = [
 ]
 GNU_LINK_FLAGS = ["-Wl,-s"] if sys.platform == "linux" else []
 """Debug records and symbol tables would make the libraries five times as large."""
+NETWORK_FLAGS = ("-ffp-contract=fast",)
+"""Fused multiply-adds for the network alone: no stream depends on its bits."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
@@ -39,19 +43,24 @@ class BuildNative(build_ext):
     def build_extensions(self) -> None:
         for extension in self.extensions:
             msvc = self.compiler.compiler_type == "msvc"
-            extension.extra_compile_args = MSVC_FLAGS if msvc else GNU_FLAGS
+            own = extension.extra_compile_args
+            extension.extra_compile_args = MSVC_FLAGS if msvc else [*GNU_FLAGS, *own]
             extension.extra_link_args = [] if msvc else GNU_LINK_FLAGS
         super().build_extensions()
 
 
-def native(name: str, folder: Path) -> Extension:
-    """The extension of all C++ sources in a folder, for the limited API of Python 3.11."""
+def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
+    """The extension of all C++ sources in a folder, for the limited API of Python 3.11.
+
+    `flags` are added to those of every extension, where the compiler is GCC or Clang.
+    """
     headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp")}
     return Extension(
         name,
         sources=sorted(path.as_posix() for path in folder.glob("*.cpp")),
         depends=sorted(path.as_posix() for path in headers),
         include_dirs=[FORMATS.as_posix()],
+        extra_compile_args=list(flags),
         define_macros=[("Py_LIMITED_API", "0x030B0000")],
         py_limited_api=True,
         language="c++",
@@ -63,8 +72,9 @@ setup(
     ext_modules=[
         native("fhash_formats.native._core", FORMATS),
         native("fhash_codec.native._codec", CODEC),
+        native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
     cmdclass={"build_ext": BuildNative},
-    # The two libraries take a minute each; they are built side by side.
+    # The libraries take up to a minute each; they are built side by side.
     options={"bdist_wheel": {"py_limited_api": "cp311"}, "build_ext": {"parallel": 2}},
 )

@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = (
     "formats/fhash_formats/native/_core.abi3.so",
     "fhash_codec/native/_codec.abi3.so",
+    "fhash_codec/native/network/_network.abi3.so",
 )
 
 

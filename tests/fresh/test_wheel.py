@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 from fresh_install import fhash, run
 
-LIBRARIES = ("fhash_formats/native/_core.abi3.so", "fhash_codec/native/_codec.abi3.so")
+LIBRARIES = (
+    "fhash_formats/native/_core.abi3.so",
+    "fhash_codec/native/_codec.abi3.so",
+    "fhash_codec/native/network/_network.abi3.so",
+)
 HEAVY = ("torch", "vtkmodules", "matplotlib", "numba", "hdf5plugin", "skimage", "dask")
 """Packages of the extras, which a plain install leaves out."""
 
@@ -21,14 +25,20 @@ def test_a_plain_install_holds_no_heavy_package(site: Path, tmp_path: Path) -> N
         assert run(site, tmp_path, "-c", script).stdout.strip() == "None", name
 
 
-def test_both_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> None:
+def test_the_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> None:
     script = (
-        "import fhash_formats.native, fhash_codec.native;"
+        "import fhash_formats.native, fhash_codec.native, fhash_codec.native.network;"
         "print(fhash_formats.native.library() is not None,"
-        " fhash_codec.native.library() is not None, fhash_codec.__file__)"
+        " fhash_codec.native.library() is not None,"
+        " fhash_codec.native.network.library() is not None, fhash_codec.__file__)"
     )
     result = run(site, tmp_path, "-c", script)
-    assert result.stdout.split() == ["True", "True", str(site / "fhash_codec" / "__init__.py")]
+    assert result.stdout.split() == [
+        "True",
+        "True",
+        "True",
+        str(site / "fhash_codec" / "__init__.py"),
+    ]
 
 
 def test_the_wheel_holds_the_stripped_abi3_libraries(wheel: Path) -> None:

@@ -1,0 +1,53 @@
+"""The loader of the network's native library."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import fhash_formats.native as formats_native
+from fhash_codec import native as codec_native
+from fhash_codec.native import network
+from fhash_codec.native.network import ABI_VERSION, PROTOTYPES
+
+SOURCES = Path(network.__file__).parent
+
+
+def test_the_environment_switches_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    assert network.library() is None
+
+
+def test_it_is_a_library_of_its_own() -> None:
+    library = network.library()
+    if library is None:
+        pytest.skip("the native library was not built here")
+    assert library not in (codec_native.library(), formats_native.library())
+    assert library.fhash_network_abi_version() == ABI_VERSION
+
+
+def test_the_sources_and_the_loader_agree_on_the_abi() -> None:
+    source = (SOURCES / "network.cpp").read_text(encoding="utf-8")
+    assert f"FHASH_NETWORK_ABI = {ABI_VERSION};" in source
+
+
+def test_the_prototypes_take_the_arguments_of_the_sources() -> None:
+    names = {
+        formats_native.ARRAY: "*",
+        formats_native.INTEGER: "int64_t",
+        formats_native.REAL: "double",
+    }
+    exported = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
+    sources = {
+        name: [
+            "*" if "*" in argument else argument.split()[0].removeprefix("std::")
+            for argument in arguments.split(",")
+            if argument
+        ]
+        for path in SOURCES.glob("*.cpp")
+        for name, arguments in exported.findall(path.read_text(encoding="utf-8"))
+    }
+    del sources["fhash_network_abi_version"]
+    assert sources == {name: [names[kind] for kind in kinds] for name, kinds in PROTOTYPES.items()}
