@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
+from exports import exported
 
 import fhash_formats.native as formats_native
 from fhash_codec import native as codec_native
@@ -34,20 +34,4 @@ def test_the_sources_and_the_loader_agree_on_the_abi() -> None:
 
 
 def test_the_prototypes_take_the_arguments_of_the_sources() -> None:
-    names = {
-        formats_native.ARRAY: "*",
-        formats_native.INTEGER: "int64_t",
-        formats_native.REAL: "double",
-    }
-    exported = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
-    sources = {
-        name: [
-            "*" if "*" in argument else argument.split()[0].removeprefix("std::")
-            for argument in arguments.split(",")
-            if argument
-        ]
-        for path in SOURCES.glob("*.cpp")
-        for name, arguments in exported.findall(path.read_text(encoding="utf-8"))
-    }
-    del sources["fhash_network_abi_version"]
-    assert sources == {name: [names[kind] for kind in kinds] for name, kinds in PROTOTYPES.items()}
+    assert exported(SOURCES) == PROTOTYPES
