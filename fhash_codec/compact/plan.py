@@ -13,8 +13,8 @@ from fhash_codec.compact.choices.estimate import estimated_size, estimated_step
 from fhash_codec.compact.choices.head import HeadHistory
 from fhash_codec.compact.choices.labels import (
     LabelTrial,
+    ends_trials,
     has_labels,
-    is_hopeless,
     look_at_labels,
     may_be_many,
     tiled_labels,
@@ -163,9 +163,7 @@ def _by_trial(
         attempt = first_guess(task, tiled, settings)
     if trial is not None and not task.goal.lossless:
         trial = with_step_of(trial, attempt)
-    if trial is not None and is_hopeless(
-        trial.attempt.outcome.size, attempt.outcome.size, trial.entropy, trial.rank
-    ):
+    if trial is not None and ends_trials(trial, attempt.outcome.size):
         return _label_plan(task, tiled_labels(task, trial))
     attempt = _improved(task, attempt)
     settings = attempt.settings

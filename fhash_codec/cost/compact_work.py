@@ -25,7 +25,7 @@ from fhash_codec.compact.choices.head_prospects import (
     expected_gain,
     likely_heads,
 )
-from fhash_codec.compact.choices.labels import is_hopeless
+from fhash_codec.compact.choices.labels import ends_trials
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.choices.quantiser import allows_trellis
 from fhash_codec.compact.choices.search import EXCHANGE
@@ -147,12 +147,7 @@ def stage_seconds(
     labels = look.labels
     if labels is not None:
         seconds["labels"] = look.labelling
-    if labels is not None and (
-        labels.clearly
-        or is_hopeless(
-            labels.attempt.outcome.size, look.attempt.outcome.size, labels.entropy, labels.rank
-        )
-    ):
+    if labels is not None and (labels.clearly or ends_trials(labels, look.attempt.outcome.size)):
         if not labels.clearly:
             seconds["first guess"] = look.guessing
         return seconds | {"coding": _all_tiles(work, rates.final)}

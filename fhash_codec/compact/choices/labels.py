@@ -17,7 +17,7 @@ from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.choices.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.access import Tiling
-from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.measure.value_range import ValueRange
@@ -29,6 +29,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
     "LabelTrial",
+    "ends_trials",
     "has_labels",
     "is_hopeless",
     "look_at_labels",
@@ -57,14 +58,24 @@ class LabelTrial:
     Attributes:
         attempt: tiles that were looked at, and settings.
         clearly: whether nothing else can take fewer bytes; never where values need not be exact.
+        alone: whether nothing but labels may be tried: values must be exact, or all tiles may be
+            labels. A sample may lie on a plateau beside a shell, whose tiles then have the settings
+            of a first guess.
         entropy: bytes of the values by how often each occurs in its tile, whatever stands around.
         rank: see `rank_share`.
     """
 
     attempt: Attempt
     clearly: bool
+    alone: bool
     entropy: float
     rank: float
+
+
+def ends_trials(trial: LabelTrial, other: float) -> bool:
+    """Whether labels are taken after a first guess of `other` bytes without a transform."""
+    size = trial.attempt.outcome.size
+    return trial.alone and is_hopeless(size, other, trial.entropy, trial.rank)
 
 
 def is_hopeless(labels: float, other: float, entropy: float, rank: float) -> bool:
@@ -120,15 +131,23 @@ def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     """Whether any tile of a sample has few enough different values, or regions of equal ones."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
+    return any(_is_labels(tile, tiled) for tile in sample.tiles)
+
+
+def _are_all_labels(task: PlanTask, tiled: Blocks) -> bool:
+    """Whether all tiles of a series may be labels; of one larger than memory, those of a sample."""
+    if not tiled.in_memory:
+        sample = Sample(tiled, LOOK_VERTICES, task.workers)
+        return all(_is_labels(tile, tiled) for tile in sample.tiles)
+    return all(_is_labels(tiled.read(index), tiled) for index in tiled.indices())
+
+
+def _is_labels(tile: Tile, tiled: Blocks) -> bool:
+    """Whether a tile has few enough different values to be coded as labels."""
     # Vertices that are not occupied take a label of their own.
     spare = not tiled.complete
-    for tile in sample.tiles:
-        most = MAX_LABELS if has_regions(tile.values) else MAX_NARROW
-        if surely_exceeds(tile.values, most - spare):
-            continue
-        if np.unique(tile.values).size <= most - spare:
-            return True
-    return False
+    most = (MAX_LABELS if has_regions(tile.values) else MAX_NARROW) - spare
+    return not surely_exceeds(tile.values, most) and np.unique(tile.values).size <= most
 
 
 def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial:
@@ -152,9 +171,10 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
         ]
     )
     clearly = task.goal.lossless and CLEARLY * outcome.size <= sample.run(settings, exact).size
+    alone = task.goal.lossless or _are_all_labels(task, tiled)
     task.gains.note("labels", outcome)
     attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
-    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)
+    return LabelTrial(attempt=attempt, clearly=clearly, alone=alone, entropy=entropy, rank=rank)
 
 
 def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:

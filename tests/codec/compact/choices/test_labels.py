@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import lzma
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from planned import plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact import plan as planning
-from fhash_codec.compact.choices.labels import is_hopeless, rank_share
+from fhash_codec.compact.choices.labels import (
+    ends_trials,
+    is_hopeless,
+    look_at_labels,
+    rank_share,
+)
+from fhash_codec.compact.stages import first_settings
 
 
 def moving_regions() -> np.ndarray:
@@ -74,6 +82,20 @@ def test_labels_under_a_promise_with_tiles_that_have_none(tmp_path) -> None:
     assert np.abs(decoded - values).max() <= 2.0
     np.testing.assert_array_equal(decoded[:, :, :48, :48], values[:, :, :48, :48])
     assert size < encoded(tmp_path, values, tile="6x12x16x16")[0]
+
+
+def test_a_plateau_beside_a_shell_of_many_values_does_not_end_the_trials() -> None:
+    """Tiles of a sample may all lie on the plateau; those of the shell are no labels."""
+    regions = moving_regions().astype("f4")
+    shell = regions.copy()
+    shell[:, :, -16:, -16:] = np.random.default_rng(0).normal(0, 1, (6, 12, 16, 16))
+    with ThreadPoolExecutor(2) as workers:
+        for values, alone in ((regions, True), (shell, False)):
+            task = plan_task(values, workers, psnr=45.0)
+            tiled = task.blocks.retile((6, 12, 16, 16))
+            trial = look_at_labels(task, tiled, first_settings(task, tiled))
+            assert trial.alone is alone
+            assert ends_trials(trial, 1e9) is alone
 
 
 def test_values_that_a_transform_codes_in_fewer_bytes_are_no_labels(tmp_path) -> None:
