@@ -22,6 +22,11 @@ PROTOTYPES: Prototypes = {
     "fhash_network_paths": (),
     "fhash_network_fma": (INTEGER, INTEGER),
     "fhash_network_copy": (ARRAY, ARRAY, INTEGER),
+    # train_bricks.cpp
+    "fhash_bricks_work": (ARRAY,),
+    "fhash_bricks_gaps": (ARRAY, INTEGER, INTEGER),
+    "fhash_bricks_touch": (ARRAY,),
+    "fhash_bricks_run": (ARRAY, INTEGER, INTEGER),
 }
 """Functions of this package's library that Python calls."""
 
