@@ -21,7 +21,7 @@ struct Work {
     float* picked;         // the same of the samples alone
     Planes planes;
     float* mlp;
-    std::int32_t* places;  // (vertices,): those of the samples
+    std::int32_t* runs;    // (vertices + 1,): first vertex and end of each run of samples
     std::int64_t* rows;    // places of the rows of corners, level by level
     std::int64_t size;     // numbers of all memory
 
@@ -49,7 +49,7 @@ struct Work {
         w.planes.x = take(b.embedding * lines * groups_of(b) * FHASH_GROUP);
         w.planes.y = take(b.embedding * planes * plane);
         w.mlp = take(Mlp::memory(count - 1, b.hidden, b.width, P::N, Tiles<P>::CHUNK));
-        w.places = reinterpret_cast<std::int32_t*>(take(vertices_of(b)));
+        w.runs = reinterpret_cast<std::int32_t*>(take(vertices_of(b) + 1));
         w.rows = reinterpret_cast<std::int64_t*>(take(2 * rows));
         return w;
     }
@@ -76,22 +76,61 @@ FHASH_INLINE Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, cons
     return t;
 }
 
-// Write the places of a brick's samples; return their number.
-template <class P> FHASH_INLINE std::int64_t places_of(const Thread<P>& t, std::int64_t brick) {
+// Write where the runs of a brick's samples begin and end; return the number of runs.
+template <class P> FHASH_INLINE std::int64_t runs_of(const Thread<P>& t, std::int64_t brick) {
     const std::uint8_t* bits = t.b.mask + brick * t.b.mask_bytes;
-    std::int64_t count = 0;
-    for (std::int64_t v = 0; v < t.vertices; v++) {
-        t.w.places[count] = (std::int32_t)v;
-        count += bits[v >> 3] >> (7 - (v & 7)) & 1;
+    std::int64_t edges = 0;
+    std::uint64_t last = 0;  // whether the vertex before is a sample
+    for (std::int64_t first = 0; first < t.b.mask_bytes; first += 8) {
+        std::uint64_t word = 0;
+        const std::int64_t bytes = smaller(8, t.b.mask_bytes - first);
+        for (std::int64_t i = 0; i < bytes; i++)
+            word |= (std::uint64_t)bits[first + i] << (56 - 8 * i);
+        std::uint64_t changes = word ^ (word >> 1 | last << 63);
+        last = word & 1;
+        while (changes) {
+            const int place = __builtin_clzll(changes);
+            t.w.runs[edges++] = (std::int32_t)(8 * first + place);
+            changes &= ~(1ull << 63 >> place);
+        }
     }
-    return count;
+    if (edges % 2) t.w.runs[edges++] = (std::int32_t)t.vertices;
+    return edges / 2;
+}
+
+// Copy runs of the numbers of a row side by side, and zeros behind them to the end of a vector.
+template <class P> FHASH_INLINE void pick(const Thread<P>& t, std::int64_t runs, const float* from,
+                                          float* to, std::int64_t samples) {
+    std::int64_t at = 0;
+    for (std::int64_t n = 0; n < runs; n++) {
+        const std::int64_t first = t.w.runs[2 * n], length = t.w.runs[2 * n + 1] - first;
+        for (std::int64_t i = 0; i < length; i += P::N)
+            store<P>(to + at + i, loaded<P>(from + first + i));
+        at += length;
+    }
+    for (; at < (samples + P::N - 1) / P::N * P::N; at++) to[at] = 0;
+}
+
+// Copy them back, with zeros between them. What a vector writes too much is written again.
+template <class P> FHASH_INLINE void put_back(const Thread<P>& t, std::int64_t runs,
+                                              const float* from, float* to) {
+    const typename P::F zero = {};
+    std::int64_t at = 0, end = 0;
+    for (std::int64_t n = 0; n <= runs; n++) {
+        const std::int64_t first = n < runs ? t.w.runs[2 * n] : t.vertices;
+        for (std::int64_t i = end; i < first; i += P::N) store<P>(to + i, zero);
+        end = n < runs ? t.w.runs[2 * n + 1] : first;
+        for (std::int64_t i = first; i < end; i += P::N)
+            store<P>(to + i, loaded<P>(from + at + i - first));
+        at += end - first;
+    }
 }
 
 // Write the inputs at all vertices of a brick, and return the rows of its samples: those of all
 // vertices where all are samples. `flat` holds the coarse tables, caught up.
 template <class P>
 FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
-                              const float* flat, std::int64_t samples) {
+                              const float* flat, std::int64_t samples, std::int64_t* run_count) {
     const FhashBricks& b = t.b;
     const std::int64_t row = t.w.row, numbers = b.embedding * t.vertices;
     for (std::int64_t e = 0; e < b.embedding; e++) {
@@ -113,14 +152,10 @@ FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap&
         rows += level.corners[0] * level.corners[1] * level.corners[2];
     }
     if (samples == t.vertices) return t.w.inputs;
-    places_of(t, brick);
-    const std::int64_t whole = (samples + P::N - 1) / P::N * P::N;
-    for (std::int64_t k = 0; k < t.inputs; k++) {
-        const float* FHASH_RESTRICT from = t.w.inputs + k * row;
-        float* FHASH_RESTRICT to = t.w.picked + k * row;
-        for (std::int64_t s = 0; s < samples; s++) to[s] = from[t.w.places[s]];
-        for (std::int64_t s = samples; s < whole; s++) to[s] = 0;
-    }
+    const std::int64_t runs = runs_of(t, brick);
+    for (std::int64_t n = 0; n < t.inputs; n++)
+        pick(t, runs, t.w.inputs + n * row, t.w.picked + n * row, samples);
+    *run_count = runs;
     return t.w.picked;
 }
 
@@ -173,7 +208,8 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
         const std::int64_t brick = b.chosen[i], row = t.w.row;
         const std::int64_t samples = b.offsets[brick + 1] - b.offsets[brick];
         const Gap gap(b.gaps, b.visited[brick], b.step - 1);
-        float* rows = inputs_of(t, brick, gap, b.flat, samples);
+        std::int64_t runs = 0;
+        float* rows = inputs_of(t, brick, gap, b.flat, samples, &runs);
         float* const fine = b.fine + brick * b.embedding * t.vertices;
         if (gap.factor != 0)
             for (std::int64_t e = 0; e < b.embedding; e++)
@@ -181,12 +217,8 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
                             t.vertices * sizeof(float));
         error += backpropagate(t, rows, b.values + b.offsets[brick], samples);
         if (rows == t.w.picked)
-            for (std::int64_t k = 0; k < t.inputs; k++) {
-                const float* FHASH_RESTRICT from = t.w.picked + k * row;
-                float* FHASH_RESTRICT to = t.w.inputs + k * row;
-                std::memset(to, 0, t.vertices * sizeof(float));
-                for (std::int64_t s = 0; s < samples; s++) to[t.w.places[s]] = from[s];
-            }
+            for (std::int64_t k = 0; k < t.inputs; k++)
+                put_back(t, runs, t.w.picked + k * row, t.w.inputs + k * row);
         const std::int64_t* level_rows = t.w.rows;
         for (std::int64_t l = 0; l < b.levels; l++) {
             const FhashLevel& level = b.level[l];
@@ -213,7 +245,8 @@ template <class P> FHASH_INLINE void infer(const FhashBricks& b, std::int64_t th
         const std::int64_t brick = b.chosen[i];
         const std::int64_t samples = b.offsets[brick + 1] - b.offsets[brick];
         const Gap gap(b.gaps, b.visited[brick], b.step);
-        float* rows = inputs_of(t, brick, gap, b.current, samples);
+        std::int64_t runs = 0;
+        float* rows = inputs_of(t, brick, gap, b.current, samples, &runs);
         in_chunks<P>(samples, [&](std::int64_t at, std::int64_t vectors) FHASH_LAMBDA {
             t.mlp.template forward<P>(rows + at, t.w.row, vectors, false);
             std::memcpy(b.out + b.places[i] + at, t.mlp.value,
