@@ -1,0 +1,66 @@
+// Training and evaluation of the paper's network by bricks: the functions that Python calls. The
+// kernels are those of brick_kernels.hpp, compiled for each path in a file of its own.
+#include "bricks.hpp"
+#include "gaps.hpp"
+
+namespace {
+
+bool is_sound(const FhashBricks& b) {
+    return b.embedding > 0 && b.levels >= 0 && b.hidden >= 0 && b.hidden <= 2 && b.threads > 0 &&
+           (!b.hidden || (b.width > 0 && b.width <= FHASH_WIDEST)) && vertices_of(b) > 0;
+}
+
+}  // namespace
+
+// Numbers of memory that a thread needs, or a negative number for a task that cannot be done.
+FHASH_EXPORT int64_t fhash_bricks_work(const FhashBricks* task) {
+    if (!has_path(task->path)) return FHASH_NO_PATH;
+    if (!is_sound(*task)) return -1;
+#if defined(FHASH_THREE_PATHS)
+    if (task->path == FHASH_PATH_V4) return fhash_bricks_work_v4(*task);
+    if (task->path == FHASH_PATH_V3) return fhash_bricks_work_v3(*task);
+#endif
+#if defined(FHASH_VECTORS)
+    return fhash_bricks_work_v1(*task);
+#else
+    return FHASH_NO_PATH;
+#endif
+}
+
+// Sum the missed steps (`FhashGaps`) up to the steps first .. last, one after the other.
+FHASH_EXPORT int64_t fhash_bricks_gaps(const FhashBricks* task, int64_t first, int64_t last) {
+    for (int64_t step = first; step <= last; step++) sweep(task->gaps, step);
+    return 0;
+}
+
+// List the blocks whose numbers the chosen bricks need; return how many there are.
+FHASH_EXPORT int64_t fhash_bricks_touch(const FhashBricks* task) {
+    const FhashBricks& b = *task;
+    int64_t touches = 0;
+    for (int64_t i = 0; b.levels && i < b.count; i++) {
+        const FhashLevel& l = b.level[0];
+        const int32_t* place = b.bricks + 4 * b.chosen[i];
+        const int64_t count = l.corners[3] * b.embedding;
+        for_rows(b, l, place, [&](int64_t at) {
+            for (int64_t block = at / FHASH_BLOCK; block <= (at + count - 1) / FHASH_BLOCK; block++)
+                if (b.stamps[block] != b.step) {
+                    b.stamps[block] = b.step;
+                    b.touched[touches++] = block;
+                }
+        });
+    }
+    return touches;
+}
+
+// Do the share of one thread in a part. All threads finish a part before the next one begins.
+FHASH_EXPORT int64_t fhash_bricks_run(const FhashBricks* task, int64_t part, int64_t thread) {
+#if defined(FHASH_THREE_PATHS)
+    if (task->path == FHASH_PATH_V4) return fhash_bricks_run_v4(*task, part, thread);
+    if (task->path == FHASH_PATH_V3) return fhash_bricks_run_v3(*task, part, thread);
+#endif
+#if defined(FHASH_VECTORS)
+    return fhash_bricks_run_v1(*task, part, thread);
+#else
+    return FHASH_NO_PATH;
+#endif
+}
