@@ -42,3 +42,8 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device is 'cuda', but torch finds no CUDA device here; use --device cpu")
     return torch.device(name)
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's text: CUDA adds advice for programmers to it."""
+    return str(error).strip().split("\n")[0]
