@@ -170,7 +170,7 @@ def test_a_device_without_enough_memory_says_so(
 ) -> None:
     import torch
 
-    def full(places: object) -> None:
+    def full(places: object, wanted: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     field, task = planned(volume, {}, tensors)
