@@ -22,7 +22,9 @@ from fhash_codec.paper.training.fit import train_model
 from fhash_codec.paper.training.train import TrainingProgress
 from fhash_formats.errors import FhashWarning, InputError
 
-CONFIG = EncodeConfig(profile="paper", epochs=2, width=8, batch=20_000, device="cuda")
+CONFIG = EncodeConfig(
+    profile="paper", epochs=2, width=8, batch=20_000, device="cuda", engine="slab"
+)
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def saved(coreset: Coreset, architecture: Architecture, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("tables", ["float16", "transform"])
 def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
     values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
-    config = EncodeConfig(profile="paper", epochs=3, width=8, device="cuda", tables=tables)
+    config = replace(CONFIG, epochs=3, batch=0, tables=tables)
     with pretended_cuda() as pretended, warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)  # of the quality of three epochs
         figures = fhash_codec.encode(values.astype(np.float32), tmp_path / "a.fhz", config)
