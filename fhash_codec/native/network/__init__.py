@@ -25,6 +25,11 @@ PROTOTYPES: Prototypes = {
     # points.cpp
     "fhash_network_points": (*(ARRAY,) * 4, INTEGER, INTEGER, ARRAY, ARRAY),
     "fhash_network_still": (ARRAY, ARRAY, REAL, INTEGER, ARRAY),
+    # train_bricks.cpp
+    "fhash_bricks_work": (ARRAY,),
+    "fhash_bricks_gaps": (ARRAY, INTEGER, INTEGER),
+    "fhash_bricks_touch": (ARRAY,),
+    "fhash_bricks_run": (ARRAY, INTEGER, INTEGER),
 }
 """Functions of this package's library that Python calls."""
 
