@@ -60,6 +60,5 @@ def _curves(panel: Any, entry: dict[str, Any], clock: str) -> None:
         )
     for goal in GOALS:
         panel.axhline(goal, color="#c9cbd1", linewidth=0.8)
-    panel.set_xscale("log")
     panel.grid(True, color="#e3e4e8", linewidth=0.8)
     panel.set_axisbelow(True)
