@@ -1,4 +1,4 @@
-"""What the machine can do at most: arithmetic and copies of memory, by the clocks of the engines.
+"""The peaks of the machine: arithmetic and copies of memory, by the clocks of the engines.
 
 The arithmetic of a CPU is that of fused multiply-adds in registers, by the native library, for each
 of the machine's instructions; without the library, that of torch's float32 matrix product. The

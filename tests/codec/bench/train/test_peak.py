@@ -1,4 +1,4 @@
-"""What the machine can do: named by operation, instructions and precision."""
+"""Peaks of the machine, named by operation, instructions and precision."""
 
 from __future__ import annotations
 
