@@ -36,9 +36,9 @@ __all__ = ["NAMES", "bench_train"]
 
 NAMES = ("native", *(name for name in ENGINES if name != "native"))
 """Engines that can be measured."""
-TURNS = 6
+TURNS = 10
 """Turns over which each engine's time is spread, and points of its curve."""
-INFER_SECONDS = 0.2
+INFER_SECONDS = 0.12
 """Seconds of evaluation in each turn."""
 
 
