@@ -164,6 +164,7 @@ def _text(result: dict[str, Any]) -> str:
             f" {entry['brick_fill']:.0%} full, {entry['batch_bricks']:.0f} bricks a step;"
             f" model {size(entry['float16_bytes'])} as float16",
             _engines(entry["engines"]),
+            *_threads(entry["engines"]),
             _points(entry["points"]),
             f"decoding {number(entry['decode_msamples_s'], digits=3)} M/s,"
             f" {number(entry['decode_ratio'], digits=3)} times as fast as by whole blocks",
@@ -205,6 +206,17 @@ def _engines(runs: list[dict[str, Any]]) -> str:
         for run in runs
     ]
     return table([header, *rows])
+
+
+def _threads(runs: list[dict[str, Any]]) -> list[str]:
+    """A line with the rates of several threads over one, by time that passed; none without."""
+    ratios = [
+        f"{run['engine']} {number(run['thread_ratio'], digits=3)}"
+        for run in runs
+        if run["thread_ratio"] is not None
+    ]
+    count = max(run["threads"] for run in runs)
+    return [f"{count} threads over one, time that passed: {', '.join(ratios)}"] if ratios else []
 
 
 def _points(points: list[dict[str, Any]]) -> str:

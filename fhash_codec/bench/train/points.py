@@ -16,11 +16,11 @@ from fhash_codec.paper.points import sample_points
 
 __all__ = ["bench_points"]
 
-POINTS = 1 << 17
+POINTS = 1 << 19
 """Points of a measurement."""
 RAY_POINTS = 128
 """Points of a ray."""
-TURNS = 3
+TURNS = 2
 """Turns of which the best counts."""
 
 Points = npt.NDArray[np.float64]
