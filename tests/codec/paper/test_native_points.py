@@ -112,6 +112,28 @@ def test_few_points_of_one_time_have_the_bits_of_many(networks, library, monkeyp
     assert once == [2.3]
 
 
+def test_points_beside_borders_are_read_where_they_are_evaluated(networks, library) -> None:
+    """One point a call: a cell that was not read would show at once."""
+    network = networks.random((7, 50, 125), 3, 2, 2, 1)
+    for level in network.levels[1:4]:
+        border = [
+            k * (s - 1) / max(r - 1, 1)
+            for k, s, r in zip((1, 2, 11, 29), (3, 7, 50, 125), level, strict=True)
+        ]
+        border = [min(b, s - 1.0) for b, s in zip(border, (3, 7, 50, 125), strict=True)]
+        for end in (0.0, 1e9):
+            place = [
+                min(float(np.nextafter(b, end)), s - 1.0)
+                for b, s in zip(border, (3, 7, 50, 125), strict=True)
+            ]
+            np.testing.assert_allclose(
+                sample_points(network, *place),
+                networks.reference(network, [np.array([p]) for p in place]),
+                rtol=1e-5,
+                atol=1e-5,
+            )
+
+
 def test_strided_places_and_several_threads_change_nothing(networks, library) -> None:
     network = networks.random((20, 21, 22), 5, 2, 2, 1)
     rows = np.stack(networks.points(network, 100_000), axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -42,3 +44,16 @@ def test_a_vertex_on_a_corner_lies_in_the_cell_that_begins_there(size: int) -> N
     before, after_weight, pace = locate((size,) * 4, (size,) * 4, vertices)
     np.testing.assert_array_equal(before[0] + after_weight[0], np.arange(size))
     assert pace.tolist() == [1.0 if size > 1 else 0.0] * 4
+
+
+@pytest.mark.parametrize(("size", "resolution"), [(125, 63), (80, 41), (7, 3), (997, 499), (50, 2)])
+def test_points_beside_a_border_lie_in_the_exact_cell(size: int, resolution: int) -> None:
+    """The native library finds cells without a quotient: it must find the same, which were read."""
+    borders = np.arange(1, resolution - 1) * (size - 1) / (resolution - 1)
+    places = np.concatenate([borders, *(np.nextafter(borders, end) for end in (0, size))])
+    places = np.append(places, [0.0, size - 1.0])
+    (before, *_), after_weight, _ = locate((size,) * 4, (resolution,) * 4, np.tile(places, (4, 1)))
+    scaled = [Fraction(float(place * (resolution - 1))) for place in places]
+    exact = [min(place // (size - 1), resolution - 2) for place in scaled]
+    assert before.tolist() == exact
+    assert ((after_weight >= 0) & (after_weight <= 1)).all()
