@@ -82,6 +82,11 @@ class BricksType(click.ParamType[tuple[int, ...]]):
     type=BricksType(),
     help="Bricks of a training step, each measured, such as 64,256; without it, --batch.",
 )
+@click.option(
+    "--whole/--no-whole",
+    default=True,
+    help="With a feature, measure the whole DATA too, or the feature alone.",
+)
 @config_options(
     "features",
     "dilation",
@@ -105,6 +110,7 @@ def train(
     engines: tuple[str, ...] | None,
     seconds: float,
     bricks: tuple[int, ...] | None,
+    whole: bool,
     config: EncodeConfig,
     plot: str | None,
     force: bool,
@@ -113,7 +119,7 @@ def train(
 ) -> None:
     """Train the model of DATA with each engine in turns; speeds in million samples a second.
 
-    With a feature, the whole DATA is measured too: bricks around a feature are partly empty.
+    With a feature, the whole DATA is measured too, since bricks around a feature are partly empty.
     Without DATA: a made series, a blast's shell as a feature, and whole. DATA generated:argon is
     a made series of the size of the paper's Argon box.
 
@@ -144,6 +150,7 @@ def train(
             engines=engines or (),
             seconds=seconds,
             bricks=bricks or (),
+            whole=whole,
             progress=progress,
         )
     if plot is not None:

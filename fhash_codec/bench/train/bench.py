@@ -49,6 +49,7 @@ def bench_train(
     engines: Sequence[str] = (),
     seconds: float = 12.0,
     bricks: Sequence[int] = (),
+    whole: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure engines on the coreset of a series.
@@ -66,6 +67,7 @@ def bench_train(
         engines: names of the engines; all that take the model if empty.
         seconds: training of each engine: seconds of processors, on a GPU those that pass.
         bricks: bricks of a training step, each measured; empty for the batch of `config`.
+        whole: whether a series with a feature is measured without it, too.
         progress: called with each step of the work.
 
     Raises:
@@ -89,7 +91,7 @@ def bench_train(
     else:
         opened = open_source(name)
     configs = [config]
-    if config.features != ("all",):
+    if whole and config.features != ("all",):
         configs.append(replace(config, features=("all",)))
     with opened as series:
         results = [

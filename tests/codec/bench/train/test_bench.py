@@ -85,6 +85,8 @@ def test_a_series_with_a_feature_is_measured_whole_too(series: ArraySeries) -> N
     assert (sparse["features"], whole["features"]) == ([feature], ["all"])
     assert sparse["samples"] < whole["samples"] == series.values.size
     assert sparse["brick_fill"] < whole["brick_fill"]
+    report = bench_train(series, config, engines=("naive",), seconds=0.01, whole=False)
+    assert [entry["features"] for entry in report["series"]] == [[feature]]
 
 
 def test_bricks_of_a_step_are_measured_each(series: ArraySeries) -> None:
