@@ -160,6 +160,7 @@ def _header(
             "steps": trained.steps,
             "epochs": trained.epochs,
             "device": trained.device,
+            **trained.engine,
             **restarts,
         },
         "history": brief_history(trained.history, timings=config.timings),

@@ -207,7 +207,9 @@ def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypa
 
     monkeypatch.setattr("fhash_codec.paper.engines.slab.SlabEngine", Spoilt)
     with pytest.raises(TrainingError, match="not finite"):
-        fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
+        fhash_codec.encode(
+            field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01, engine="slab")
+        )
     assert not list(tmp_path.iterdir())
 
 

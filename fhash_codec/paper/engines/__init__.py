@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.config import ENGINES
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,10 +29,12 @@ class Engine(Protocol):
     and follow the same learning rates.
 
     Attributes:
+        name: name of the engine.
         rates: learning rate of every training step, float64 and counted from 1; rates[0] is unused.
         step: training steps done so far.
     """
 
+    name: str
     rates: npt.NDArray[np.float64]
     step: int
 
@@ -72,7 +75,7 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: slab, naive, or auto for the fastest.
+        name: native, slab, naive, or auto for native where it takes the model, and else slab.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
@@ -80,9 +83,15 @@ def make_engine(
         device: where the engine computes.
 
     Raises:
-        InputError: the name is unknown.
+        InputError: the name is unknown, or the engine does not take the model.
     """
-    if name in ("auto", "slab"):
+    from fhash_codec.paper.engines.native import NativeEngine, refusal
+
+    if name == "auto":
+        name = "slab" if refusal(architecture, device) else "native"
+    if name == "native":
+        return NativeEngine(architecture, coreset, rates, seed=seed, device=device)
+    if name == "slab":
         from fhash_codec.paper.engines.slab import SlabEngine
 
         return SlabEngine(architecture, coreset, rates, seed=seed, device=device)
@@ -90,4 +99,15 @@ def make_engine(
         from fhash_codec.paper.engines.naive import NaiveEngine
 
         return NaiveEngine(architecture, coreset, rates, seed=seed, device=device)
-    raise InputError(f"unknown engine '{name}'; known: auto, slab, naive")
+    raise InputError(f"unknown engine '{name}'; known: auto, {', '.join(ENGINES)}")
+
+
+def describe_engine(engine: Engine, threads: int) -> dict[str, str | int]:
+    """Return what a file's header says of the engine that trained its model.
+
+    The keys are `engine`, its name; `threads`; and for the native engine `path`, the name of the
+    processor's instructions that it used.
+    """
+    said: dict[str, str | int] = {"engine": engine.name, "threads": threads}
+    path = getattr(engine, "path", None)
+    return said if path is None else said | {"path": path}

@@ -129,7 +129,7 @@ class NativeEngine:
         self._used = upsampling.used.numpy()
         self._rank = None if upsampling.rank is None else upsampling.rank.numpy()
         self._tables = LevelTables(architecture, coreset)
-        self._coreset_arrays = {
+        self._coreset_arrays: dict[str, npt.NDArray[Any]] = {
             "bricks": np.ascontiguousarray(coreset.bricks, np.int32),
             "mask": np.ascontiguousarray(coreset.mask_bits),
             "values": np.ascontiguousarray(coreset.values, np.float32),
@@ -277,10 +277,9 @@ class NativeEngine:
             stamps=self._stamps.ctypes.data,
             touched=self._touched.ctypes.data,
         )
-        for name, array in self._coreset_arrays.items():
+        own = {name: getattr(self, name) for name in (*STATE, "blocks")}
+        for name, array in (self._coreset_arrays | own).items():
             setattr(task, name, array.ctypes.data)
-        for name in (*STATE, "blocks"):
-            setattr(task, name, getattr(self, name).ctypes.data)
         assert self._native is not None
         task.work_size = self._native.fhash_bricks_work(ctypes.byref(task))
         assert task.work_size > 0

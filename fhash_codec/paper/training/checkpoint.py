@@ -42,6 +42,8 @@ def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Pat
         "fold": config.model_fold,
         "embedding_size": config.model_embedding_size,
         "width": config.model_width,
+        # The other engines go on from each other's state.
+        "engine": "naive" if config.engine == "naive" else "bricks",
     }
     digest = hashlib.sha256(
         json.dumps(

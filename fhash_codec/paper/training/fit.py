@@ -53,6 +53,7 @@ class TrainedModel:
         steps: training steps, one for each batch.
         history: {seconds, epoch, psnr} after epochs.
         device: type of the device.
+        engine: the engine, as `describe_engine` says it.
         checkpoint: path of the checkpoint, of no more use once the numbers are written.
         restarts: restarts at a lower learning rate.
         learning_rate: learning rate of the last start.
@@ -66,6 +67,7 @@ class TrainedModel:
     steps: int
     history: list[dict[str, float | None]]
     device: str
+    engine: dict[str, str | int]
     checkpoint: Path
     restarts: int
     learning_rate: float
@@ -130,7 +132,7 @@ class _Fitting:
 
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress, self._goal = progress, goal
-        self._limited = False
+        self._limited, self._threads = False, 1
         self._device: torch.device = choose_device(config.device)
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -147,7 +149,7 @@ class _Fitting:
         with (
             stage("training", f"{plan.epochs} epochs of {plan.batches} steps"),
             deferred_interrupts() as stop,
-            threads_for(plan.batch_samples),
+            threads_for(plan.batch_samples) as self._threads,
         ):
             while self._trained_to_end(engine, plan, stop):
                 further = self._next_round(engine, plan)
@@ -280,6 +282,8 @@ class _Fitting:
 
     def _trained(self, engine: Engine, plan: TrainingPlan) -> TrainedModel:
         """Return the numbers of the engine. Raises TrainingError if they are not finite."""
+        from fhash_codec.paper.engines import describe_engine
+
         parameters = engine.parameters()
         if not all(
             bool(vector.isfinite().all())
@@ -295,6 +299,7 @@ class _Fitting:
             steps=plan.epochs * plan.batches,
             history=self._reached.history,
             device=self._device.type,
+            engine=describe_engine(engine, self._threads),
             checkpoint=self._checkpoint,
             restarts=self._reached.restarts,
             learning_rate=self._reached.rate(self._config.learning_rate),

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from fhash_codec.native import network
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.engines import describe_engine, make_engine
+from fhash_codec.paper.engines.native import machine_paths
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")
@@ -21,7 +23,37 @@ def test_unknown_engines_are_refused(noise_coreset) -> None:
         )
 
 
-@pytest.mark.parametrize("name", ["slab", "naive"])
+def test_auto_is_native_where_it_takes_the_model_and_else_slab(noise_coreset, monkeypatch) -> None:
+    coreset = noise_coreset((1, 2, 2, 2))
+
+    def chosen(hidden_layers):
+        architecture = Architecture.for_box((2, 2, 2), 1, hidden_layers=hidden_layers)
+        return make_engine("auto", architecture, coreset, np.zeros(1), seed=0, device=CPU)
+
+    engine = chosen(2)
+    if network.library() is None:
+        assert describe_engine(engine, 3) == {"engine": "slab", "threads": 3}
+    else:
+        assert describe_engine(engine, 3) == {
+            "engine": "native",
+            "threads": 3,
+            "path": machine_paths()[0],
+        }
+    assert chosen(3).name == "slab"
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    assert chosen(2).name == "slab"
+
+
+def test_an_engine_that_was_named_is_never_replaced(noise_coreset, monkeypatch) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    architecture = Architecture.for_box((2, 2, 2), 1)
+    with pytest.raises(InputError, match="native library is missing"):
+        make_engine(
+            "native", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
+        )
+
+
+@pytest.mark.parametrize("name", ["auto", "slab", "naive"])
 def test_restoring_a_state_goes_on_bit_for_bit(noise_coreset, name) -> None:
     coreset = noise_coreset((3, 9, 10, 20))
     architecture = Architecture.for_box(coreset.box.shape, 3, width=8)

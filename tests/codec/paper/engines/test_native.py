@@ -1,0 +1,295 @@
+"""The native engine trains what the naive one in float64 does, on every path of the machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.native import network
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines.naive import NaiveEngine
+from fhash_codec.paper.engines.native import NativeEngine, machine_paths, refusal
+from fhash_codec.paper.engines.native_task import BLOCK, PATHS
+from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_formats.errors import InputError
+
+CPU = torch.device("cpu")
+RATES = np.full(201, 0.01)
+STEPS = 40
+CASES = {
+    "plain": ((4, 7, 16, 30), {"hidden_layers": 1}),
+    "one key frame, linear readout": (
+        (1, 17, 16, 16),
+        {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
+    ),
+    "thin axes, two hidden layers": (
+        (3, 1, 33, 2),
+        {"embedding_size": 3, "hidden_layers": 2, "width": 32},
+    ),
+    "a column": ((2, 5, 1, 1), {"hidden_layers": 1}),
+    "one voxel": ((2, 1, 1, 1), {"hidden_layers": 1}),
+    "a row of many groups": ((2, 1, 1, 700), {"hidden_layers": 1}),
+    "a row of many groups, few of them full": ((2, 1, 3, 300), {"hidden_layers": 1, "low": 0.9}),
+    "a few vertices far apart": ((3, 30, 40, 50), {"hidden_layers": 1, "low": 0.9999}),
+    "no coarse levels": ((2, 9, 9, 20), {"hidden_layers": 1, "levels": 1}),
+    "odd width, large embeddings": (
+        (2, 6, 9, 40),
+        {"embedding_size": 4, "hidden_layers": 1, "width": 37, "fold": 4},
+    ),
+    "64 neurons twice": ((2, 9, 12, 20), {"hidden_layers": 2, "width": 64, "low": 0.5}),
+    "128 neurons twice": ((1, 9, 12, 20), {"hidden_layers": 2, "width": 128}),
+}
+
+if network.library() is None:
+    pytest.skip("the native library was not built here", allow_module_level=True)
+
+
+@pytest.fixture(params=PATHS)
+def path(request: pytest.FixtureRequest) -> str:
+    """Each path of the kernels; those that the machine lacks are skipped."""
+    name: str = request.param
+    if name not in machine_paths():
+        pytest.skip(f"this machine has no {name}")
+    return name
+
+
+@pytest.fixture(scope="session")
+def model_of(noise_coreset):
+    """A function of a case's name: its coreset and architecture."""
+
+    def make(case, **changes):
+        shape, settings = CASES[case] if isinstance(case, str) else case
+        settings = {"embedding_size": 2, "width": 16} | settings | changes
+        coreset = noise_coreset(shape, settings.pop("low", 0.3))
+        levels = settings.pop("levels", None)
+        architecture = Architecture.for_box(coreset.box.shape, shape[0], **settings)
+        return coreset, replace(architecture, levels=architecture.levels[:levels])
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def oracle_of(model_of):
+    """A function of a case's name: the batches, the errors and the numbers of the oracle."""
+    known = {}
+
+    def make(case):
+        if case not in known:
+            coreset, architecture = model_of(case)
+            oracle = NaiveEngine(
+                architecture, coreset, RATES, seed=7, device=CPU, dtype=torch.float64
+            )
+            first = oracle.infer(np.arange(len(coreset.bricks))).numpy()
+            random, bricks = np.random.default_rng(1), len(coreset.bricks)
+            batches = [random.permutation(bricks)[: max(1, bricks // 3)] for _ in range(STEPS)]
+            errors = [float(oracle.train(batch)) for batch in batches]
+            known[case] = first, batches, errors, oracle.parameters()
+        return known[case]
+
+    return make
+
+
+@pytest.fixture
+def threads():
+    """A function that sets torch's number of threads until the test ends."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def _assert_near(ours, theirs) -> None:
+    """Parameters agree by median and count: near a ReLU's kink float32 may take the other side."""
+    for a, b in (
+        (ours.fine, theirs.fine),
+        (ours.coarse, theirs.coarse),
+        (ours.network, theirs.network),
+    ):
+        if not a.numel():
+            continue
+        # What no sample moved is 0 in ours and still at its start in the oracle's.
+        apart = (a - b)[a != 0].abs()
+        # A thousandth of one Adam step, after STEPS of them.
+        assert float(apart.median()) < 1e-3 * 0.01
+        assert float((apart > 1e-3).double().mean()) < 0.01
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_trains_like_a_dense_adam_in_float64(model_of, oracle_of, path, case) -> None:
+    coreset, architecture = model_of(case)
+    first, batches, errors, expected = oracle_of(case)
+    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    values = engine.infer(np.arange(len(coreset.bricks))).numpy()
+    assert values.shape == coreset.values.shape
+    np.testing.assert_allclose(values, first, atol=3e-7)
+    ours = [float(engine.train(batch)) for batch in batches]
+    np.testing.assert_allclose(ours, errors, rtol=1e-3, atol=1e-6)
+    _assert_near(engine.parameters(), expected)
+
+
+def test_gradients_equal_those_of_autograd_in_float64(model_of, path) -> None:
+    """After one step Adam's mean is a tenth of the gradient."""
+    coreset, architecture = model_of("64 neurons twice")
+    bricks = np.arange(len(coreset.bricks))
+    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    oracle = NaiveEngine(architecture, coreset, RATES, seed=7, device=CPU, dtype=torch.float64)
+    used = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU).upsampling.used
+    engine.train(bricks)
+    oracle.train(bricks)
+    tables = torch.cat([table.grad.flatten() for table in list(oracle.model.tables)[1:]])
+    parts = [tables[used]]
+    for weight, bias in zip(oracle.model.weights, oracle.model.biases, strict=True):
+        parts.append(torch.column_stack([weight.grad, bias.grad]))
+    expected = torch.cat([part.flatten() for part in parts]).numpy()
+    apart = np.abs(engine.state()["flat_mean"] * 10 - expected) / np.abs(expected).max()
+    assert np.median(apart) < 1e-7
+    assert (apart > 1e-5).mean() < 0.001
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_same_seed_path_and_threads_give_the_same_bits(model_of, path, threads, count) -> None:
+    coreset, architecture = model_of(((3, 9, 20, 35), {"hidden_layers": 2, "low": 0.6}))
+    bricks = len(coreset.bricks)
+    states = []
+    for _ in range(2):
+        engine = NativeEngine(architecture, coreset, RATES, seed=3, path=path)
+        random = np.random.default_rng(5)
+        threads(count)
+        errors = [float(engine.train(random.permutation(bricks)[:5])) for _ in range(8)]
+        states.append(engine.state() | {"errors": np.array(errors)})
+    for name, array in states[0].items():
+        np.testing.assert_array_equal(array, states[1][name], err_msg=name)
+
+
+def test_threads_change_no_more_than_the_last_digits(model_of, threads) -> None:
+    coreset, architecture = model_of("plain")
+    ends = []
+    for count in (1, 3):
+        threads(count)
+        engine = NativeEngine(architecture, coreset, RATES, seed=3)
+        for _ in range(4):
+            engine.train(np.arange(len(coreset.bricks)))
+        ends.append(engine.infer(np.arange(len(coreset.bricks))[::-1].copy()).numpy())
+    np.testing.assert_allclose(*ends, atol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["plain", "a few vertices far apart", "no coarse levels"])
+def test_slab_and_native_go_on_from_each_other(model_of, case) -> None:
+    coreset, architecture = model_of(case)
+    random, bricks = np.random.default_rng(1), len(coreset.bricks)
+    batches = [random.permutation(bricks)[: max(1, bricks // 3)] for _ in range(30)]
+    slab = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
+    alternating = NativeEngine(architecture, coreset, RATES, seed=7)
+    for step, batch in enumerate(batches):
+        if step in (10, 20):
+            other = (
+                SlabEngine(architecture, coreset, RATES, seed=1, device=CPU)
+                if step == 10
+                else NativeEngine(architecture, coreset, RATES, seed=2)
+            )
+            other.restore({name: array.copy() for name, array in alternating.state().items()})
+            alternating = other
+        error = float(slab.train(batch))
+        assert float(alternating.train(batch)) == pytest.approx(error, rel=1e-3, abs=1e-6)
+    assert alternating.name == "native"
+    _assert_near(alternating.parameters(), slab.parameters())
+
+
+def test_a_step_moves_no_block_that_it_does_not_need(model_of) -> None:
+    coreset, architecture = model_of(((3, 30, 40, 50), {"hidden_layers": 1}))
+    engine = NativeEngine(architecture, coreset, RATES, seed=7)
+    assert len(engine.blocks) == -(-engine.lazy // BLOCK)
+    engine.train(np.array([0]))
+    visited = engine.blocks > 0
+    assert 0 < visited.sum() < 0.2 * len(visited)
+    behind = engine.flat.copy()
+    engine.train(np.array([len(coreset.bricks) - 1]))
+    same = np.repeat(engine.blocks != 2, BLOCK)[: engine.lazy]
+    np.testing.assert_array_equal(engine.flat[: engine.lazy][same], behind[: engine.lazy][same])
+    # The state has what a dense Adam has: it moves what had a gradient before.
+    settled = engine.state()["flat"]
+    moved = np.repeat(visited & (engine.blocks != 2), BLOCK)[: engine.lazy]
+    assert (settled[: engine.lazy][moved] != engine.flat[: engine.lazy][moved]).any()
+
+
+def test_evaluation_changes_nothing(model_of) -> None:
+    coreset, architecture = model_of("plain")
+    bricks = len(coreset.bricks)
+    ends = []
+    for looks in (False, True):
+        engine = NativeEngine(architecture, coreset, RATES, seed=7)
+        for step in range(9):
+            engine.train(np.array([step % bricks]))
+            if looks:
+                engine.infer(np.arange(bricks))
+                engine.state()
+        ends.append(engine.state())
+    for name, array in ends[0].items():
+        np.testing.assert_array_equal(array, ends[1][name], err_msg=name)
+
+
+def test_settling_changes_no_value_beyond_rounding(model_of) -> None:
+    coreset, architecture = model_of("plain")
+    engine = NativeEngine(architecture, coreset, RATES, seed=7)
+    for brick in range(len(coreset.bricks)):
+        engine.train(np.array([brick]))
+    bricks = np.arange(len(coreset.bricks))
+    before = engine.infer(bricks).numpy()
+    engine.settle()
+    np.testing.assert_allclose(engine.infer(bricks).numpy(), before, atol=1e-6)
+
+
+def test_other_learning_rates_count_from_the_next_step_on(model_of) -> None:
+    """A training that goes on beyond its plan has a longer course of the rate."""
+    coreset, architecture = model_of("plain")
+    engines = [
+        NativeEngine(architecture, coreset, RATES[:11], seed=7),
+        NativeEngine(architecture, coreset, RATES, seed=7),
+    ]
+    for step in range(20):
+        if step == 10:
+            engines[0].rates = RATES
+        errors = {float(engine.train(np.array([step % 3]))) for engine in engines}
+        assert len(errors) == 1
+
+
+def test_embeddings_that_no_sample_moved_are_stored_as_zero(in_coreset, model_of) -> None:
+    coreset, architecture = model_of(((3, 9, 20, 35), {"hidden_layers": 1}))
+    engine = NativeEngine(architecture, coreset, RATES, seed=7)
+    engine.train(np.arange(len(coreset.bricks)))
+    fine = engine.parameters().fine.numpy()
+    mask = in_coreset(coreset)
+    outside = np.moveaxis(fine, 1, -1)[~mask]
+    assert not outside.any()
+    assert not np.signbit(outside).any()
+    assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
+
+
+def test_a_state_of_another_model_is_refused(model_of) -> None:
+    coreset, architecture = model_of("plain")
+    engine = NativeEngine(architecture, coreset, RATES, seed=7)
+    other = NativeEngine(replace(architecture, width=8), coreset, RATES, seed=7)
+    with pytest.raises(ValueError, match="flat"):
+        engine.restore(other.state())
+    with pytest.raises(KeyError):
+        engine.restore({"step": np.array(3)})
+
+
+def test_what_it_does_not_take_is_named(model_of, monkeypatch) -> None:
+    coreset, architecture = model_of("plain")
+
+    def refused(match, **changes):
+        with pytest.raises(InputError, match=match):
+            NativeEngine(replace(architecture, **changes), coreset, RATES, seed=7)
+
+    refused("2 hidden layers at most, not 3", hidden_layers=3)
+    refused("128 neurons at most, not 129", width=129)
+    assert refusal(replace(architecture, width=1024, hidden_layers=0), CPU) is None
+    assert "device is 'cuda'" in str(refusal(architecture, torch.device("cuda")))
+    with pytest.raises(InputError, match="path is 'quick'"):
+        NativeEngine(architecture, coreset, RATES, seed=7, path="quick")
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    assert machine_paths() == []
+    refused("native library is missing")
