@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
-from fhash_formats.native import ARRAY, INTEGER, Prototypes, load_library
+from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
@@ -22,6 +22,9 @@ PROTOTYPES: Prototypes = {
     "fhash_network_paths": (),
     "fhash_network_fma": (INTEGER, INTEGER),
     "fhash_network_copy": (ARRAY, ARRAY, INTEGER),
+    # points.cpp
+    "fhash_network_points": (*(ARRAY,) * 4, INTEGER, INTEGER, ARRAY, ARRAY),
+    "fhash_network_still": (ARRAY, ARRAY, REAL, INTEGER, ARRAY),
     # train_bricks.cpp
     "fhash_bricks_work": (ARRAY,),
     "fhash_bricks_gaps": (ARRAY, INTEGER, INTEGER),
