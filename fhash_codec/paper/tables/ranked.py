@@ -1,30 +1,28 @@
 """Tables that hold only some vertices of a level, found by the rank of a bit in a bitmap.
 
-A bitmap has one bit for each bucket of a level at one time node, 1 where the vertex is held. The
-held embeddings lie one after the other in the order of their buckets, so the place of an embedding
-is the number of ones before its bit, its *rank*. Two small arrays of counts make a rank one
-population count: a perfect hash of an arbitrary region, without collisions and without a search.
+A bitmap has one bit for each vertex of a level at one time, 1 where the vertex is held. The held
+embeddings lie one after the other in the order of their bits, so the place of an embedding is the
+number of ones before its bit, its *rank*. Two small arrays of counts make a rank one population
+count: a perfect hash of an arbitrary region, without collisions and without a search.
 
-The bitmap with its counts takes 1.25 bits for each bucket. numpy only.
+The bitmap with its counts takes 1.25 bits for each vertex of the level. numpy only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.network import Floats
 from fhash_formats.errors import InputError
 
+Floats = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-WORD = 64
-"""Bits of a word of the bitmap."""
 BLOCK_WORDS = 4
 """Words of a block: ones before a word in its block fit in one byte."""
 MAX_COUNT = 2**32 - 1
@@ -36,31 +34,26 @@ class RankedBits:
     """A bitmap, and for each of its ones the number of ones before it.
 
     Attributes:
-        size: number of bits.
-        words: uint64 (ceil(size / 64),); position p is bit p % 64, 0 the lowest, of word p // 64.
-            Bits beyond `size` are 0.
-        blocks: uint32 (ceil(words / 4) + 1,), ones before each block of 4 words; the last is the
+        words: uint64 (n,); position p is bit p % 64, 0 the lowest, of word p // 64.
+        blocks: uint32 (ceil(n / 4) + 1,), ones before each block of 4 words; the last is the
             number of all ones.
-        within: uint8 (words,), ones before each word in its block.
+        within: uint8 (n,), ones before each word in its block.
     """
 
-    size: int
     words: npt.NDArray[np.uint64]
     blocks: npt.NDArray[np.uint32]
     within: npt.NDArray[np.uint8]
 
     @classmethod
-    def of(cls, mask: Mask) -> RankedBits:
-        """Return the bits of a mask of any shape, in C order."""
-        flat = mask.reshape(-1)
-        octets = np.zeros(-(-flat.size // WORD) * (WORD // 8), np.uint8)
-        packed = np.packbits(flat, bitorder="little")
-        octets[: len(packed)] = packed
-        return cls.of_words(octets.view("<u8").astype(np.uint64, copy=False), flat.size)
+    def of_octets(cls, octets: npt.NDArray[np.uint8]) -> RankedBits:
+        """Return the bitmap of bytes; position p is bit p % 8, 0 the lowest, of byte p // 8."""
+        filled = np.zeros(-(-len(octets) // 8) * 8, np.uint8)
+        filled[: len(octets)] = octets
+        return cls.of_words(filled.view("<u8").astype(np.uint64, copy=False))
 
     @classmethod
-    def of_words(cls, words: npt.NDArray[np.uint64], size: int) -> RankedBits:
-        """Return the bitmap of words whose bits beyond `size` are 0."""
+    def of_words(cls, words: npt.NDArray[np.uint64]) -> RankedBits:
+        """Return the bitmap of words; position p is bit p % 64, 0 the lowest, of word p // 64."""
         counts = np.zeros((-(-len(words) // BLOCK_WORDS), BLOCK_WORDS), np.uint8)
         counts.reshape(-1)[: len(words)] = np.bitwise_count(words)
         # Up to 3 words of 64 ones come before the last word of a block: 192 fit in a byte.
@@ -72,7 +65,7 @@ class RankedBits:
             raise InputError(
                 f"a level needs {blocks[-1]} vertices at one time; at most {MAX_COUNT} are allowed"
             )
-        return cls(size, words, blocks.astype(np.uint32), within[: len(words)])
+        return cls(words, blocks.astype(np.uint32), within[: len(words)])
 
     @property
     def count(self) -> int:
@@ -88,7 +81,7 @@ class RankedBits:
         """Return the place of each position among the ones, `count` where its bit is 0.
 
         Args:
-            positions: int64 of any shape, in 0 .. size - 1.
+            positions: int64 of any shape, in 0 .. 64 n - 1.
         """
         word = positions >> 6
         # The bit moves to the top of its word, and all that come after it fall out.
@@ -96,16 +89,22 @@ class RankedBits:
         ranks = self.blocks[word >> 2] + self.within[word] + np.bitwise_count(upto)
         return np.where(upto.view(np.int64) < 0, ranks.astype(np.int64) - 1, self.count)
 
+    def before(self, position: int) -> int:
+        """Return the number of ones before a position in 0 .. 64 n."""
+        word, bit = divmod(position, 64)
+        block = word - word % BLOCK_WORDS
+        whole = int(np.bitwise_count(self.words[block:word]).sum())
+        part = int(self.words[word]) & ((1 << bit) - 1) if bit else 0
+        return int(self.blocks[block // BLOCK_WORDS]) + whole + part.bit_count()
+
+    @property
+    def octets(self) -> npt.NDArray[np.uint8]:
+        """The bitmap as bytes, in the order of `of_octets`, filled up to whole words."""
+        return self.words.astype("<u8", copy=False).view(np.uint8)
+
     def positions(self) -> Integers:
         """Return the positions of all ones, ascending."""
-        octets = self.words.astype("<u8", copy=False).view(np.uint8)
-        return np.flatnonzero(np.unpackbits(octets, count=self.size, bitorder="little"))
-
-    def run(self, start: int, stop: int) -> Mask:
-        """Return the bits of positions start .. stop - 1."""
-        octets = self.words.astype("<u8", copy=False).view(np.uint8)[start // 8 : -(-stop // 8)]
-        bits = np.unpackbits(octets, bitorder="little")
-        return bits[start % 8 : start % 8 + stop - start].view(np.bool_)
+        return np.flatnonzero(np.unpackbits(self.octets, bitorder="little"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +113,9 @@ class SparseFrame:
 
     Attributes:
         shape: vertices (z, y, x) of the level.
-        bits: which buckets are held, in C order over (z, y, x).
-        values: embeddings (bits.count + 1, E) of the held buckets, float16 or float32. The last
-            row is 0: `bits.lookup` gives it for a bucket that is not held.
+        bits: which vertices are held. Rows along x are filled up to whole bytes of bits.
+        values: embeddings (bits.count + 1, E) of the held vertices in C order over (z, y, x),
+            float16 or float32. The last row is 0: `bits.lookup` gives it for other vertices.
     """
 
     shape: tuple[int, int, int]
@@ -124,57 +123,60 @@ class SparseFrame:
     values: npt.NDArray[Any]
 
     @classmethod
-    def of(cls, shape: Sequence[int], bits: RankedBits, held: npt.NDArray[Any]) -> SparseFrame:
-        """Return a frame of the embeddings (bits.count, E) of its held buckets."""
-        z, y, x = shape
+    def of(cls, mask: Mask, held: npt.NDArray[Any]) -> SparseFrame:
+        """Return a frame of the embeddings (held vertices, E) of a mask (z, y, x)."""
+        z, y, x = mask.shape
+        rows = np.packbits(mask, axis=2, bitorder="little")
+        return cls._with((z, y, x), RankedBits.of_octets(rows.reshape(-1)), held)
+
+    @classmethod
+    def _with(
+        cls, shape: tuple[int, int, int], bits: RankedBits, held: npt.NDArray[Any]
+    ) -> SparseFrame:
         nothing = np.zeros((1, held.shape[1]), held.dtype)
-        return cls((z, y, x), bits, np.concatenate([held, nothing]))
+        return cls(shape, bits, np.concatenate([held, nothing]))
+
+    @property
+    def row(self) -> int:
+        """Bits of a row along x; vertex (z, y, x) has bit (z * shape[1] + y) * row + x."""
+        return -(-self.shape[2] // 8) * 8
 
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
         return self.bits.nbytes + self.values.nbytes
 
-    def take(self, buckets: Integers) -> npt.NDArray[Any]:
-        """Return the embeddings (..., E) of buckets (...), numbered in C order over (z, y, x)."""
-        return self.values.take(self.bits.lookup(buckets), axis=0)
+    def take(self, z: Integers, y: Integers, x: Integers) -> npt.NDArray[Any]:
+        """Return the embeddings (..., E) of vertices, whose indices broadcast to (...)."""
+        positions = (z * self.shape[1] + y) * self.row + x
+        return self.values.take(self.bits.lookup(positions), axis=0)
 
     def read(self, box: tuple[slice, ...]) -> npt.NDArray[Any]:
         """Return the embeddings (z, y, x, E) of a region: 3 slices with explicit ends."""
-        spans = [axis.stop - axis.start for axis in box]
-        (z0, z1), (y0, y1), (x0, x1) = ((axis.start, axis.stop) for axis in box)
-        _, y, x = self.shape
-        result = np.zeros((*spans, self.values.shape[1]), self.values.dtype)
-        if (y0, y1, x0, x1) == (0, y, 0, x):
-            # Whole planes are one run of bits, whose embeddings lie together as well.
-            first, end = self._ranks(z0 * y * x), self._ranks(z1 * y * x)
-            held = self.bits.run(z0 * y * x, z1 * y * x)
-            result[held.reshape(spans)] = self.values[first:end]
-            return result
-        buckets = (np.arange(z0, z1)[:, None, None] * y + np.arange(y0, y1)[:, None]) * x
-        return self.take(buckets + np.arange(x0, x1))
-
-    def _ranks(self, position: int) -> int:
-        """Return the number of held buckets before a position in 0 .. size."""
-        word, bit = divmod(position, WORD)
-        before = int(self.bits.blocks[word // BLOCK_WORDS])
-        if bit or word % BLOCK_WORDS:
-            first = word // BLOCK_WORDS * BLOCK_WORDS
-            before += int(np.bitwise_count(self.bits.words[first:word]).sum())
-        if bit:
-            before += (int(self.bits.words[word]) & ((1 << bit) - 1)).bit_count()
-        return before
+        z, y, x = box
+        octets = self.bits.octets[: prod(self.shape[:2]) * self.row // 8]
+        rows = octets.reshape(*self.shape[:2], -1)[z, y, x.start // 8 : -(-x.stop // 8)]
+        bits = np.unpackbits(rows, axis=2, bitorder="little").view(np.bool_)
+        held = bits[:, :, x.start % 8 : x.start % 8 + x.stop - x.start]
+        result = np.zeros((*held.shape, self.values.shape[1]), self.values.dtype)
+        if (y.start, y.stop, x.start, x.stop) == (0, self.shape[1], 0, self.shape[2]):
+            # The embeddings of whole planes lie together.
+            first = self.bits.before(z.start * self.shape[1] * self.row)
+            result[held] = self.values[first : first + np.count_nonzero(held)]
+        else:
+            at = held.nonzero()
+            result[at] = self.take(*(i + axis.start for i, axis in zip(at, box, strict=True)))
+        return result
 
 
 def between(before: SparseFrame, after: SparseFrame, after_weight: np.float32) -> SparseFrame:
     """Return the frame between two frames of a level, linear in time, float32.
 
-    It holds the buckets that either of them holds. Each embedding is that of dense frames, bit for
+    It holds the vertices that either of them holds. Each embedding is that of dense frames, bit for
     bit: before * (1 - after_weight) + after * after_weight.
     """
-    words = before.bits.words | after.bits.words
-    bits = RankedBits.of_words(words, before.bits.size)
-    buckets = bits.positions()
-    mixed: Floats = before.take(buckets) * np.float32(1 - after_weight)
-    mixed += after.take(buckets) * after_weight
-    return SparseFrame.of(before.shape, bits, mixed)
+    bits = RankedBits.of_words(before.bits.words | after.bits.words)
+    positions = bits.positions()
+    mixed: Floats = before.values[before.bits.lookup(positions)] * np.float32(1 - after_weight)
+    mixed += after.values[after.bits.lookup(positions)] * after_weight
+    return SparseFrame._with(before.shape, bits, mixed)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fhash_codec.model_parts import TABLE_AXES
 from fhash_codec.paper.number_type import NumberType
 from fhash_codec.paper.tables.needed import Mask
-from fhash_codec.paper.tables.ranked import RankedBits, SparseFrame
+from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.sparse import COUNTS
 from fhash_formats.errors import DamagedFileError
@@ -72,14 +72,14 @@ class SparseTable:
         Raises DamagedFileError where the file has another number of them than the occupancy asks
         for.
         """
-        bits = RankedBits.of(self._needed(node))
+        mask = self._needed(node)
         first, end = self._starts[node : node + 2]
-        if bits.count != end - first:
+        if (needed := int(np.count_nonzero(mask))) != end - first:
             raise DamagedFileError(
                 f"{self._name} has {end - first} vertices at time node {node}; "
-                f"the occupancy asks for {bits.count}"
+                f"the occupancy asks for {needed}"
             )
-        return SparseFrame.of(self.shape[1:4], bits, self._rows(first, end))
+        return SparseFrame.of(mask, self._rows(first, end))
 
 
 def write_sparse(

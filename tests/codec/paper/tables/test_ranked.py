@@ -27,14 +27,18 @@ def frame_of(
     held = np.random.default_rng(seed).normal(size=(int(mask.sum()), 3)).astype(dtype)
     dense = np.zeros((*SHAPE, 3), dtype)
     dense[mask] = held
-    return SparseFrame.of(SHAPE, RankedBits.of(mask), held), dense
+    return SparseFrame.of(mask, held), dense
+
+
+def bits_of(mask: npt.NDArray[np.bool_]) -> RankedBits:
+    return RankedBits.of_octets(np.packbits(mask, bitorder="little"))
 
 
 @pytest.mark.parametrize("size", [1, 63, 64, 65, 255, 256, 257, 1000, 4096])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 1.0])
 def test_a_rank_is_the_number_of_ones_before(size: int, share: float) -> None:
     mask = mask_of(share, (size,))
-    bits = RankedBits.of(mask)
+    bits = bits_of(mask)
     expected = np.where(mask, np.cumsum(mask) - 1, mask.sum())
     np.testing.assert_array_equal(bits.lookup(np.arange(size)), expected)
     np.testing.assert_array_equal(bits.positions(), np.flatnonzero(mask))
@@ -43,22 +47,23 @@ def test_a_rank_is_the_number_of_ones_before(size: int, share: float) -> None:
 
 def test_positions_of_any_shape_and_order() -> None:
     mask = mask_of(0.4)
-    bits = RankedBits.of(mask)
+    bits = bits_of(mask)
     places = np.where(mask.reshape(-1), np.cumsum(mask) - 1, mask.sum())
     positions = np.random.default_rng(1).integers(0, mask.size, (4, 5, 6))
     np.testing.assert_array_equal(bits.lookup(positions), places[positions])
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0, 1), (3, 3), (5, 200), (64, 128), (454, 455)])
-def test_a_run_of_bits(start: int, stop: int) -> None:
-    mask = mask_of(0.5)
-    np.testing.assert_array_equal(
-        RankedBits.of(mask).run(start, stop), mask.reshape(-1)[start:stop]
-    )
+@pytest.mark.parametrize("size", [64, 256, 320, 4096])
+def test_ones_before_a_position(size: int) -> None:
+    mask = mask_of(0.4, (size,))
+    bits = bits_of(mask)
+    for position in {0, 1, 63, 64, 65, 255, 256, size - 1, size}:
+        if position <= size:
+            assert bits.before(position) == mask[:position].sum()
 
 
 def test_the_counts_take_a_quarter_of_the_bitmap() -> None:
-    bits = RankedBits.of(mask_of(0.5, (64, 64, 64)))
+    bits = bits_of(mask_of(0.5, (64, 64, 64)))
     assert bits.words.nbytes == 64**3 // 8
     assert bits.nbytes <= 1.26 * bits.words.nbytes
 
@@ -66,7 +71,7 @@ def test_the_counts_take_a_quarter_of_the_bitmap() -> None:
 def test_more_ones_than_a_count_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ranked, "MAX_COUNT", 99)
     with pytest.raises(InputError, match="needs 100 vertices at one time; at most 99"):
-        RankedBits.of(np.ones(100, np.bool_))
+        bits_of(np.ones(100, np.bool_))
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
@@ -84,10 +89,10 @@ def test_a_sparse_frame_reads_as_a_dense_one(share: float, dtype: str) -> None:
         np.testing.assert_array_equal(read, dense[region])
 
 
-def test_embeddings_of_buckets() -> None:
+def test_embeddings_of_vertices() -> None:
     frame, dense = frame_of(0.3)
-    buckets = np.random.default_rng(2).integers(0, np.prod(SHAPE), (4, 25))
-    np.testing.assert_array_equal(frame.take(buckets), dense.reshape(-1, 3)[buckets])
+    z, y, x = (np.random.default_rng(2).integers(0, n, (4, 25)) for n in SHAPE)
+    np.testing.assert_array_equal(frame.take(z, y, x), dense[z, y, x])
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
