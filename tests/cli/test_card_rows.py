@@ -26,6 +26,7 @@ def added(line: str) -> bool:
              "relu", "occupancy/bits, bytes,"],
         ),
         ("paper-1.1-transform", ["fhash.transform", "occupancy/bits, bytes,"]),
+        ("paper-1.6-sparse", ["; 2 at each needed vertex, float16; tables/level_1 to tables/level_4,"]),
         ("compact-1.1-psnr", ["tables/level_1, fhash.transform,", "none: the values"]),
         ("compact-1.1-mask", ["in the tiles of tables/level_1"]),
         (
