@@ -19,9 +19,10 @@ promise, both by construction and on every machine:
   same column of a product of the same shape. Where few vertices of a block are asked for, they move
   to fewer products (`run_some`), each within its column.
 * `PointwiseLayers` (`pointwise.py`), for samples at free positions (`points.py`, rendering), which
-  may come in any column. It adds without BLAS.
+  may come in any column. It adds without BLAS. So does the native library (`native_points.py`),
+  which replaces it where it is built.
 
-The bits may differ between machines, because their BLAS libraries do.
+The bits may differ between machines, because their BLAS libraries and their vectors do.
 """
 
 from __future__ import annotations

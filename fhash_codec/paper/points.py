@@ -1,16 +1,22 @@
-"""Decoding at points between vertices, with the analytic gradient, with numpy alone."""
+"""Decoding at points between vertices, with the analytic gradient.
+
+The native library evaluates the points (native_points.py); where it is missing, numpy does, with
+the same values within rounding.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, overload
+from typing import Literal, overload
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.native import network as native
+from fhash_codec.paper.native_points import NativePoints, best_path
 from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
+from fhash_codec.paper.point_tables import Patch, PointTables, locate
 from fhash_codec.paper.pointwise import PointwiseLayers
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
@@ -25,19 +31,6 @@ LARGE_READ = 2**25
 """Vertices of the finest table that a group of points may never exceed."""
 READ_PER_POINT = 16
 """Vertices of the finest table per point that a group may span between those two limits."""
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A part of one level's table in memory.
-
-    Attributes:
-        values: embeddings (t, z, y, x, E).
-        first: vertex (t, z, y, x) of the level at which the part begins.
-    """
-
-    values: npt.NDArray[Any]
-    first: tuple[int, ...]
 
 
 @overload
@@ -87,7 +80,8 @@ def sample_points(
     * On a ReLU's kink they are those of its flat side.
 
     Points that lie close together share one read of a part of each table. A point has the same
-    bits whatever other points are given with it, in whatever order (pointwise.py).
+    bits whatever other points are given with it, in whatever order (pointwise.py,
+    native_points.py). Where all points share one time, the tables are interpolated in time once.
 
     Args:
         network: the trained network.
@@ -102,30 +96,74 @@ def sample_points(
         InputError: the lengths of the arrays do not fit together.
     """
     threads = usable_threads(threads)
-    points = _points(network, (key_index, z, y, x))
-    count = points.shape[1]
+    columns, count = _columns((key_index, z, y, x))
+    _check(network, columns)
     values = np.empty(count, np.float32)
-    slopes = np.empty((count, 4) if gradient else (0, 4), np.float32)
+    slopes = np.empty((count, 4), np.float32) if gradient else None
+    for group in _groups(columns, np.arange(count)):
+        whole = len(group) == count
+        places = columns if whole else [_chosen(column, group) for column in columns]
+        tables = PointTables.read(network, *_extremes(places))
+        sampler = PointSampler(tables, None if gradient else _one_time(tables, places, len(group)))
+        if whole:
+            sampler.sample(places, values, slopes, threads)
+            continue
+        some = np.empty(len(group), np.float32)
+        some_slopes = np.empty((len(group), 4), np.float32) if gradient else None
+        sampler.sample(places, some, some_slopes, threads)
+        values[group] = some
+        if slopes is not None:
+            slopes[group] = some_slopes
+    return values if slopes is None else (values, slopes)
 
-    for group in _groups(network, points, np.arange(count)):
-        patches = _patches(network, points[:, group])
 
-        def evaluate(
-            chunks: Sequence[npt.NDArray[np.intp]], patches: Sequence[Patch] = patches
-        ) -> None:
+class PointSampler:
+    """Tables in memory, ready to be sampled at points; for many calls on the same tables."""
+
+    def __init__(self, tables: PointTables, key_index: float | None = None) -> None:
+        """Take over tables.
+
+        Args:
+            tables: parts of the tables around the points to come.
+            key_index: the time of all points, at which the tables are interpolated once. The
+                points' own time is then 0, and their derivative by time.
+        """
+        library = native.library()
+        path = 0 if library is None else best_path(library)
+        self._native: NativePoints | None = None
+        if library is not None and path:
+            points = NativePoints(library, tables, path)
+            self._native = points if key_index is None else points.at(key_index)
+        else:
+            self._tables = tables if key_index is None else tables.at(key_index)
+
+    def sample(
+        self,
+        columns: Sequence[npt.NDArray[np.float64]],
+        values: Floats,
+        slopes: Floats | None,
+        threads: int,
+    ) -> None:
+        """Write the normalised values and, unless `slopes` is None, the derivatives at points.
+
+        Args:
+            columns: key index, z, y and x of the points, each (n,) or (1,) for all, in the box.
+            values: float32 (n,), to be written.
+            slopes: float32 (n, 4), to be written, or None.
+            threads: number of threads.
+        """
+
+        def evaluate(chunks: Sequence[slice]) -> None:
             for chunk in chunks:
-                values[chunk], chunk_slopes = _evaluate(
-                    network, patches, points[:, chunk], gradient
-                )
-                if chunk_slopes is not None:
-                    slopes[chunk] = chunk_slopes.T
+                places = [column[chunk] if len(column) > 1 else column for column in columns]
+                some = None if slopes is None else slopes[chunk]
+                if self._native is None:
+                    _evaluate(self._tables, places, values[chunk], some)
+                else:
+                    self._native.evaluate(places, values[chunk], some)
 
-        share_out(
-            evaluate,
-            [group[start : start + CHUNK_POINTS] for start in range(0, len(group), CHUNK_POINTS)],
-            threads,
-        )
-    return (values, slopes) if gradient else values
+        starts = range(0, len(values), CHUNK_POINTS)
+        share_out(evaluate, [slice(start, start + CHUNK_POINTS) for start in starts], threads)
 
 
 def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
@@ -139,12 +177,12 @@ def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
         network: the trained network.
         points: positions (4, n), key index, z, y and x, inside the box.
     """
-    patches = _patches(network, points)
+    tables = PointTables.read(network, points.min(axis=1), points.max(axis=1))
     slopes = np.empty((network.inputs, points.shape[1]), np.float32)
     for start in range(0, points.shape[1], CHUNK_POINTS):
         chunk = points[:, start : start + CHUNK_POINTS]
         layers = DenseLayers(network, chunk.shape[1])
-        _encode(network, patches, chunk, layers.inputs)
+        _encode(tables, chunk, layers.inputs)
         layers.run()
         slopes[:, start : start + chunk.shape[1]] = layers.gradient()[:, : chunk.shape[1]]
     return slopes
@@ -182,21 +220,24 @@ def _between(pair: Floats, after_weight: Floats) -> Floats:
 
 
 def _evaluate(
-    network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool
-) -> tuple[Floats, Floats | None]:
-    """Return values (n,) and, with `gradient`, derivatives (4, n) at points (4, n) in patches."""
-    count = points.shape[1]
-    layers = PointwiseLayers(network, count)
-    slopes = _encode(network, patches, points, layers.inputs, gradient=gradient)
-    values = layers.run()[:count]
-    if not gradient:
-        return values, None
-    return values, layers.slopes(slopes)[:, :count]
+    tables: PointTables,
+    columns: Sequence[npt.NDArray[np.float64]],
+    values: Floats,
+    slopes: Floats | None,
+) -> None:
+    """Write values (n,) and derivatives (n, 4) at points by numpy; `PointSampler.sample`."""
+    points, count = np.stack(np.broadcast_arrays(*columns)), len(values)
+    if points.shape[1] != count:
+        points = np.broadcast_to(points, (4, count))
+    layers = PointwiseLayers(tables.network, count)
+    by_place = _encode(tables, points, layers.inputs, gradient=slopes is not None)
+    values[:] = layers.run()[:count]
+    if slopes is not None:
+        slopes[:] = layers.slopes(by_place)[:, :count].T
 
 
 def _encode(
-    network: Network,
-    patches: Sequence[Patch],
+    tables: PointTables,
     points: npt.NDArray[np.float64],
     inputs: Floats,
     *,
@@ -206,59 +247,71 @@ def _encode(
 
     Return their derivatives (4, inputs, columns) by the position; with `gradient` unset, none.
     """
-    size, count = network.embedding_size, points.shape[1]
-    slopes = np.zeros((4 if gradient else 0, network.inputs, inputs.shape[1]), np.float32)
-    for level, patch in enumerate(patches):
+    size, count = tables.network.embedding_size, points.shape[1]
+    slopes = np.zeros((4 if gradient else 0, len(inputs) - 1, inputs.shape[1]), np.float32)
+    # Tables of one time have no corners after it.
+    first_axis = 1 if tables.still else 0
+    for level, (patch, resolution) in enumerate(zip(tables.patches, tables.levels, strict=True)):
         rows = slice(level * size, (level + 1) * size)
-        before, after_weights, pace = _locate(network, level, points)
-        corners = _corners(patch, before, network.levels[level])
-        inputs[rows, :count], changes = interpolate(corners, after_weights, gradient)
-        for axis, change in enumerate(changes):
+        before, after_weights, pace = locate(tables.sizes, resolution, points)
+        corners = _corners(patch, before, resolution)
+        if tables.still:
+            corners = corners[0]
+        inputs[rows, :count], changes = interpolate(corners, after_weights[first_axis:], gradient)
+        for axis, change in enumerate(changes, start=first_axis):
             np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows, :count])
     return slopes
 
 
-def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:
-    """Return the points as one array (4, n) after checking them."""
-    columns = [np.asarray(array, dtype=np.float64) for array in arrays]
-    try:
-        points = np.stack(np.broadcast_arrays(*(np.atleast_1d(column) for column in columns)))
-    except ValueError:
-        points = np.empty(0)
-    if points.ndim != 2:
+def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float64]], int]:
+    """Return coordinates as arrays (n,), or (1,) where one stands for all points, and n."""
+    columns = [np.atleast_1d(np.asarray(array, dtype=np.float64)) for array in arrays]
+    lengths = {len(column) for column in columns if np.ndim(column) == 1} - {1}
+    if any(column.ndim != 1 for column in columns) or len(lengths) > 1:
         raise InputError(
-            f"points have shapes {', '.join(str(column.shape) for column in columns)}; "
+            f"points have shapes {', '.join(str(np.shape(array)) for array in arrays)}; "
             "one length (n,) is needed for key_index, z, y and x"
         )
+    return columns, lengths.pop() if lengths else 1
+
+
+def _check(network: Network, columns: Sequence[npt.NDArray[np.float64]]) -> None:
+    """Raise RegionError for the first point that is outside the box."""
     for axis, column, size in zip(
-        AXES, points, (network.key_frames, *network.box_size), strict=True
+        AXES, columns, (network.key_frames, *network.box_size), strict=True
     ):
-        outside = np.flatnonzero(~((column >= 0) & (column <= size - 1)))
-        if len(outside):
+        # A number that is none makes both ends none.
+        if len(column) and not (column.min() >= 0 and column.max() <= size - 1):
+            outside = np.flatnonzero(~((column >= 0) & (column <= size - 1)))
             raise RegionError(
                 f"point {outside[0]}: {axis} {column[outside[0]]:g} is outside 0..{size - 1}"
             )
-    return points
 
 
-def _locate(
-    network: Network, level: int, points: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.int64], Floats, npt.NDArray[np.float64]]:
-    """Find the cells of a level around points (4, n).
+def _chosen(
+    column: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
+) -> npt.NDArray[np.float64]:
+    """Return a coordinate of chosen points; one number stands for all."""
+    return column[chosen] if len(column) > 1 else column
 
-    Returns:
-        The corner before each point (4, n), the weight in [0, 1] of the corner after it (4, n), and
-        the corners per vertex of the box along each axis (4,).
-    """
-    corners = np.array(network.levels[level])[:, None]
-    span = np.array([max(size - 1, 1) for size in (network.key_frames, *network.box_size)])[:, None]
-    position = points * (corners - 1) / span
-    before = np.minimum(position.astype(np.int64), np.maximum(corners - 2, 0))
-    return before, (position - before).astype(np.float32), ((corners - 1) / span)[:, 0]
+
+def _extremes(columns: Sequence[npt.NDArray[np.float64]]) -> tuple[list[float], list[float]]:
+    """Return the smallest and the largest of each coordinate."""
+    return [float(c.min()) for c in columns], [float(c.max()) for c in columns]
+
+
+def _one_time(
+    tables: PointTables, columns: Sequence[npt.NDArray[np.float64]], count: int
+) -> float | None:
+    """Return the time that all points share, if interpolating the tables there once pays."""
+    times = columns[0]
+    if tables.vertices > READ_PER_POINT * count or times.min() != times.max():
+        return None
+    return float(times[0])
 
 
 def _groups(
-    network: Network, points: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
+    columns: Sequence[npt.NDArray[np.float64]], chosen: npt.NDArray[np.intp]
 ) -> Iterator[npt.NDArray[np.intp]]:
     """Split chosen points into groups that each span a part of the finest table fit to be read.
 
@@ -266,33 +319,15 @@ def _groups(
     """
     if not len(chosen):
         return
-    low, high = points[:, chosen].min(axis=1), points[:, chosen].max(axis=1)
+    low, high = np.array(_extremes([_chosen(column, chosen) for column in columns]))
     extent = np.floor(high) - np.floor(low) + 2
     if math.prod(extent) <= min(LARGE_READ, max(SMALL_READ, READ_PER_POINT * len(chosen))):
         yield chosen
         return
     axis = int(np.argmax(extent))
-    below = points[axis, chosen] < np.floor((low[axis] + high[axis] + 1) / 2)
-    yield from _groups(network, points, chosen[below])
-    yield from _groups(network, points, chosen[~below])
-
-
-def _patches(network: Network, points: npt.NDArray[np.float64]) -> list[Patch]:
-    """Read the part of each level that surrounds all of some points (4, n)."""
-    span = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
-    return [_patch(network, level, span) for level in range(len(network.levels))]
-
-
-def _patch(network: Network, level: int, span: npt.NDArray[np.float64]) -> Patch:
-    """Read the part of a level that surrounds all points between the ends of a span (4, 2)."""
-    first, last = _locate(network, level, span)[0].T.tolist()
-    ends = (
-        min(corner + 2, length) for corner, length in zip(last, network.levels[level], strict=True)
-    )
-    values = network.read(
-        level, tuple(slice(start, stop) for start, stop in zip(first, ends, strict=True))
-    )
-    return Patch(np.ascontiguousarray(values), tuple(first))
+    below = columns[axis][chosen] < np.floor((low[axis] + high[axis] + 1) / 2)
+    yield from _groups(columns, chosen[below])
+    yield from _groups(columns, chosen[~below])
 
 
 def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[int]) -> Floats:

@@ -1,7 +1,7 @@
 """A network's values at scattered places of one key index, for streamed samples.
 
 On the host the value of a place has the same bits whatever other places are evaluated with it
-(fhash_codec/paper/pointwise.py).
+(fhash_codec/paper/points.py).
 
 On a device it has not: a library of matrix products chooses its kernels by the number of samples.
 There two evaluations of a place differ by at most twice the rounding error of the layers' sums. A
@@ -12,15 +12,15 @@ a kink of a ReLU may be those of either side.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_codec.paper.network import Network, TableSource
-from fhash_codec.paper.points import interpolate, sample_points
+from fhash_codec.paper.network import Network
+from fhash_codec.paper.point_tables import PointTables
+from fhash_codec.paper.points import PointSampler, interpolate
 from fhash_codec.rendering.task.arrays import Array, Arrays
+from fhash_formats.support.threads import usable_threads
 
 __all__ = ["DenseInference", "Inference", "PatchInference"]
 
@@ -38,19 +38,29 @@ class Inference(Protocol):
 
 
 class PatchInference:
-    """Inference on the host: places close together are evaluated together, in several threads."""
+    """Inference on the host, in several threads.
+
+    The tables of the whole box are held in memory. They are interpolated in time once, since a
+    picture has one key index.
+    """
 
     def __init__(self, network: Network, key: float) -> None:
-        tables = [
-            _Nodes(table, _nodes(network, level, key)) for level, table in enumerate(network.tables)
-        ]
-        self._network, self._key = replace(network, tables=tables), key
+        self._sampler = PointSampler(PointTables.of_box(network, key), key)
 
     def values(self, places: Array) -> Array:
-        return sample_points(self._network, self._key, *places.T[::-1])
+        return self._sampled(places, None)
 
     def slopes(self, places: Array) -> Array:
-        return sample_points(self._network, self._key, *places.T[::-1], gradient=True)[1][:, :0:-1]
+        slopes = np.empty((len(places), 4), np.float32)
+        self._sampled(places, slopes)
+        return slopes[:, :0:-1]
+
+    def _sampled(self, places: Array, slopes: Array | None) -> Array:
+        """Values (n,) at places; derivatives by t, z, y and x (n, 4) go into `slopes`."""
+        values = np.empty(len(places), np.float32)
+        x, y, z = places.T
+        self._sampler.sample((np.zeros(1), z, y, x), values, slopes, usable_threads())
+        return values
 
 
 class DenseInference:
@@ -158,23 +168,6 @@ class _Level:
         )
         pace = arrays.to_float32(self._pace)
         return embeddings, [change * pace[axis] for axis, change in enumerate(across[::-1])]
-
-
-class _Nodes:
-    """The time nodes of a table around one key index, in memory.
-
-    So a pass of samples does not read them again.
-    """
-
-    def __init__(self, table: TableSource, nodes: slice) -> None:
-        self.shape = tuple(table.shape)
-        self._first = nodes.start
-        self._values = table.read((nodes, *(slice(0, length) for length in self.shape[1:])))
-
-    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Values of a region (t, z, y, x, embedding) whose times are among the nodes."""
-        time = region[0]
-        return self._values[(slice(time.start - self._first, time.stop - self._first), *region[1:])]
 
 
 def _position(network: Network, level: int, key: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fhash_formats.native as formats_native
@@ -51,3 +52,27 @@ def test_the_prototypes_take_the_arguments_of_the_sources() -> None:
     }
     del sources["fhash_network_abi_version"]
     assert sources == {name: [names[kind] for kind in kinds] for name, kinds in PROTOTYPES.items()}
+
+
+def test_arithmetic_runs_on_the_paths_of_the_machine_alone() -> None:
+    library = network.library()
+    if library is None:
+        pytest.skip("the native library was not built here")
+    paths = library.fhash_network_paths()
+    assert paths & 1
+    lanes = {1: 4, 2: 8, 4: 16}
+    for path in (0, 1, 2, 3, 4, 8):
+        done = library.fhash_network_fma(path, 5)
+        if path in lanes and path & paths:
+            assert done == 5 * 2 * 12 * lanes[path]
+        else:
+            assert done == -3
+
+
+def test_copies_count_what_is_read_and_what_is_written() -> None:
+    library = network.library()
+    if library is None:
+        pytest.skip("the native library was not built here")
+    source, copy = np.arange(100, dtype=np.float32), np.zeros(100, np.float32)
+    assert library.fhash_network_copy(copy.ctypes.data, source.ctypes.data, 400) == 800
+    np.testing.assert_array_equal(copy, source)

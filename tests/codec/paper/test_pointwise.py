@@ -53,7 +53,7 @@ def uneven_products(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(np, "matmul", uneven)
 
 
-@pytest.mark.usefixtures("uneven_products")
+@pytest.mark.usefixtures("uneven_products", "evaluation")
 @pytest.mark.parametrize(("width", "hidden"), [(1, 0), (16, 1), (33, 3)])
 def test_a_point_has_the_same_bits_among_any_other_points(width: int, hidden: int) -> None:
     network, random = random_network(width, hidden), np.random.default_rng(1)

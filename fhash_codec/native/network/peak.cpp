@@ -1,0 +1,54 @@
+// The instruction paths of this machine, and what it can do at most on one of them: the arithmetic
+// of fused multiply-adds in registers, and copies of memory. Benchmarks hold kernels to these.
+#include "vector.hpp"
+
+#if defined(FHASH_VECTORS)
+namespace {
+
+// A constraint of a register that holds a vector.
+#if defined(__x86_64__) || defined(__i386__)
+#define REGISTER "+x"
+#elif defined(__aarch64__)
+#define REGISTER "+w"
+#else
+#define REGISTER "+m"
+#endif
+
+// Chains of multiply-adds that do not wait for each other: more than latency times ports.
+constexpr int CHAINS = 12;
+
+template <class P> FHASH_INLINE std::int64_t fma_kernel(std::int64_t rounds) {
+    typename P::F chain[CHAINS], factor = all<P>(0.999f), summand = all<P>(0.001f);
+    FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = all<P>(1.0f + c);
+    // The compiler may know nothing of the numbers, and must keep each round.
+    asm volatile("" : REGISTER(factor), REGISTER(summand));
+    for (std::int64_t round = 0; round < rounds; round++) {
+        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = chain[c] * factor + summand;
+        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) asm volatile("" : REGISTER(chain[c]));
+    }
+    return 2 * CHAINS * P::N * rounds;
+}
+FHASH_PATHS(std::int64_t, fma, (std::int64_t rounds), (rounds))
+
+}  // namespace
+#endif
+
+// The paths of this machine as bits: 1 the baseline, 2 x86-64-v3, 4 x86-64-v4.
+FHASH_EXPORT int64_t fhash_network_paths() { return machine_paths(); }
+
+// Do `rounds` rounds of multiply-adds in registers on a path. Returns the number of floating-point
+// operations that were done, two for each multiply-add, or FHASH_NO_PATH.
+FHASH_EXPORT int64_t fhash_network_fma(int64_t path, int64_t rounds) {
+    if (!has_path(path)) return FHASH_NO_PATH;
+#if defined(FHASH_VECTORS)
+    return fma(path)(rounds);
+#else
+    return FHASH_NO_PATH;
+#endif
+}
+
+// Copy memory. Returns the number of bytes moved: those read and those written.
+FHASH_EXPORT int64_t fhash_network_copy(void* to, const void* from, int64_t bytes) {
+    std::memcpy(to, from, (std::size_t)bytes);
+    return 2 * bytes;
+}

@@ -1,0 +1,388 @@
+"""The native engine: training and evaluation on a CPU by kernels in C++, a brick at a time.
+
+It does what the slab engine does, and both go on from each other's state. What a brick needs stays
+in a core's cache from the upsampling to Adam. Like the finest embeddings, the numbers of the
+largest coarse table take part in the steps that need them alone, in blocks: they catch up on the
+steps between in closed form (`training.adam.catch_up`).
+
+The bricks of a batch are divided among the threads in a fixed way. The same seed, number of
+threads and instructions of the processor give the same bits.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.native.network import library
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines import Chosen
+from fhash_codec.paper.engines.initial import Parameters, initial_parameters
+from fhash_codec.paper.engines.native_task import (
+    ADAM,
+    BLOCK,
+    CATCH_UP,
+    INFER,
+    MOST_HIDDEN,
+    PATHS,
+    TRAIN,
+    WIDEST,
+    Bricks,
+    Gaps,
+    LevelTables,
+)
+from fhash_codec.paper.engines.upsampling import Upsampling
+from fhash_codec.training.adam import BETA1, BETA2
+from fhash_formats.errors import InputError
+
+STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "flat_square")
+"""Arrays of the slab engine's state."""
+FLUSH = 1024
+"""Bricks that are brought up to date at a time."""
+CPU = torch.device("cpu")
+
+Floats = npt.NDArray[np.float32]
+
+
+def machine_paths() -> list[str]:
+    """Return the names of the instructions that the kernels can use here, the fastest first.
+
+    The list is empty where the native library is missing.
+    """
+    native = library()
+    bits = 0 if native is None else native.fhash_network_paths()
+    return [name for name, bit in PATHS.items() if bits & bit]
+
+
+def refusal(architecture: Architecture, device: torch.device) -> str | None:
+    """Return why a model cannot be trained by the native engine here; None if it can."""
+    if device.type != "cpu":
+        return f"it computes on a CPU, and the device is '{device.type}'"
+    if not machine_paths():
+        return "the native library is missing; install the package with a C++ compiler at hand"
+    if architecture.hidden_layers > MOST_HIDDEN:
+        return f"it has {MOST_HIDDEN} hidden layers at most, not {architecture.hidden_layers}"
+    if architecture.hidden_layers and architecture.width > WIDEST:
+        return f"its hidden layers have {WIDEST} neurons at most, not {architecture.width}"
+    return None
+
+
+class NativeEngine:
+    """An `Engine` on a CPU, in C++.
+
+    Attributes:
+        fine, fine_mean, fine_square, visited: as the slab engine has them.
+        flat, flat_mean, flat_square, coarse: as the slab engine has them, but for the blocks of the
+            largest coarse table: these are as they were after the step in `blocks`.
+        lazy: numbers of that table, the first ones in `flat`.
+        blocks: number of the last training step that used each block of BLOCK of them, 0 for none,
+            int64.
+        path: name of the instructions of the processor that the kernels use.
+    """
+
+    name = "native"
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        coreset: Coreset,
+        rates: npt.NDArray[np.float64],
+        *,
+        seed: int,
+        device: torch.device = CPU,
+        path: str = "auto",
+    ) -> None:
+        """Start from fresh parameters; arguments as in `make_engine`.
+
+        Args:
+            architecture: the sizes of the model.
+            coreset: the training samples.
+            rates: learning rate of every training step, counted from 1.
+            seed: seed of the initial parameters.
+            device: the CPU.
+            path: a name in `PATHS`, or auto for the fastest that there is.
+
+        Raises:
+            InputError: the engine does not take the model, or the machine lacks the instructions.
+        """
+        reason = refusal(architecture, device)
+        if reason is not None:
+            raise InputError(f"the engine 'native' does not take this model: {reason}")
+        if path not in ("auto", *machine_paths()):
+            raise InputError(f"path is '{path}'; here are: auto, {', '.join(machine_paths())}")
+        self.architecture, self.coreset, self.rates = architecture, coreset, rates
+        self.path = machine_paths()[0] if path == "auto" else path
+        self._native = library()
+        upsampling = Upsampling(architecture, coreset, CPU)
+        self._used = upsampling.used.numpy()
+        self._rank = None if upsampling.rank is None else upsampling.rank.numpy()
+        self._tables = LevelTables(architecture, coreset)
+        self._coreset_arrays = {
+            "bricks": np.ascontiguousarray(coreset.bricks, np.int32),
+            "mask": np.ascontiguousarray(coreset.mask_bits),
+            "values": np.ascontiguousarray(coreset.values, np.float32),
+            "offsets": np.ascontiguousarray(coreset.offsets, np.int64),
+        }
+        start = initial_parameters(architecture, coreset, seed)
+        self.fine = start.fine.numpy()
+        self.fine_mean, self.fine_square = np.zeros_like(self.fine), np.zeros_like(self.fine)
+        self.visited = np.zeros(len(self.fine), np.int64)
+        self.step = 0
+        self.coarse = len(self._used)
+        self.flat = np.concatenate([start.coarse.numpy()[self._used], start.network.numpy()])
+        self.flat_mean, self.flat_square = np.zeros_like(self.flat), np.zeros_like(self.flat)
+        largest = prod(architecture.levels[1]) if len(architecture.levels) > 1 else 0
+        self.lazy = int(np.searchsorted(self._used, largest * architecture.embedding_size))
+        self.blocks = np.zeros(-(-self.lazy // BLOCK), np.int64)
+        self._stamps, self._touched = np.zeros_like(self.blocks), np.zeros_like(self.blocks)
+        self._gaps: _GapTables | None = None
+        self._current: tuple[int, list[Floats]] | None = None
+        self._pool: ThreadPoolExecutor | None = None
+        self._memory: dict[str, npt.NDArray[Any]] = {}
+        self._task = self._new_task()
+
+    def train(self, chosen: Chosen) -> Tensor:
+        """Do one training step on a batch; return the sum of squared errors before it."""
+        self._catch_up_gaps()
+        self._current = None
+        self.step += 1
+        # In the order of their places, bricks of a thread share the numbers of the coarse tables.
+        bricks = np.sort(chosen)
+        samples = int((self.coreset.offsets[bricks + 1] - self.coreset.offsets[bricks]).sum())
+        task, threads = self._task, self._threads(len(bricks))
+        task.threads, task.step = threads, self.step
+        task.rate, task.scale = float(self.rates[self.step]), 2.0 / max(samples, 1)
+        task.chosen, task.count = bricks.ctypes.data, len(bricks)
+        errors = np.zeros(threads)
+        task.error = errors.ctypes.data
+        assert self._native is not None
+        task.touches = self._native.fhash_bricks_touch(ctypes.byref(task))
+        for part in (CATCH_UP, TRAIN, ADAM):
+            self._run(part, threads)
+        return torch.tensor(errors.sum())
+
+    def infer(self, chosen: Chosen) -> Tensor:
+        """Return the values (n,) at the samples of some bricks."""
+        self._catch_up_gaps()
+        offsets = self.coreset.offsets
+        places = np.concatenate([[0], np.cumsum(offsets[chosen + 1] - offsets[chosen])])
+        values = np.empty(int(places[-1]), np.float32)
+        task, threads = self._task, self._threads(len(chosen))
+        task.threads, task.step = threads, self.step
+        task.chosen, task.count = chosen.ctypes.data, len(chosen)
+        task.out, task.places = values.ctypes.data, places.ctypes.data
+        task.current = self._settled_flat()[0].ctypes.data
+        self._run(INFER, threads)
+        return torch.from_numpy(values)
+
+    def settle(self) -> None:
+        """Let every brick catch up with the present step, so that evaluation is faster."""
+        self._catch_up_gaps()
+        for first in range(0, len(self.fine), FLUSH):
+            part = slice(first, first + FLUSH)
+            self._gap_tables().settle(
+                (self.fine[part], self.fine_mean[part], self.fine_square[part]),
+                self.visited[part],
+                self.step,
+            )
+        self.visited[self.visited > 0] = self.step
+
+    def parameters(self) -> Parameters:
+        """Return the trained numbers, on the CPU. Embeddings that no sample ever moved are 0.
+
+        The finest embeddings are the engine's own memory, not a copy.
+        """
+        self.settle()
+        vertices = self.fine.shape[2]
+        for first in range(0, len(self.fine), FLUSH):
+            part = slice(first, first + FLUSH)
+            bits = np.unpackbits(self.coreset.mask_bits[part], axis=1, count=vertices)
+            self.fine[part].swapaxes(1, 2)[bits == 0] = 0
+        flat, mean, square = self._settled_flat()
+        moved = (mean != 0) | (square != 0)
+        used = (np.where(moved, flat, np.float32(0)) if self.step else flat)[: self.coarse]
+        levels = self.architecture.levels[1:]
+        coarse = np.zeros(
+            sum(prod(level) for level in levels) * self.architecture.embedding_size, np.float32
+        )
+        coarse[self._used] = used
+        return Parameters(
+            fine=torch.from_numpy(self.fine),
+            coarse=torch.from_numpy(coarse),
+            network=torch.from_numpy(flat[self.coarse :].copy()),
+        )
+
+    def state(self) -> dict[str, npt.NDArray[np.generic]]:
+        """Return parameters, Adam's moments and the step number as arrays.
+
+        The arrays of the slab engine's state have its meaning. The blocks that are behind are there
+        as they are, too, so that this engine goes on with the same bits.
+        """
+        flat, mean, square = self._settled_flat()
+        behind = np.stack([self.flat, self.flat_mean, self.flat_square])[:, : self.lazy]
+        own = {"blocks": self.blocks, "behind": behind}
+        settled = {"flat": flat, "flat_mean": mean, "flat_square": square}
+        arrays = {name: getattr(self, name) for name in STATE} | settled | own
+        return {"step": np.array(self.step)} | arrays
+
+    def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
+        """Continue from a `state`, also from one of the slab engine.
+
+        Raises KeyError or ValueError for one of another model.
+        """
+        self.step, self._current, self._gaps = int(state["step"]), None, None
+        arrays = {name: state[name] for name in STATE}
+        for name, array in arrays.items():
+            if array.shape != getattr(self, name).shape:
+                raise ValueError(f"{name} has the shape {array.shape}")
+            getattr(self, name)[...] = array
+        self._stamps[:] = 0
+        self.blocks[:] = state.get("blocks", np.array(self.step))
+        if "behind" in state:
+            numbers = (self.flat, self.flat_mean, self.flat_square)
+            for array, behind in zip(numbers, state["behind"], strict=True):
+                array[: self.lazy] = behind
+
+    def _new_task(self) -> Bricks:
+        """Return the structure with all that stays as it is."""
+        architecture, coreset = self.architecture, self.coreset
+        task = Bricks(
+            path=PATHS[self.path],
+            embedding=architecture.embedding_size,
+            levels=len(architecture.levels) - 1,
+            hidden=architecture.hidden_layers,
+            width=architecture.width,
+            shape=coreset.brick_shape,
+            threads=1,
+            mask_bytes=coreset.mask_bits.shape[1],
+            coarse=self.coarse,
+            numbers=len(self.flat),
+            lazy=self.lazy,
+            rank=None if self._rank is None else self._rank.ctypes.data,
+            level=self._tables.levels,
+            stamps=self._stamps.ctypes.data,
+            touched=self._touched.ctypes.data,
+        )
+        for name, array in self._coreset_arrays.items():
+            setattr(task, name, array.ctypes.data)
+        for name in (*STATE, "blocks"):
+            setattr(task, name, getattr(self, name).ctypes.data)
+        assert self._native is not None
+        task.work_size = self._native.fhash_bricks_work(ctypes.byref(task))
+        assert task.work_size > 0
+        return task
+
+    def _threads(self, bricks: int) -> int:
+        """Return the threads for some bricks, those of torch at most; their memory is there."""
+        threads = max(1, min(torch.get_num_threads(), bricks))
+        if len(self._memory.get("gradient", ())) < threads:
+            self._memory["gradient"] = np.zeros((threads, len(self.flat)), np.float32)
+            # A cache line more, so that the memory can begin with one.
+            work = np.zeros(threads * self._task.work_size + 16, np.float32)
+            self._memory["work"] = work
+            self._task.gradient = self._memory["gradient"].ctypes.data
+            self._task.work = -(-work.ctypes.data // 64) * 64
+        return threads
+
+    def _run(self, part: int, threads: int) -> None:
+        """Let all threads do their shares in a part of the task."""
+        assert self._native is not None
+        run, task = self._native.fhash_bricks_run, ctypes.byref(self._task)
+        if threads > 1 and (self._pool is None or self._pool._max_workers < threads - 1):
+            self._pool = ThreadPoolExecutor(threads - 1)
+        others = [
+            self._pool.submit(run, task, part, thread)
+            for thread in range(1, threads)
+            if self._pool is not None
+        ]
+        results = [run(task, part, 0), *(other.result() for other in others)]
+        assert not any(results), f"part {part} of the native engine returned {results}"
+
+    def _gap_tables(self) -> _GapTables:
+        """Return the closed form of missed steps at the present learning rates."""
+        if self._gaps is None or self._gaps.rates is not self.rates:
+            self._gaps = _GapTables(self.rates)
+            self._task.gaps = self._gaps.structure
+        return self._gaps
+
+    def _catch_up_gaps(self) -> None:
+        """Let the closed form know all steps up to the present one."""
+        tables = self._gap_tables()
+        if tables.step < self.step:
+            assert self._native is not None
+            self._native.fhash_bricks_gaps(ctypes.byref(self._task), tables.step + 1, self.step)
+            tables.step = self.step
+
+    def _settled_flat(self) -> list[Floats]:
+        """Return `flat` and its moments with all blocks caught up; the engine's own stay behind."""
+        if self._current is None or self._current[0] != self.step:
+            self._catch_up_gaps()
+            arrays = [array.copy() for array in (self.flat, self.flat_mean, self.flat_square)]
+            visited = np.repeat(self.blocks, BLOCK)[: self.lazy]
+            self._gap_tables().settle([a[: self.lazy] for a in arrays], visited, self.step)
+            self._current = (self.step, arrays)
+        return self._current[1]
+
+
+class _GapTables:
+    """The closed form of Adam's steps without a gradient (`FhashGaps`).
+
+    Attributes:
+        rates: learning rate of every step, counted from 1.
+        step: step up to which the sums are known.
+        structure: the addresses of the tables.
+    """
+
+    def __init__(self, rates: npt.NDArray[np.float64]) -> None:
+        """Make the tables of a course of the learning rate."""
+        self.rates, self.step = rates, 0
+        steps = np.arange(len(rates))
+        corrections = [-np.expm1(np.maximum(steps, 1) * np.log(beta)) for beta in (BETA1, BETA2)]
+        self._tables: dict[str, npt.NDArray[Any]] = {
+            "weight": rates * np.sqrt(corrections[1]) / corrections[0],
+            "inverse": rates / corrections[0],
+            "weight_sum": np.zeros(len(rates)),
+            "inverse_sum": np.zeros(len(rates)),
+            "factor": np.zeros(len(rates), np.float32),
+            "epsilon": np.zeros(len(rates), np.float32),
+            "mean_decay": (BETA1 ** steps.astype(np.float64)).astype(np.float32),
+            "square_decay": (BETA2 ** steps.astype(np.float64)).astype(np.float32),
+        }
+        self.structure = Gaps(**{name: a.ctypes.data for name, a in self._tables.items()})
+
+    def settle(
+        self, arrays: tuple[Floats, ...] | list[Floats], visited: npt.NDArray[np.int64], step: int
+    ) -> None:
+        """Let numbers and their moments catch up, in place.
+
+        Args:
+            arrays: numbers (n, ...), and the two moments of each.
+            visited: last step with a gradient of each number (n,), 0 for none.
+            step: step up to which they catch up.
+        """
+        numbers, mean, square = arrays
+        missed = np.where(visited > 0, step - visited, 0)
+        at = np.where(missed > 0, visited, 0)
+        columns = {
+            "factor": np.where(missed > 0, self._tables["factor"][at], np.float32(0)),
+            "epsilon": self._tables["epsilon"][at],
+            "mean_decay": self._tables["mean_decay"][missed],
+            "square_decay": self._tables["square_decay"][missed],
+        }
+        factor, epsilon, mean_decay, square_decay = (
+            column.reshape(-1, *(1,) * (numbers.ndim - 1)) for column in columns.values()
+        )
+        # Where nothing was missed nothing changes, and the root of 0 divides nothing.
+        root = np.sqrt(square) + np.where(epsilon > 0, epsilon, np.float32(1))
+        numbers -= factor * mean / root
+        mean *= mean_decay
+        square *= square_decay
