@@ -106,8 +106,8 @@ AXES = (
             {"tables": "transform"},
         ),
         reference=1,
-        why="storage of the tables, sparse with needed vertices alone; transform alone has a smaller"
-        " model, made for coding",
+        why="storage of the tables, sparse of needed vertices alone; transform alone has a"
+        " smaller model, made for coding",
     ),
     Axis(
         name="effort",
