@@ -37,6 +37,12 @@ With 5 columns, the sparse blocks of a shock's feature take 0.19 of their produc
 READ_NUMBERS = 2**24
 """Numbers of a table that are read at once for one time node."""
 
+SMALL_NUMBERS = 2**18
+"""Numbers up to which the part of a level that holds some vertices only gets all vertices.
+
+Blocks then take them without looking for their places.
+"""
+
 Scalar = TypeVar("Scalar", bound=np.generic)
 BlockIndex = tuple[int, int, int]
 """Place (z, y, x) of a block in the grid of blocks."""
@@ -293,22 +299,22 @@ def _level_window(
 ) -> LevelWindow:
     """Read the part of a level that all blocks need, and interpolate it in time.
 
-    The part is read at the one or two time nodes around the key index, in a few large reads. Of a
-    level that holds some vertices only, nothing becomes an array of all vertices.
+    The part is read at the one or two time nodes around the key index, in a few large reads. A
+    large part of a level that holds some vertices only does not become an array of all vertices.
     """
     last = network.levels[level][0] - 1
     position = key_index * last / max(network.key_frames - 1, 1)
     node = min(int(position), last)
     after_weight = np.float32(position - node)
-    frame = network.sparse_frame(level, node)
-    if frame is not None:
-        after = None if after_weight == 0 else network.sparse_frame(level, node + 1)
-        return SparseWindow(frame if after is None else between(frame, after, after_weight))
     time = slice(node, node + 1 if after_weight == 0 else node + 2)
     (z0, z1), (y0, y1), (x0, x1) = (
         (min(w.first for w in axis.values()), max(w.stop for w in axis.values()))
         for axis in weights
     )
+    numbers = network.embedding_size * (z1 - z0) * (y1 - y0) * (x1 - x0)
+    if numbers > SMALL_NUMBERS and (frame := network.sparse_frame(level, node)) is not None:
+        after = None if after_weight == 0 else network.sparse_frame(level, node + 1)
+        return SparseWindow(frame if after is None else between(frame, after, after_weight))
     values = np.empty((network.embedding_size, z1 - z0, y1 - y0, x1 - x0), np.float32)
     planes = max(1, READ_NUMBERS // values[:, 0].size)
     for start in range(z0, z1, planes):

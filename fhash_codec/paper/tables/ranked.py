@@ -139,7 +139,7 @@ class SparseFrame:
     @property
     def row(self) -> int:
         """Bits of a row along x; vertex (z, y, x) has bit (z * shape[1] + y) * row + x."""
-        return -(-self.shape[2] // 8) * 8
+        return row_bits(self.shape[2])
 
     @property
     def nbytes(self) -> int:
@@ -167,6 +167,11 @@ class SparseFrame:
             at = held.nonzero()
             result[at] = self.take(*(i + axis.start for i, axis in zip(at, box, strict=True)))
         return result
+
+
+def row_bits(vertices: int) -> int:
+    """Return the bits of a row of vertices along x, filled up to whole bytes."""
+    return -(-vertices // 8) * 8
 
 
 def between(before: SparseFrame, after: SparseFrame, after_weight: np.float32) -> SparseFrame:

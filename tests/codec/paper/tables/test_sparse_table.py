@@ -12,8 +12,9 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.coreset import occupancy
-from fhash_codec.paper.network import Network, SparseSource
-from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.network import ArrayTable, Network, SparseSource
+from fhash_codec.paper.point_tables import PointTables, SparsePatch
+from fhash_codec.paper.points import PointSampler, sample_points
 from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.tables.needed import needed_by
 from fhash_codec.paper.tables.sparse_table import SparseTable
@@ -70,8 +71,13 @@ def test_regions_of_a_table_are_those_of_a_dense_one(random_model) -> None:
             np.testing.assert_array_equal(table.read(region), other.read(region))
 
 
+@pytest.mark.parametrize("small", [0, 200, 10**6])
 @pytest.mark.parametrize("key", [0.0, 0.4, 2.0, 3.75, 4.0])
-def test_a_decoded_region_has_the_bits_of_a_dense_one(random_model, key) -> None:
+def test_a_decoded_region_has_the_bits_of_a_dense_one(
+    random_model, monkeypatch, key, small
+) -> None:
+    """Whichever levels get all their vertices first."""
+    monkeypatch.setattr("fhash_codec.paper.regions.SMALL_NUMBERS", small)
     dense = random_model.network(fill=0.0)
     network = sparse(dense, random_model)
     whole = tuple((0, n) for n in dense.box_size)
@@ -97,6 +103,66 @@ def test_points_have_the_bits_of_a_dense_one(random_model) -> None:
         strict=True,
     ):
         np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
+def test_points_of_one_time_are_found_by_ranks(random_model, monkeypatch, native, key) -> None:
+    """As in pictures through the network, on the numpy path and on the native one."""
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    dense = random_model.network(fill=0.0)
+    network = sparse(dense, random_model)
+    tables = PointTables.of_box(network, key)
+    assert all(isinstance(patch, SparsePatch) for patch in tables.patches)
+    chance = np.random.default_rng(3)
+    places = [np.zeros(1), *(chance.random(300) * (n - 1) for n in dense.box_size)]
+    for column, size in zip(places[1:], dense.box_size, strict=True):
+        column[:20] = chance.integers(0, size, 20)
+    read = []
+    for box in (tables, PointTables.of_box(dense, key)):
+        values, slopes = np.empty(300, np.float32), np.empty((300, 4), np.float32)
+        PointSampler(box, key).sample(places, values, slopes, 1)
+        read.append((values, slopes))
+    np.testing.assert_array_equal(read[0][0], read[1][0])
+    np.testing.assert_array_equal(read[0][1], read[1][1])
+
+
+def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
+    tables = PointTables.of_box(sparse(random_model.network(fill=0.0), random_model), 1.3)
+    assert not tables.readable
+    assert tables.at(1.3).readable
+
+
+@pytest.mark.parametrize("box", [(1, 6, 9), (5, 1, 9), (5, 6, 1), (1, 1, 1)])
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_an_axis_of_one_vertex(monkeypatch, native, box) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    chance = np.random.default_rng(4)
+    mask = chance.random(box) < 0.5
+    held = chance.normal(size=(int(mask.sum()), 3)).astype(np.float32)
+    dense = np.zeros((1, *box, 3), np.float32)
+    dense[0][mask] = held
+    layer = (np.array([[1.0, -2.0, 0.5]], np.float32), np.zeros(1, np.float32))
+
+    def network(table: Any) -> Network:
+        return Network(
+            levels=((1, *box),),
+            embedding_size=3,
+            tables=[table],
+            layers=(layer,),
+            box_size=box,
+            key_frames=1,
+        )
+
+    table = SparseTable(
+        dense.shape, [len(held)], lambda first, end: held[first:end], lambda node: mask, "level 1"
+    )
+    places = [np.zeros(1), *(chance.random(50) * (n - 1) for n in box)]
+    values = np.empty((2, 50), np.float32)
+    for number, source in enumerate((table, ArrayTable(dense))):
+        tables = PointTables.of_box(network(source), 0.0)
+        PointSampler(tables, 0.0).sample(places, values[number], None, 1)
+    np.testing.assert_array_equal(values[0], values[1])
 
 
 def test_numbers_that_are_not_finite_are_damage(random_model) -> None:
