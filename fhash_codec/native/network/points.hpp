@@ -37,8 +37,8 @@ struct Held {
     std::int64_t nothing;
 };
 
-// A part of a level's table: its numbers, how many there are, and its axes t, z, y, x. Where it holds
-// some vertices only, the axes count bits of the bitmap, and the table has one time.
+// A part of a level's table: its numbers, how many there are, and its axes t, z, y, x. Where it
+// holds some vertices only, the axes count bits of the bitmap, and the table has one time.
 struct Level {
     const float* table;
     std::int64_t numbers;

@@ -108,7 +108,7 @@ def test_points_have_the_bits_of_a_dense_one(random_model) -> None:
 @pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
 def test_points_of_one_time_are_found_by_ranks(random_model, monkeypatch, native, key) -> None:
-    """As in pictures through the network, on the numpy path and on the native one."""
+    """Pictures through the network do so, on the numpy path and on the native one."""
     monkeypatch.setenv("FHASH_NATIVE", native)
     dense = random_model.network(fill=0.0)
     network = sparse(dense, random_model)
