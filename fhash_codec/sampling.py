@@ -46,6 +46,9 @@ def interpolable(
 def _groups_of_one_occupancy(steps: Positions, keys: Positions) -> Iterator[tuple[float, Mask]]:
     """Points between the same steps and the same key frames: a step of theirs, and their mask."""
     between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
+    if len(steps) and (between == between[:, :1]).all():
+        yield float(steps[0]), np.ones(len(steps), np.bool_)
+        return
     _, first, group = np.unique(between, axis=1, return_index=True, return_inverse=True)
     for number, point in enumerate(first):
         yield steps[point], group == number
@@ -66,6 +69,8 @@ def _cells_occupied(
     )
     occupied = occupancy(step, region)
     complete = np.ones(space[0].shape, dtype=bool)
+    if occupied.all():
+        return complete
     for corner in np.ndindex(2, 2, 2):
         vertex = tuple(
             (high if is_upper else low) - first

@@ -102,7 +102,7 @@ def sample_points(
     slopes = np.empty((count, 4), np.float32) if gradient else None
     for group in _groups(columns, np.arange(count)):
         whole = len(group) == count
-        places = columns if whole else [_chosen(column, group) for column in columns]
+        places = [_chosen(column, group) for column in columns]
         tables = PointTables.read(network, *_extremes(places))
         sampler = PointSampler(tables, None if gradient else _one_time(tables, places, len(group)))
         if whole:
@@ -291,8 +291,8 @@ def _check(network: Network, columns: Sequence[npt.NDArray[np.float64]]) -> None
 def _chosen(
     column: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
 ) -> npt.NDArray[np.float64]:
-    """Return a coordinate of chosen points; one number stands for all."""
-    return column[chosen] if len(column) > 1 else column
+    """Return a coordinate of chosen points, in ascending order; one number stands for all."""
+    return column if len(column) in (1, len(chosen)) else column[chosen]
 
 
 def _extremes(columns: Sequence[npt.NDArray[np.float64]]) -> tuple[list[float], list[float]]:

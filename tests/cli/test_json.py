@@ -17,9 +17,9 @@ from click.testing import Result
 
 import fhash_codec
 from fhash_cli.main import COMMANDS
-from fhash_codec.bench import train
 from fhash_codec.bench.pictures.results import RenderBench
 from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed, TilePrice
+from fhash_codec.bench.train import bench, clock
 from fhash_codec.cost.results import (
     Advice,
     CostReport,
@@ -228,8 +228,9 @@ def test_cost() -> None:
 
 def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = count()
-    monkeypatch.setattr(train, "time", SimpleNamespace(perf_counter=lambda: next(ticks) / 100))
-    monkeypatch.setattr(train, "INFER_SECONDS", 0.01)
+    read = lambda: next(ticks) / 100  # noqa: E731
+    monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=read, process_time=read))
+    monkeypatch.setattr(bench, "INFER_SECONDS", 0.01)
     words = ["bench", "train", data, "--seconds", "0.1", "--width", "4", "--engines", "slab"]
     check("bench train", parsed(fhash(*words, "--json", "-q")))
 

@@ -109,8 +109,46 @@ inline std::int64_t row_of(const FhashBricks& b) {
     return (vertices_of(b) + 15) / 16 * 16 + 16;
 }
 
+inline std::int64_t larger(std::int64_t a, std::int64_t b) { return a > b ? a : b; }
+inline std::int64_t smaller(std::int64_t a, std::int64_t b) { return a < b ? a : b; }
+
 inline std::int64_t groups_of(const FhashBricks& b) {
     return (b.shape[2] + FHASH_GROUP - 1) / FHASH_GROUP;
 }
 
+// Corners along t that a brick reads: a second one without weight is left out.
+inline std::int64_t corners_in_time(const FhashLevel& l, std::int64_t key_frame) {
+    return l.corners[0] > 1 && l.time[2 * key_frame + 1] != 0 ? 2 : 1;
+}
+
+// Call `each` with the place in `flat` of each of a brick's rows of corners at a level, ordered t,
+// z, y. Corners of a row lie side by side: a brick needs all of them, and `rank` leaves out what no
+// brick needs.
+template <class Each>
+FHASH_INLINE void for_rows(const FhashBricks& b, const FhashLevel& l, const std::int32_t* brick,
+                           Each each) {
+    const std::int64_t start = l.start[0][brick[0]] + l.start[1][brick[1]] +
+                               l.start[2][brick[2]] + l.start[3][brick[3]];
+    const std::int64_t nt = corners_in_time(l, brick[0]);
+    for (std::int64_t t = 0; t < nt; t++)
+        for (std::int64_t z = 0; z < l.corners[1]; z++)
+            for (std::int64_t y = 0; y < l.corners[2]; y++) {
+                const std::int64_t at =
+                    start + t * l.stride[0] + z * l.stride[1] + y * l.stride[2];
+                each(b.rank ? (std::int64_t)b.rank[at] : at);
+            }
+}
+
 }  // namespace
+
+// The parts of a step, and an evaluation.
+enum FhashPart { CATCH_UP, TRAIN, ADAM, INFER };
+
+// The kernels of a path: the share of a thread in a part, and the numbers of its memory.
+#define FHASH_BRICK_KERNELS(NAME)                                                              \
+    std::int64_t fhash_bricks_run_##NAME(const FhashBricks& b, std::int64_t part,              \
+                                         std::int64_t thread);                                 \
+    std::int64_t fhash_bricks_work_##NAME(const FhashBricks& b);
+FHASH_BRICK_KERNELS(v4)
+FHASH_BRICK_KERNELS(v3)
+FHASH_BRICK_KERNELS(v1)

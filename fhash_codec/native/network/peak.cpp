@@ -18,7 +18,8 @@ namespace {
 constexpr int CHAINS = 12;
 
 template <class P> FHASH_INLINE std::int64_t fma_kernel(std::int64_t rounds) {
-    typename P::F chain[CHAINS], factor = all<P>(0.999f), summand = all<P>(0.001f);
+    typename P::F chain[CHAINS];
+    typename P::F factor = all<P>(0.999f), summand = all<P>(0.001f);
     FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = all<P>(1.0f + c);
     // The compiler may know nothing of the numbers, and must keep each round.
     asm volatile("" : REGISTER(factor), REGISTER(summand));

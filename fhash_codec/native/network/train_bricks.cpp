@@ -1,296 +1,7 @@
-// Training and evaluation of the paper's network, a brick at a time: upsampling, MLP forward and
-// backward, the transpose, and Adam of the finest embeddings while they lie in a core's cache.
-//
-// A step has three parts, of which each thread does its own share: catching up the blocks of the
-// largest coarse table that the step touches, the bricks, and Adam of the flat numbers. Threads add
-// gradients to memory of their own, which is summed in their order: the same bricks, path and number
-// of threads give the same bits.
-#include <algorithm>
-
-#include "adam.hpp"
-#include "mlp.hpp"
-#include "upsample.hpp"
-
-#if defined(FHASH_VECTORS)
-
-namespace {
-
-// Memory of a thread.
-struct Work {
-    std::int64_t row;      // numbers from one row of inputs to the next
-    float* inputs;         // (inputs + 1, row): at all vertices; the last row is 1
-    float* picked;         // the same of the samples alone
-    Planes planes;
-    float* mlp;
-    std::int32_t* places;  // (vertices,): those of the samples
-    std::int64_t* rows;    // places of the rows of corners, level by level
-    std::int64_t size;     // numbers of all memory
-
-    // Lay out memory that begins at `memory`; null for the size alone.
-    template <class P> static Work of(const FhashBricks& b, float* memory) {
-        Work w = {};
-        const auto take = [&](std::int64_t numbers) {
-            float* const taken = memory ? memory + w.size : nullptr;
-            w.size += (numbers + FHASH_PAD + 15) / 16 * 16;
-            return taken;
-        };
-        const std::int64_t count = (b.levels + 1) * b.embedding + 1, plane = b.shape[1] * b.shape[2];
-        std::int64_t nx = 0, lines = 0, planes = 0, rows = 0;
-        for (std::int64_t l = 0; l < b.levels; l++) {
-            const std::int64_t* corners = b.level[l].corners;
-            nx = std::max(nx, corners[3]);
-            lines = std::max(lines, corners[1] * corners[2]);
-            planes = std::max(planes, corners[1]);
-            rows += corners[0] * corners[1] * corners[2];
-        }
-        w.row = row_of(b);
-        w.inputs = take(count * w.row);
-        w.picked = take(count * w.row);
-        w.planes.corners = take(b.embedding * (nx + FHASH_REACH));
-        w.planes.x = take(b.embedding * lines * groups_of(b) * FHASH_GROUP);
-        w.planes.y = take(b.embedding * planes * plane);
-        w.mlp = take(Mlp::memory(count - 1, b.hidden, b.width, P::N, Tiles<P>::CHUNK));
-        w.places = reinterpret_cast<std::int32_t*>(take(vertices_of(b)));
-        w.rows = reinterpret_cast<std::int64_t*>(take(2 * rows));
-        return w;
-    }
-};
-
-// What is the same for all bricks of a thread.
-template <class P> struct Thread {
-    const FhashBricks& b;
-    Work w;
-    Mlp mlp;
-    std::int64_t inputs, vertices;
-};
-
-template <class P>
-FHASH_INLINE Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, const float* flat) {
-    const std::int64_t inputs = (b.levels + 1) * b.embedding;
-    Thread<P> t{b, Work::of<P>(b, b.work + thread * b.work_size),
-                Mlp{inputs, b.hidden, b.width, {}, {}, {}, {}, nullptr}, inputs, vertices_of(b)};
-    t.mlp.template lay_out<P>(flat + b.coarse, t.w.mlp);
-    t.mlp.template begin<P>();
-    for (float* rows : {t.w.inputs, t.w.picked})
-        std::fill(rows + inputs * t.w.row, rows + (inputs + 1) * t.w.row, 1.0f);
-    return t;
-}
-
-// Write the places of a brick's samples; return their number.
-template <class P> FHASH_INLINE std::int64_t places_of(const Thread<P>& t, std::int64_t brick) {
-    const std::uint8_t* bits = t.b.mask + brick * t.b.mask_bytes;
-    std::int64_t count = 0;
-    for (std::int64_t v = 0; v < t.vertices; v++) {
-        t.w.places[count] = (std::int32_t)v;
-        count += bits[v >> 3] >> (7 - (v & 7)) & 1;
-    }
-    return count;
-}
-
-// Write the inputs at all vertices of a brick, and return the rows of its samples: those of all
-// vertices where all are samples. `flat` holds the coarse tables, caught up.
-template <class P>
-FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
-                              const float* flat, std::int64_t samples) {
-    const FhashBricks& b = t.b;
-    const std::int64_t row = t.w.row, numbers = b.embedding * t.vertices;
-    for (std::int64_t e = 0; e < b.embedding; e++) {
-        const std::int64_t at = brick * numbers + e * t.vertices;
-        if (gap.factor != 0)
-            catch_up<P>(t.w.inputs + e * row, b.fine + at, b.fine_mean + at, b.fine_square + at,
-                        t.vertices, gap);
-        else
-            std::memcpy(t.w.inputs + e * row, b.fine + at, t.vertices * sizeof(float));
-    }
-    const std::int32_t* place = b.bricks + 4 * brick;
-    std::int64_t* rows = t.w.rows;
-    for (std::int64_t l = 0; l < b.levels; l++) {
-        const FhashLevel& level = b.level[l];
-        std::int64_t* row_of_corners = rows;
-        for_rows(b, level, place, [&](std::int64_t at) { *row_of_corners++ = at; });
-        interpolate<P>(Place(b, level, place, rows), flat, t.w.planes,
-                       t.w.inputs + (l + 1) * b.embedding * row, row);
-        rows += level.corners[0] * level.corners[1] * level.corners[2];
-    }
-    if (samples == t.vertices) return t.w.inputs;
-    places_of(t, brick);
-    const std::int64_t whole = (samples + P::N - 1) / P::N * P::N;
-    for (std::int64_t k = 0; k < t.inputs; k++) {
-        const float* FHASH_RESTRICT from = t.w.inputs + k * row;
-        float* FHASH_RESTRICT to = t.w.picked + k * row;
-        for (std::int64_t s = 0; s < samples; s++) to[s] = from[t.w.places[s]];
-        for (std::int64_t s = samples; s < whole; s++) to[s] = 0;
-    }
-    return t.w.picked;
-}
-
-// Chunks of nearly equal length: some vectors of samples each.
-template <class P, class Work> FHASH_INLINE void in_chunks(std::int64_t samples, Work work) {
-    const std::int64_t vectors = (samples + P::N - 1) / P::N;
-    const std::int64_t chunks = (vectors + Tiles<P>::CHUNK - 1) / Tiles<P>::CHUNK;
-    for (std::int64_t c = 0; c < chunks; c++) {
-        const std::int64_t first = vectors * c / chunks, stop = vectors * (c + 1) / chunks;
-        work(first * P::N, stop - first);
-    }
-}
-
-// Replace the inputs of samples by the gradients by them; return the sum of squared errors.
-template <class P>
-FHASH_INLINE double backpropagate(Thread<P>& t, float* rows, const float* target,
-                                  std::int64_t samples) {
-    double error = 0;
-    const float scale = (float)t.b.scale;
-    in_chunks<P>(samples, [&](std::int64_t at, std::int64_t vectors) FHASH_LAMBDA {
-        t.mlp.template forward<P>(rows + at, t.w.row, vectors, true);
-        typename P::F squares = {};
-        const std::int64_t left = std::min(samples - at, vectors * P::N);
-        float* value = t.mlp.value;
-        std::int64_t i = 0;
-        for (; i + P::N <= left; i += P::N) {
-            const typename P::F d = loaded<P>(value + i) - loaded<P>(target + at + i);
-            squares += d * d;
-            store<P>(value + i, d * all<P>(scale));
-        }
-        for (; i < vectors * P::N; i++) {
-            const float d = i < left ? value[i] - target[at + i] : 0;
-            error += (double)d * d;
-            value[i] = d * scale;
-        }
-        for (int n = 0; n < P::N; n++) error += squares[n];
-        t.mlp.template backward<P>(rows + at, t.w.row, vectors);
-    });
-    return error;
-}
-
-// The share of a thread in the bricks of a training step.
-template <class P> FHASH_INLINE std::int64_t train_kernel(const FhashBricks& b, std::int64_t thread) {
-    Thread<P> t = thread_of<P>(b, thread, b.flat);
-    const Part part(b.count, thread, b.threads);
-    const Step step(b);
-    float* const gradient = b.gradient + thread * b.numbers;
-    double error = 0;
-    for (std::int64_t i = part.first; i < part.stop; i++) {
-        const std::int64_t brick = b.chosen[i], row = t.w.row;
-        const std::int64_t samples = b.offsets[brick + 1] - b.offsets[brick];
-        const Gap gap(b.gaps, b.visited[brick], b.step - 1);
-        float* rows = inputs_of(t, brick, gap, b.flat, samples);
-        float* const fine = b.fine + brick * b.embedding * t.vertices;
-        if (gap.factor != 0)
-            for (std::int64_t e = 0; e < b.embedding; e++)
-                std::memcpy(fine + e * t.vertices, t.w.inputs + e * row,
-                            t.vertices * sizeof(float));
-        error += backpropagate(t, rows, b.values + b.offsets[brick], samples);
-        if (rows == t.w.picked)
-            for (std::int64_t k = 0; k < t.inputs; k++) {
-                const float* FHASH_RESTRICT from = t.w.picked + k * row;
-                float* FHASH_RESTRICT to = t.w.inputs + k * row;
-                std::memset(to, 0, t.vertices * sizeof(float));
-                for (std::int64_t s = 0; s < samples; s++) to[t.w.places[s]] = from[s];
-            }
-        const std::int64_t* level_rows = t.w.rows;
-        for (std::int64_t l = 0; l < b.levels; l++) {
-            const FhashLevel& level = b.level[l];
-            add_transposed<P>(Place(b, level, b.bricks + 4 * brick, level_rows),
-                              t.w.inputs + (l + 1) * b.embedding * row, row, t.w.planes, gradient);
-            level_rows += level.corners[0] * level.corners[1] * level.corners[2];
-        }
-        for (std::int64_t e = 0; e < b.embedding; e++) {
-            const std::int64_t at = (brick * b.embedding + e) * t.vertices;
-            adam<P>(b.fine + at, b.fine_mean + at, b.fine_square + at, t.w.inputs + e * row,
-                    t.vertices, gap, step);
-        }
-        b.visited[brick] = b.step;
-    }
-    t.mlp.template gradient<P>(gradient + b.coarse);
-    b.error[thread] = error;
-    return 0;
-}
-FHASH_PATHS(std::int64_t, train, (const FhashBricks& b, std::int64_t thread), (b, thread))
-
-// The share of a thread in the bricks to be evaluated.
-template <class P> FHASH_INLINE std::int64_t infer_kernel(const FhashBricks& b, std::int64_t thread) {
-    Thread<P> t = thread_of<P>(b, thread, b.current);
-    const Part part(b.count, thread, b.threads);
-    for (std::int64_t i = part.first; i < part.stop; i++) {
-        const std::int64_t brick = b.chosen[i];
-        const std::int64_t samples = b.offsets[brick + 1] - b.offsets[brick];
-        const Gap gap(b.gaps, b.visited[brick], b.step);
-        float* rows = inputs_of(t, brick, gap, b.current, samples);
-        in_chunks<P>(samples, [&](std::int64_t at, std::int64_t vectors) FHASH_LAMBDA {
-            t.mlp.template forward<P>(rows + at, t.w.row, vectors, false);
-            std::memcpy(b.out + b.places[i] + at, t.mlp.value,
-                        std::min(samples - at, vectors * P::N) * sizeof(float));
-        });
-    }
-    return 0;
-}
-FHASH_PATHS(std::int64_t, infer, (const FhashBricks& b, std::int64_t thread), (b, thread))
-
-// The numbers of a block.
-inline std::int64_t length_of(const FhashBricks& b, std::int64_t block) {
-    return std::min<std::int64_t>(FHASH_BLOCK, b.lazy - block * FHASH_BLOCK);
-}
-
-// The share of a thread in the touched blocks, which catch up to the step before.
-template <class P>
-FHASH_INLINE std::int64_t catch_up_blocks_kernel(const FhashBricks& b, std::int64_t thread) {
-    const Part part(b.touches, thread, b.threads);
-    for (std::int64_t i = part.first; i < part.stop; i++) {
-        const std::int64_t block = b.touched[i], at = block * FHASH_BLOCK;
-        const Gap gap(b.gaps, b.blocks[block], b.step - 1);
-        if (gap.factor != 0)
-            catch_up<P>(b.flat + at, b.flat + at, b.flat_mean + at, b.flat_square + at,
-                        length_of(b, block), gap);
-    }
-    return 0;
-}
-FHASH_PATHS(std::int64_t, catch_up_blocks, (const FhashBricks& b, std::int64_t thread), (b, thread))
-
-// Do a step on some flat numbers, whose gradients are summed over the threads.
-template <class P, int MOST>
-FHASH_INLINE void move(const FhashBricks& b, std::int64_t at, std::int64_t count, const Gap& gap,
-                       const Step& step) {
-    float sum[MOST] = {};
-    for (std::int64_t t = 0; t < b.threads; t++) {
-        float* const from = b.gradient + t * b.numbers + at;
-        for (std::int64_t i = 0; i < count; i++) sum[i] += from[i];
-        std::memset(from, 0, count * sizeof(float));
-    }
-    adam<P>(b.flat + at, b.flat_mean + at, b.flat_square + at, sum, count, gap, step);
-}
-
-// The share of a thread in Adam of the flat numbers: the touched blocks, and all behind the blocks.
-template <class P> FHASH_INLINE std::int64_t adam_of_flat_kernel(const FhashBricks& b, std::int64_t thread) {
-    const Step step(b);
-    const Part part(b.touches, thread, b.threads);
-    for (std::int64_t i = part.first; i < part.stop; i++) {
-        const std::int64_t block = b.touched[i], length = length_of(b, block);
-        const Gap gap(b.gaps, b.blocks[block], b.step - 1);
-        if (length == FHASH_BLOCK)
-            move<P, FHASH_BLOCK>(b, block * FHASH_BLOCK, FHASH_BLOCK, gap, step);
-        else
-            move<P, FHASH_BLOCK>(b, block * FHASH_BLOCK, length, gap, step);
-        b.blocks[block] = b.step;
-    }
-    constexpr int MOST = 1024;
-    const std::int64_t rest = b.numbers - b.lazy;
-    const Part dense((rest + MOST - 1) / MOST, thread, b.threads);
-    const Gap none(b.gaps, 0, 0);
-    for (std::int64_t i = dense.first; i < dense.stop; i++)
-        move<P, MOST>(b, b.lazy + i * MOST, std::min<std::int64_t>(MOST, rest - i * MOST), none,
-                      step);
-    return 0;
-}
-FHASH_PATHS(std::int64_t, adam_of_flat, (const FhashBricks& b, std::int64_t thread), (b, thread))
-
-template <class P> FHASH_INLINE std::int64_t work_kernel(const FhashBricks& b) {
-    return Work::of<P>(b, nullptr).size;
-}
-FHASH_PATHS(std::int64_t, work, (const FhashBricks& b), (b))
-
-}  // namespace
-
-#endif  // FHASH_VECTORS
+// Training and evaluation of the paper's network by bricks: the functions that Python calls. The
+// kernels are those of brick_kernels.hpp, compiled for each path in a file of its own.
+#include "bricks.hpp"
+#include "gaps.hpp"
 
 namespace {
 
@@ -305,8 +16,12 @@ bool is_sound(const FhashBricks& b) {
 FHASH_EXPORT int64_t fhash_bricks_work(const FhashBricks* task) {
     if (!has_path(task->path)) return FHASH_NO_PATH;
     if (!is_sound(*task)) return -1;
+#if defined(FHASH_THREE_PATHS)
+    if (task->path == FHASH_PATH_V4) return fhash_bricks_work_v4(*task);
+    if (task->path == FHASH_PATH_V3) return fhash_bricks_work_v3(*task);
+#endif
 #if defined(FHASH_VECTORS)
-    return work(task->path)(*task);
+    return fhash_bricks_work_v1(*task);
 #else
     return FHASH_NO_PATH;
 #endif
@@ -337,20 +52,14 @@ FHASH_EXPORT int64_t fhash_bricks_touch(const FhashBricks* task) {
     return touches;
 }
 
-// The parts of a step, and an evaluation.
-enum { CATCH_UP, TRAIN, ADAM, INFER };
-
 // Do the share of one thread in a part. All threads finish a part before the next one begins.
 FHASH_EXPORT int64_t fhash_bricks_run(const FhashBricks* task, int64_t part, int64_t thread) {
+#if defined(FHASH_THREE_PATHS)
+    if (task->path == FHASH_PATH_V4) return fhash_bricks_run_v4(*task, part, thread);
+    if (task->path == FHASH_PATH_V3) return fhash_bricks_run_v3(*task, part, thread);
+#endif
 #if defined(FHASH_VECTORS)
-    const FhashBricks& b = *task;
-    switch (part) {
-        case CATCH_UP: return catch_up_blocks(b.path)(b, thread);
-        case TRAIN: return train(b.path)(b, thread);
-        case ADAM: return adam_of_flat(b.path)(b, thread);
-        case INFER: return infer(b.path)(b, thread);
-    }
-    return -1;
+    return fhash_bricks_run_v1(*task, part, thread);
 #else
     return FHASH_NO_PATH;
 #endif

@@ -7,40 +7,33 @@
 
 #include "bricks.hpp"
 
-namespace {
-
-// Corners along t that a brick reads: a second one without weight is left out.
-inline std::int64_t corners_in_time(const FhashLevel& l, std::int64_t key_frame) {
-    return l.corners[0] > 1 && l.time[2 * key_frame + 1] != 0 ? 2 : 1;
-}
-
-// Call `each` with the place in `flat` of each of a brick's rows of corners at a level, ordered t,
-// z, y. Corners of a row lie side by side: a brick needs all of them, and `rank` leaves out what no
-// brick needs.
-template <class Each>
-FHASH_INLINE void for_rows(const FhashBricks& b, const FhashLevel& l, const std::int32_t* brick,
-                           Each each) {
-    const std::int64_t start = l.start[0][brick[0]] + l.start[1][brick[1]] +
-                               l.start[2][brick[2]] + l.start[3][brick[3]];
-    const std::int64_t nt = corners_in_time(l, brick[0]);
-    for (std::int64_t t = 0; t < nt; t++)
-        for (std::int64_t z = 0; z < l.corners[1]; z++)
-            for (std::int64_t y = 0; y < l.corners[2]; y++) {
-                const std::int64_t at =
-                    start + t * l.stride[0] + z * l.stride[1] + y * l.stride[2];
-                each(b.rank ? (std::int64_t)b.rank[at] : at);
-            }
-}
-
-}  // namespace
-
 #if defined(FHASH_VECTORS)
 
 namespace {
 
+// Two vectors of pairs: apart, the first numbers and the second ones; and back.
+template <class P> struct Pairs {
+    typedef typename P::F F;
+    template <int... I> struct Places {};
+    template <int COUNT, int... I> struct First : First<COUNT - 1, COUNT - 1, I...> {};
+    template <int... I> struct First<0, I...> {
+        typedef Places<I...> All;
+    };
+    typedef typename First<P::N>::All All;
+    template <int... I> static FHASH_INLINE void apart(F a, F b, F& first, F& second, Places<I...>) {
+        first = __builtin_shufflevector(a, b, 2 * I...);
+        second = __builtin_shufflevector(a, b, (2 * I + 1)...);
+    }
+    template <int... I>
+    static FHASH_INLINE void together(F first, F second, F& a, F& b, Places<I...>) {
+        a = __builtin_shufflevector(first, second, (I / 2 + I % 2 * P::N)...);
+        b = __builtin_shufflevector(first, second, (I / 2 + P::N / 2 + I % 2 * P::N)...);
+    }
+};
+
 // Memory of an interpolation at one level.
 struct Planes {
-    float* corners;  // (embedding, corners x)
+    float* corners;  // (embedding, corners x and room for more)
     float* x;        // (embedding, corners z, corners y, vertices x in whole groups)
     float* y;        // (embedding, corners z, vertices y, vertices x)
 };
@@ -49,7 +42,7 @@ struct Planes {
 struct Place {
     const FhashBricks& b;
     const FhashLevel& l;
-    std::int64_t size, nt, nz, ny, nx, groups, wide, plane;
+    std::int64_t size, nt, nz, ny, nx, groups, wide, plane, room;
     const std::int64_t* rows;
     const float *time, *weight_z, *weight_y, *spread, *gathered;
     const std::int32_t *first_z, *first_y, *reach;
@@ -57,7 +50,7 @@ struct Place {
           const std::int64_t* level_rows)
         : b(bricks), l(level), size(b.embedding), nz(l.corners[1]), ny(l.corners[2]),
           nx(l.corners[3]), groups(groups_of(b)), wide(groups * FHASH_GROUP),
-          plane(b.shape[1] * b.shape[2]), rows(level_rows) {
+          plane(b.shape[1] * b.shape[2]), room(nx + FHASH_REACH), rows(level_rows) {
         time = l.time + 2 * brick[0];
         nt = corners_in_time(l, brick[0]);
         first_z = l.first[0] + brick[1] * b.shape[0];
@@ -74,12 +67,25 @@ struct Place {
 // Write the numbers of a row of corners between two key frames, embedding by embedding.
 template <class P> FHASH_INLINE void corners_of(const Place& p, std::int64_t row, const float* flat,
                                                 float* FHASH_RESTRICT to) {
+    typedef typename P::F F;
     const float* from = flat + p.rows[row];
     const float* next = p.nt > 1 ? flat + p.rows[row + p.nz * p.ny] : from;
     const float w0 = p.nt > 1 ? p.time[0] : 1, w1 = p.nt > 1 ? p.time[1] : 0;
+    if (p.size == 2) {
+        const F v0 = all<P>(w0), v1 = all<P>(w1);
+        for (std::int64_t x = 0; x < p.nx; x += P::N) {
+            const float *a = from + 2 * x, *b = next + 2 * x;
+            F low = v0 * loaded<P>(a) + v1 * loaded<P>(b), first;
+            F high = v0 * loaded<P>(a + P::N) + v1 * loaded<P>(b + P::N), second;
+            Pairs<P>::apart(low, high, first, second, typename Pairs<P>::All());
+            store<P>(to + x, first);
+            store<P>(to + p.room + x, second);
+        }
+        return;
+    }
     for (std::int64_t e = 0; e < p.size; e++)
         for (std::int64_t x = 0; x < p.nx; x++)
-            to[e * p.nx + x] = w0 * from[x * p.size + e] + w1 * next[x * p.size + e];
+            to[e * p.room + x] = w0 * from[x * p.size + e] + w1 * next[x * p.size + e];
 }
 
 // to[i] = w0 * a[i] + w1 * b[i]
@@ -99,7 +105,7 @@ template <class P> FHASH_INLINE void interpolate(const Place& p, const float* fl
         corners_of<P>(p, line, flat, m.corners);
         for (std::int64_t e = 0; e < p.size; e++)
             for (std::int64_t g = 0; g < p.groups; g++) {
-                const float* from = m.corners + e * p.nx + p.reach[2 * g];
+                const float* from = m.corners + e * p.room + p.reach[2 * g];
                 const float* w = p.spread + g * FHASH_REACH * FHASH_GROUP;
                 typename P::F sum[FHASH_GROUP / P::N] = {};
                 for (std::int64_t c = 0; c < p.reach[2 * g + 1]; c++) {
@@ -140,7 +146,19 @@ template <class P> FHASH_INLINE void collect(float* to, std::int64_t corners,
         while (begin < lines && first[begin] < c - 1) begin++;
         std::int64_t end = begin;
         while (end < lines && first[end] <= c) end++;
-        for (std::int64_t i = 0; i < length; i += P::N) {
+        constexpr int MANY = 4;  // vectors at a time
+        std::int64_t i = 0;
+        for (; i + MANY * P::N <= length; i += MANY * P::N) {
+            typename P::F sum[MANY] = {};
+            for (std::int64_t n = begin; n < end; n++) {
+                const typename P::F w = all<P>(weight[2 * n + (first[n] < c)]);
+                FHASH_UNROLLED for (int q = 0; q < MANY; q++)
+                    sum[q] += w * loaded<P>(from + n * apart + i + q * P::N);
+            }
+            FHASH_UNROLLED for (int q = 0; q < MANY; q++)
+                store<P>(to + c * out_apart + i + q * P::N, sum[q]);
+        }
+        for (; i < length; i += P::N) {
             typename P::F sum = {};
             for (std::int64_t n = begin; n < end; n++)
                 sum += all<P>(weight[2 * n + (first[n] < c)]) * loaded<P>(from + n * apart + i);
@@ -156,8 +174,8 @@ template <class P> FHASH_INLINE void add_corners(const Place& p, std::int64_t ro
     const std::int64_t length = p.b.shape[2];
     const bool direct = p.groups == 1 && p.reach[1] == p.nx;  // one group writes all corners
     for (std::int64_t e = 0; e < p.size; e++) {
-        float* own = corners + e * (p.nx + FHASH_REACH);
-        if (!direct) std::memset(own, 0, (p.nx + FHASH_REACH) * sizeof(float));
+        float* own = corners + e * p.room;
+        if (!direct) std::memset(own, 0, p.room * sizeof(float));
         for (std::int64_t g = 0; g < p.groups; g++) {
             const float* from = vertices + e * apart + g * FHASH_GROUP;
             const float* w = p.gathered + g * FHASH_GROUP * FHASH_REACH;
@@ -180,9 +198,21 @@ template <class P> FHASH_INLINE void add_corners(const Place& p, std::int64_t ro
     for (std::int64_t t = 0; t < p.nt; t++) {
         const float share = p.nt > 1 ? p.time[t] : 1;
         float* at = to + p.rows[row + t * p.nz * p.ny];
+        if (p.size == 2) {
+            const typename P::F v = all<P>(share);
+            // Behind the last corner there are zeros.
+            for (std::int64_t x = 0; x < p.nx; x += P::N) {
+                typename P::F low, high;
+                Pairs<P>::together(loaded<P>(corners + x), loaded<P>(corners + p.room + x), low,
+                                   high, typename Pairs<P>::All());
+                store<P>(at + 2 * x, loaded<P>(at + 2 * x) + v * low);
+                store<P>(at + 2 * x + P::N, loaded<P>(at + 2 * x + P::N) + v * high);
+            }
+            continue;
+        }
         for (std::int64_t e = 0; e < p.size; e++)
             for (std::int64_t x = 0; x < p.nx; x++)
-                at[x * p.size + e] += share * corners[e * (p.nx + FHASH_REACH) + x];
+                at[x * p.size + e] += share * corners[e * p.room + x];
     }
 }
 

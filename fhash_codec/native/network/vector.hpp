@@ -1,11 +1,18 @@
 // Vectors of the network's kernels: one source for AVX-512, AVX2 with FMA, and the baseline.
 //
 // A kernel is an always-inlined template on a path (`Path1`, `Path2`, `Path4`), written with the
-// vector extensions of GCC and Clang. FHASH_PATHS compiles it once for each path that the machine's
-// architecture knows, and makes a function that returns the one of a path. Compilers without these
-// extensions build a library that offers no path.
+// vector extensions of GCC and Clang. There are two ways to compile it for each path:
+// - FHASH_PATHS, for a kernel of few lines: functions of three targets that inline it, and a
+//   function that returns the one of a path.
+// - A source file for each path, which defines FHASH_ONLY as the path's bit before it includes this
+//   header: all that follows is compiled for that path. GCC lowers some vector expressions, above
+//   all those that repeat a number, before it inlines a function into one of another target; then
+//   they are built place by place. Nothing of the standard library but functions of C may be called
+//   there: a copy of it for that path could be linked into others.
+// Compilers without these extensions build a library that offers no path.
 #pragma once
 
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 
@@ -24,6 +31,25 @@ constexpr std::int64_t FHASH_PATH_V4 = 4;
 
 // What an exported function returns for a path that the machine does not have.
 constexpr std::int64_t FHASH_NO_PATH = -3;
+
+#if defined(__x86_64__) && (defined(__clang__) || (defined(__GNUC__) && __GNUC__ >= 12))
+#define FHASH_THREE_PATHS 1
+#define FHASH_TARGET_V4 "arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"
+#define FHASH_TARGET_V3 "arch=x86-64-v3,tune=haswell"
+#if defined(FHASH_ONLY) && defined(__clang__)
+#if FHASH_ONLY == 4
+#pragma clang attribute push(__attribute__((target("arch=x86-64-v4"))), apply_to = function)
+#elif FHASH_ONLY == 2
+#pragma clang attribute push(__attribute__((target("arch=x86-64-v3"))), apply_to = function)
+#endif
+#elif defined(FHASH_ONLY)
+#if FHASH_ONLY == 4
+#pragma GCC target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512")
+#elif FHASH_ONLY == 2
+#pragma GCC target("arch=x86-64-v3,tune=haswell")
+#endif
+#endif
+#endif
 
 #if defined(FHASH_VECTORS)
 
@@ -48,14 +74,16 @@ template <class P> FHASH_INLINE void store(float* to, typename P::F vector) {
 }
 // A vector with one number in all its places.
 template <class P> FHASH_INLINE typename P::F all(float number) {
+#if defined(FHASH_ONLY)
     return number - typename P::F{};
+#else
+    return typename P::F{} + number;  // an addition, but not lowered to places (see above)
+#endif
 }
 
-#if defined(__x86_64__) && (defined(__clang__) || __GNUC__ >= 12)
-#define FHASH_THREE_PATHS 1
-#define FHASH_V4 \
-    __attribute__((target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512")))
-#define FHASH_V3 __attribute__((target("arch=x86-64-v3,tune=haswell")))
+#if defined(FHASH_THREE_PATHS)
+#define FHASH_V4 __attribute__((target(FHASH_TARGET_V4)))
+#define FHASH_V3 __attribute__((target(FHASH_TARGET_V3)))
 // After a template `NAME_kernel<Path>`: its functions NAME_v4, NAME_v3 and NAME_v1, and NAME(path),
 // which returns that of a path. PARAMETERS and ARGUMENTS stand in parentheses.
 #define FHASH_PATHS(RESULT, NAME, PARAMETERS, ARGUMENTS)                                  \
@@ -75,7 +103,7 @@ template <class P> FHASH_INLINE typename P::F all(float number) {
 #endif  // FHASH_VECTORS
 
 // The paths of this machine, as bits.
-inline std::int64_t machine_paths() {
+static inline std::int64_t machine_paths() {
 #if defined(FHASH_THREE_PATHS)
     std::int64_t paths = FHASH_PATH_BASELINE;
     if (__builtin_cpu_supports("x86-64-v3")) paths |= FHASH_PATH_V3;
@@ -89,6 +117,6 @@ inline std::int64_t machine_paths() {
 }
 
 // Whether `path` is one path of this machine.
-inline bool has_path(std::int64_t path) {
+static inline bool has_path(std::int64_t path) {
     return path > 0 && (path & (path - 1)) == 0 && (machine_paths() & path) != 0;
 }

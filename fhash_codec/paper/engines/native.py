@@ -48,7 +48,10 @@ STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "fl
 """Arrays of the slab engine's state."""
 FLUSH = 1024
 """Bricks that are brought up to date at a time."""
+PAD = 64
+"""Numbers behind the flat ones that a vector may read or rewrite; FHASH_PAD in bricks.hpp."""
 CPU = torch.device("cpu")
+"""The device of the engine."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -138,7 +141,9 @@ class NativeEngine:
         self.visited = np.zeros(len(self.fine), np.int64)
         self.step = 0
         self.coarse = len(self._used)
-        self.flat = np.concatenate([start.coarse.numpy()[self._used], start.network.numpy()])
+        self.flat = _padded(
+            np.concatenate([start.coarse.numpy()[self._used], start.network.numpy()])
+        )
         self.flat_mean, self.flat_square = np.zeros_like(self.flat), np.zeros_like(self.flat)
         largest = prod(architecture.levels[1]) if len(architecture.levels) > 1 else 0
         self.lazy = int(np.searchsorted(self._used, largest * architecture.embedding_size))
@@ -285,7 +290,7 @@ class NativeEngine:
         """Return the threads for some bricks, those of torch at most; their memory is there."""
         threads = max(1, min(torch.get_num_threads(), bricks))
         if len(self._memory.get("gradient", ())) < threads:
-            self._memory["gradient"] = np.zeros((threads, len(self.flat)), np.float32)
+            self._memory["gradient"] = _padded(np.zeros((threads, len(self.flat)), np.float32))
             # A cache line more, so that the memory can begin with one.
             work = np.zeros(threads * self._task.work_size + 16, np.float32)
             self._memory["work"] = work
@@ -326,11 +331,19 @@ class NativeEngine:
         """Return `flat` and its moments with all blocks caught up; the engine's own stay behind."""
         if self._current is None or self._current[0] != self.step:
             self._catch_up_gaps()
-            arrays = [array.copy() for array in (self.flat, self.flat_mean, self.flat_square)]
+            arrays = [_padded(array) for array in (self.flat, self.flat_mean, self.flat_square)]
             visited = np.repeat(self.blocks, BLOCK)[: self.lazy]
             self._gap_tables().settle([a[: self.lazy] for a in arrays], visited, self.step)
             self._current = (self.step, arrays)
         return self._current[1]
+
+
+def _padded(numbers: Floats) -> Floats:
+    """Return a copy of numbers with PAD more behind them in memory, for a last vector's sake."""
+    memory = np.zeros(numbers.size + PAD, np.float32)
+    copy = memory[: numbers.size].reshape(numbers.shape)
+    copy[...] = numbers
+    return copy
 
 
 class _GapTables:

@@ -1,0 +1,218 @@
+"""`fhash bench train`: training and evaluation speed of each engine, beside the machine's."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fhash_cli.base_command import BaseCommand
+from fhash_cli.options import (
+    RealRange,
+    SourceOptions,
+    check_writable,
+    config_options,
+    force_option,
+    json_option,
+    quiet_option,
+    series_options,
+)
+from fhash_cli.output import Progress, emit, number, size, table
+
+if TYPE_CHECKING:
+    from fhash_codec.config import EncodeConfig
+
+
+class EnginesType(click.ParamType[tuple[str, ...]]):
+    """Names of engines, separated by commas."""
+
+    name = "A,B"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """The names; refuses one that is unknown."""
+        from fhash_codec.config import ENGINES
+
+        known = tuple(dict.fromkeys(("native", *ENGINES)))
+        names = tuple(name.strip() for name in str(value).split(","))
+        for name in names:
+            if name not in known:
+                self.fail(
+                    f"'{name}' is no engine; allowed, separated by commas: {', '.join(known)}",
+                    param,
+                    ctx,
+                )
+        return names
+
+
+class BricksType(click.ParamType[tuple[int, ...]]):
+    """Numbers of bricks, separated by commas."""
+
+    name = "N,M"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """The numbers; refuses what is no positive whole number."""
+        words = [word.strip() for word in str(value).split(",")]
+        for word in words:
+            if not (word.isascii() and word.isdigit() and int(word) > 0):
+                self.fail(f"'{word}' is no number of bricks; such as 64,256", param, ctx)
+        return tuple(int(word) for word in words)
+
+
+@click.command("train", cls=BaseCommand, short_help="training and inference speed of each engine")
+@click.argument("data", type=click.Path(), required=False)
+@series_options
+@click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
+@click.option(
+    "--seconds",
+    type=RealRange(0.1, 3600),
+    default=12.0,
+    show_default=True,
+    metavar="X",
+    help="Training of each engine: seconds of processors; on a GPU, seconds that pass.",
+)
+@click.option(
+    "--bricks-per-step",
+    "bricks",
+    type=BricksType(),
+    help="Bricks of a training step, each measured, such as 64,256; without it, --batch.",
+)
+@config_options(
+    "features",
+    "dilation",
+    "key_frames",
+    "embedding_size",
+    "hidden_layers",
+    "width",
+    "learning_rate",
+    "batch",
+    "device",
+    "seed",
+    profile="paper",
+)
+@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw PSNR over seconds.")
+@force_option
+@json_option
+@quiet_option
+def train(
+    data: str | None,
+    source: SourceOptions,
+    engines: tuple[str, ...] | None,
+    seconds: float,
+    bricks: tuple[int, ...] | None,
+    config: EncodeConfig,
+    plot: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Train the model of DATA with each engine in turns; speeds in million samples a second.
+
+    With a feature, the whole DATA is measured too: bricks around a feature are partly empty.
+    Without DATA: a made series, a blast's shell as a feature, and whole. DATA generated:argon is
+    a made series of the size of the paper's Argon box.
+
+    Speeds are per second of processors (CPU), the work of all threads together. "of peak" is the
+    arithmetic of the network alone over that of the processor's multiply-adds, measured in the same
+    run and by the same clock.
+    """
+    from fhash_codec.training.devices import need_torch
+
+    need_torch("bench train")
+    if plot is not None:
+        from fhash_codec.bench.rate.plot import require_matplotlib
+
+        require_matplotlib()
+        check_writable(plot, force, sources=[] if data is None else [data])
+    with Progress(quiet=quiet) as progress, ExitStack() as stack:
+        from fhash_codec.bench.train.bench import bench_train
+        from fhash_codec.bench.train.made import is_made
+
+        if data is None or is_made(data):
+            source.refuse_without_data()
+            series: Any = data
+        else:
+            series = stack.enter_context(source.open(data, progress))
+        result = bench_train(
+            series,
+            config,
+            engines=engines or (),
+            seconds=seconds,
+            bricks=bricks or (),
+            progress=progress,
+        )
+    if plot is not None:
+        from fhash_codec.bench.train.plot import plot as draw
+        from fhash_formats.support.atomic import replacing
+
+        with replacing(Path(plot), force=force) as temporary:
+            draw(result, temporary)
+    emit(result, _text(result), as_json)
+
+
+def _text(result: dict[str, Any]) -> str:
+    """A table for each entry, its facts and points, what the machine can do, and the machine."""
+    lines = []
+    for entry in result["series"]:
+        lines += [
+            f"{', '.join(entry['features'])}: {entry['samples']:,} samples in bricks"
+            f" {entry['brick_fill']:.0%} full, {entry['batch_bricks']:.0f} bricks a step;"
+            f" model {size(entry['float16_bytes'])} as float16",
+            _engines(entry["engines"]),
+            _points(entry["points"]),
+            f"decoding {number(entry['decode_msamples_s'], digits=3)} M/s,"
+            f" {number(entry['decode_ratio'], digits=3)} times as fast as by whole blocks",
+            "",
+        ]
+    for peak in result["peaks"]:
+        rate = (
+            f"{number(peak['gb_s'], digits=3)} GB/s"
+            if peak["gflops"] is None
+            else f"{number(peak['gflops'], digits=3)} GFLOP/s {peak['precision']}"
+        )
+        lines.append(" ".join(filter(None, [peak["what"], peak["path"], rate])))
+    facts = {
+        name.replace("_", " "): number(fact) if isinstance(fact, float) else fact
+        for name, fact in result["machine"].items()
+    }
+    return "\n".join([*lines, ", ".join(f"{name} {fact}" for name, fact in facts.items())])
+
+
+def _engines(runs: list[dict[str, Any]]) -> str:
+    """A row for each engine; seconds to a quality are those of processors."""
+    goals = [goal["psnr"] for goal in runs[0]["seconds_to"]]
+    header = (
+        *("engine", "threads", "train M/s", "per CPU s", "x naive", "of peak"),
+        *("infer per CPU s", "x naive", "of peak", "PSNR dB"),
+        *(f"CPU s to {goal:g} dB" for goal in goals),
+    )
+    figures = (
+        *("train_msamples_s", "train_msamples_cpu_s", "train_ratio", "fraction_of_peak"),
+        *("infer_msamples_cpu_s", "infer_ratio", "infer_fraction_of_peak", "psnr"),
+    )
+    rows = [
+        (
+            " ".join(filter(None, [run["engine"], run["path"]])),
+            str(run["threads"]),
+            *(number(run[name], digits=3) for name in figures),
+            *(number(goal["cpu_seconds"], digits=3) for goal in run["seconds_to"]),
+        )
+        for run in runs
+    ]
+    return table([header, *rows])
+
+
+def _points(points: list[dict[str, Any]]) -> str:
+    """The rates of queries at points in one thread."""
+    rates = [
+        f"{point['order']}{' with gradient' * point['gradient']}"
+        f" {number(point['mpoints_cpu_s'], digits=3)}"
+        for point in points
+        if point["threads"] == points[0]["threads"]
+    ]
+    return f"points, M per CPU s: {', '.join(rates)}"

@@ -1,0 +1,94 @@
+"""`fhash bench train`: figures of the engines asked for, and of the machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from click.testing import Result
+
+from fhash_codec.bench.train import bench, clock, made
+from fhash_codec.bench.train.bench import NAMES
+from fhash_codec.paper.engines.native import machine_paths
+
+Fhash = Callable[..., Result]
+WORDS = ("bench", "train", "--seconds", "0.1", "--width", "4", "--hidden-layers", "1", "-q")
+
+
+@pytest.fixture(autouse=True)
+def steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clocks that advance by 10 ms whenever they are read."""
+    ticks = count()
+    read = lambda: next(ticks) / 100  # noqa: E731
+    monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=read, process_time=read))
+    monkeypatch.setattr(bench, "INFER_SECONDS", 0.03)
+
+
+def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
+    result = fhash(*WORDS, data, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    report = json.loads(result.stdout)
+    (series,) = report["series"]
+    expected = {name for name in NAMES if machine_paths() or name != "native"}
+    assert {entry["engine"] for entry in series["engines"]} == expected
+    assert {"cores", "device"} <= set(report["machine"])
+
+
+def test_it_prints_a_row_for_each_engine_and_draws_curves(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "curves.png"
+    words = (*WORDS, data, "--engines", "slab,naive", "--bricks-per-step", "1", "--plot", picture)
+    result = fhash(*words)
+    assert (result.exit_code, result.stderr) == (0, "")
+    facts, header, *rows = result.stdout.splitlines()
+    assert facts.startswith("all: ")
+    assert "1 bricks a step" in facts
+    assert header.split()[:2] == ["engine", "threads"]
+    assert "CPU s to 50 dB" in header
+    assert [row.split()[0] for row in rows[:2]] == ["slab", "naive"]
+    assert any(row.startswith("points, M per CPU s: rays ") for row in rows)
+    assert any("times as fast as by whole blocks" in row for row in rows)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    again = fhash(*words)
+    assert again.exit_code != 0
+    assert "--force" in again.stderr
+
+
+def test_a_series_is_made_where_none_is_given(
+    fhash: Fhash, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {key: replace(it, shape=(2, 8, 16, 16)) for key, it in made.MADE.items()}
+    monkeypatch.setattr(made, "MADE", small)
+    words = (*WORDS, "--engines", "slab", "--json")
+    result = fhash(*words)
+    assert (result.exit_code, result.stderr) == (0, "")
+    features = [entry["features"] for entry in json.loads(result.stdout)["series"]]
+    assert features == [["interval:0.25:2"], ["all"]]
+    argon = json.loads(fhash(*words, "generated:argon").stdout)["series"]
+    assert [entry["features"] for entry in argon] == [["all"]]
+    refused = fhash(*words, "--var", "velocity")
+    assert refused.exit_code == 2
+    assert refused.stderr == "fhash: error: --var is for DATA that are read; name them\n"
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--engines", "fast"), "'fast' is no engine"),
+        (("--bricks-per-step", "64,x"), "'x' is no number of bricks"),
+        (("--bricks-per-step", "0"), "'0' is no number of bricks"),
+    ],
+)
+def test_unsuitable_options_are_refused(
+    fhash: Fhash, option: tuple[str, str], message: str
+) -> None:
+    refused = fhash(*WORDS, *option)
+    assert refused.exit_code == 2
+    assert message in refused.stderr

@@ -1,0 +1,188 @@
+"""`fhash bench train`: figures of every engine, and unsuitable requests."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from math import prod
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec import EncodeConfig
+from fhash_codec.bench.train import bench, made
+from fhash_codec.bench.train.bench import NAMES, TURNS, bench_train
+from fhash_codec.bench.train.curves import GOALS
+from fhash_codec.paper.engines.native import machine_paths
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+CONFIG = EncodeConfig(profile="paper", width=4, hidden_layers=1)
+
+
+@pytest.fixture
+def series(field: Callable[..., np.ndarray], quick: None) -> ArraySeries:
+    return ArraySeries(field())
+
+
+def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
+    calls: list[tuple[Any, ...]] = []
+    report = bench_train(series, CONFIG, seconds=0.02, progress=lambda *words: calls.append(words))
+    (entry,) = report["series"]
+    assert entry["features"] == ["all"]
+    engines = [run["engine"] for run in entry["engines"]]
+    paths = machine_paths()
+    assert list(dict.fromkeys(engines)) == [n for n in NAMES if paths or n != "native"]
+    assert {run["path"] for run in entry["engines"] if run["engine"] == "native"} == set(paths)
+    measured = [words for words in calls if words[0] == "measuring"]
+    assert len(measured) == TURNS * len(engines)
+    assert [words[3] for words in measured[: len(engines)]] * TURNS == [w[3] for w in measured]
+    assert all(later[1] == before[1] + 1 for before, later in pairwise(measured))
+    naive = next(run for run in entry["engines"] if run["engine"] == "naive")
+    assert (naive["train_ratio"], naive["infer_ratio"]) == (1.0, 1.0)
+    for run in entry["engines"]:
+        assert min(run["train_msamples_s"], run["train_msamples_cpu_s"]) > 0
+        assert min(run["infer_msamples_s"], run["infer_msamples_cpu_s"]) > 0
+        assert min(run["fraction_of_peak"], run["fraction_of_bandwidth"]) > 0
+        assert run["epochs"] > 0
+        assert np.isfinite(run["psnr"])
+        assert len(run["curve"]) == TURNS
+        assert run["curve"][-1]["psnr"] == run["psnr"]
+        assert [goal["psnr"] for goal in run["seconds_to"]] == list(GOALS)
+    assert 0 < entry["batch_samples"] <= entry["samples"] == series.values.size
+    assert entry["float16_bytes"] == 2 * entry["parameters"]
+    assert entry["sample_bytes"] == 4 * entry["samples"]
+    assert min(entry["decode_msamples_s"], entry["decode_ratio"]) > 0
+    assert {peak["what"] for peak in report["peaks"]} >= {"copy"}
+
+
+def test_shares_are_of_the_peak_of_the_same_instructions(series: ArraySeries) -> None:
+    report = bench_train(series, CONFIG, seconds=0.01)
+    (entry,) = report["series"]
+    rates = {peak["path"]: peak["gflops"] for peak in report["peaks"] if peak["gflops"]}
+    copies = report["peaks"][-1]["gb_s"]
+    levels = entry["engines"][0]["fraction_of_peak"] * 1e9 * next(iter(rates.values()))
+    flops = levels / (entry["engines"][0]["train_msamples_cpu_s"] * 1e6)
+    for run in entry["engines"]:
+        peak = rates.get(run["path"], next(iter(rates.values())))
+        rate = run["train_msamples_cpu_s"] * 1e6
+        assert run["fraction_of_peak"] == pytest.approx(rate * flops / (peak * 1e9))
+        assert run["fraction_of_bandwidth"] == pytest.approx(rate * 52 / (copies * 1e9))
+    assert flops / 6 == int(flops / 6)  # 3 passes of multiply-adds
+
+
+def test_a_series_with_a_feature_is_measured_whole_too(series: ArraySeries) -> None:
+    feature = f"interval:{np.median(series.values)}:{series.values.max()}"
+    config = replace(CONFIG, features=(feature,), dilation=0)
+    report = bench_train(series, config, engines=("naive",), seconds=0.01)
+    sparse, whole = report["series"]
+    assert (sparse["features"], whole["features"]) == ([feature], ["all"])
+    assert sparse["samples"] < whole["samples"] == series.values.size
+    assert sparse["brick_fill"] < whole["brick_fill"]
+
+
+def test_bricks_of_a_step_are_measured_each(series: ArraySeries) -> None:
+    report = bench_train(series, CONFIG, engines=("slab",), seconds=0.01, bricks=(1, 3))
+    one, three = report["series"]
+    assert one["batch_bricks"] == 1
+    assert 2 < three["batch_bricks"] < 4
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("name", [None, "generated:front", "generated:argon"])
+def test_generated_series_are_measured(name: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = (2, 8, 16, 16)
+    monkeypatch.setattr(
+        made, "MADE", {key: replace(it, shape=shape) for key, it in made.MADE.items()}
+    )
+    entries = bench_train(name, CONFIG, engines=("slab",), seconds=0.01)["series"]
+    features = [["all"]] if name == "generated:argon" else [["interval:0.25:2"], ["all"]]
+    assert [entry["features"] for entry in entries] == features
+    assert entries[-1]["samples"] == prod(shape)
+
+
+def test_there_is_no_ratio_without_the_naive_engine(series: ArraySeries) -> None:
+    (entry,) = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)["series"]
+    for run in entry["engines"]:
+        assert (run["train_ratio"], run["infer_ratio"]) == (None, None)
+
+
+def test_several_threads_are_beside_one(
+    series: ArraySeries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "threads_for", lambda _: nullcontext_of(2))
+    (entry,) = bench_train(series, CONFIG, engines=("slab", "naive"), seconds=0.01)["series"]
+    slab, slab_2, naive, naive_2 = entry["engines"]
+    assert [run["threads"] for run in entry["engines"]] == [1, 2, 1, 2]
+    assert (slab["thread_ratio"], naive["thread_ratio"]) == (None, None)
+    expected = slab_2["train_msamples_s"] / slab["train_msamples_s"]
+    assert slab_2["thread_ratio"] == expected
+    expected = slab_2["train_msamples_cpu_s"] / naive_2["train_msamples_cpu_s"]
+    assert slab_2["train_ratio"] == expected
+    assert {point["threads"] for point in entry["points"]} == {1, 2}
+
+
+def nullcontext_of(number: int) -> Any:
+    from contextlib import nullcontext
+
+    return nullcontext(number)
+
+
+def test_the_native_engine_is_left_out_where_it_does_not_take_the_model(
+    series: ArraySeries,
+) -> None:
+    config = replace(CONFIG, hidden_layers=3)
+    with pytest.raises(InputError, match="native"):
+        bench_train(series, config, engines=("native",), seconds=0.01)
+    (entry,) = bench_train(series, config, seconds=0.01)["series"]
+    assert {run["engine"] for run in entry["engines"]} == {"slab", "naive"}
+
+
+@pytest.mark.parametrize(
+    "request_", [{"seconds": 0.0}, {"engines": ("fast",)}, {"bricks": (64, 0)}], ids=str
+)
+def test_unsuitable_requests_are_refused(series: ArraySeries, request_: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        bench_train(series, CONFIG, **request_)
+
+
+def test_a_machine_that_stalls_at_the_first_steps_is_measured_all_the_same(
+    series: ArraySeries,
+    ticking: Callable[[Iterator[float]], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The clock leaps while an engine warms up; later it crawls, and the schedule runs out."""
+
+    def times() -> Iterator[float]:
+        for tick in range(80):
+            yield 1000.0 * tick
+        tick = 0
+        while True:
+            tick += 1
+            yield 1e6 + tick / 1e6
+
+    ticking(times())
+    monkeypatch.setattr(bench, "INFER_SECONDS", 1e-5)
+    report = bench_train(series, CONFIG, engines=("naive",), seconds=0.01)
+    run = report["series"][0]["engines"][0]
+    assert run["train_msamples_s"] > 0
+    assert run["train_ratio"] == 1.0
+
+
+def test_it_runs_without_zarr() -> None:
+    """Machines with a GPU may lack it."""
+    code = (
+        "import sys; sys.modules['zarr'] = None\n"
+        "from fhash_codec import EncodeConfig\n"
+        "from fhash_codec.bench.train import made\n"
+        "from fhash_codec.bench.train.bench import bench_train\n"
+        "made.MADE = {'front': made.Made('front', (2, 8, 16, 16), '', False)}\n"
+        "config = EncodeConfig(profile='paper', width=4, hidden_layers=1)\n"
+        "print(len(bench_train(None, config, engines=('slab',), seconds=0.02)['series']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1"]
