@@ -15,8 +15,8 @@ from typing import Any, cast
 from fhash_formats.errors import InputError
 from fhash_formats.support.suggestions import suggestion
 
-TABLE_TYPES = ("float32", "float16", "uint8", "transform")
-"""Storage of the paper profile's tables: a number type, or the transform codec."""
+TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
+"""Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
 
 ENGINES = ("native", "slab", "naive")
 """Training engines of the paper profile, the fastest first."""
@@ -228,9 +228,10 @@ class EncodeConfig:
     )
     tables: str = option(
         "float16",
-        "paper: number type of the stored tables; "
-        "'transform' codes them as compact does, for at most 0.1 dB or down to --psnr",
-        choices=TABLE_TYPES,
+        "paper: number type of the stored tables, which have only the vertices that the coreset "
+        "needs where it is below half of its box; 'sparse' (always so) and 'dense' (never) are "
+        "float16; 'transform' codes them as compact does, for at most 0.1 dB or down to --psnr",
+        choices=TABLES,
         profile="paper",
     )
     engine: str = option(

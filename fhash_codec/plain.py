@@ -29,6 +29,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.atomic import check_output
@@ -97,9 +98,15 @@ class _Export:
 
     def paper(self) -> dict[str, Any]:
         """Write a file of the profile paper: arrays decoded, tables and occupancy whole."""
-        coded = [t for t in self._volume.tables if f"tables/level_{t.level}" not in self._arrays]
-        rewritten = (*(f"tables/level_{table.level}/" for table in coded), MASK_ARRAY)
-        copied = [a for name, a in self._arrays.items() if not name.startswith(rewritten)]
+        model = self._header["model"]
+        # Coded tables become numbers, and tables of needed vertices get all others as well.
+        coded = [
+            table
+            for table in self._volume.tables
+            if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
+        ]
+        rewritten = (*(f"tables/level_{table.level}/" for table in coded), f"{MASK_ARRAY}/")
+        copied = [a for name, a in self._arrays.items() if not f"{name}/".startswith(rewritten)]
         keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
         self._total = sum(prod(array.grid) for array in copied) + keys
         self._total += sum(map(_chunk_count, coded))
@@ -110,10 +117,14 @@ class _Export:
         if keys:
             self._write_occupancy(keys)
             self._write_features_apart(keys)
-        tables = "float32" if coded else self._header["model"]["tables"]
+        tables, mlp = self._volume.tables, self._volume.mlp
+        changed = {
+            "tables": coded[0].dtype.name if coded else model["tables"],
+            "parameters": sum(prod(table.shape) for table in tables) + mlp.parameters,
+        }
         return {
             **self._header,
-            "model": {**self._header["model"], "tables": tables},
+            "model": {key: model[key] for key in model if key != SPARSE} | changed,
             "required_features": [],
         }
 

@@ -71,7 +71,8 @@ def _tables(
     folded = listed([extent(level["shape"][:4]) for level in levels[:3]])
     more = ", ..." if len(levels) > 3 else ""
     first = f"{len(levels)} level{'s' if len(levels) > 1 else ''} of {folded}{more}"
-    numbers = f"{levels[0]['shape'][4]} at each vertex, {levels[0]['dtype']}"
+    vertex = "needed vertex" if "sparse" in model else "vertex"
+    numbers = f"{levels[0]['shape'][4]} at each {vertex}, {levels[0]['dtype']}"
     paths = stored[0]["path"] + (f" to {stored[-1]['path']}" if len(stored) > 1 else "")
     parameters = f"{model['parameters']:,} parameters in the model"
     where = f"{paths}, {stored[0]['coding']}, {size(total)}"

@@ -78,6 +78,10 @@ class Architecture:
     @property
     def parameters(self) -> int:
         """Number of all trained numbers, in the tables and the MLP."""
-        return parameter_count(self.levels, self.embedding_size) + sum(
+        return self.parameters_of(parameter_count(self.levels, 1))
+
+    def parameters_of(self, vertices: int) -> int:
+        """Return the number of trained numbers of the MLP and of tables of so many vertices."""
+        return vertices * self.embedding_size + sum(
             outputs * (inputs + 1) for outputs, inputs in self.layer_shapes
         )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.paper.levels import parameter_count
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
 from fhash_codec.paper.training.fit import TrainedModel, train_model
@@ -16,8 +19,14 @@ from fhash_codec.paper.training.rounds import Goal
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats.container import ContainerWriter
+from fhash_formats.container.sparse import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
 from fhash_formats.series import Series
 
+SPARSE_BELOW = 0.5
+"""Share of samples in their box below which tables have needed vertices alone.
+
+The file is smaller and takes less memory below it; above, a dense table is read faster.
+"""
 RESERVE = 0.5
 """dB above a promised PSNR that a model should have before its tables are coded.
 
@@ -53,21 +62,47 @@ def encode_paper(
     trained = train_model(coreset, architecture, config, path, progress, goal)
     with stage("writing", "coordinates, masks, tables, network and header"):
         write_series(writer, series, selection.scanned, coreset.key_frames)
-    loss = None
+    loss, vertices = None, parameter_count(architecture.levels, 1)
     if config.tables == "transform":
         with stage("tables", "--tables transform: coded at a loss that the promise allows"):
             loss = _write_coded_tables(writer, series, selection, trained, config, progress)
     else:
         with stage("writing", "tables"):
-            write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
+            vertices = write_tables(
+                writer,
+                architecture,
+                coreset,
+                trained.fine,
+                trained.tables,
+                number_type(config),
+                sparse=sparse_tables(coreset, config),
+            )
             write_model(writer, coreset, trained.layers)
-    header = _header(series, selection, trained, config)
+    header = _header(series, selection, trained, config, vertices)
+    if sparse_tables(coreset, config):
+        header["required_features"] = [SPARSE_FEATURE]
     if loss is not None:
         from fhash_codec.paper.tables.small_parts import MASK_FEATURES
 
         header["required_features"] = ["transform", *MASK_FEATURES]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint, _advice(selection, series, trained, config)
+
+
+def number_type(config: EncodeConfig) -> str:
+    """Return the type of the numbers of tables, as the header's `model.tables`."""
+    return "float16" if config.tables in ("sparse", "dense") else config.tables
+
+
+def sparse_tables(coreset: Coreset, config: EncodeConfig) -> bool:
+    """Return whether the file gets the embeddings of needed vertices alone.
+
+    By default it does where the samples are fewer than SPARSE_BELOW of the vertices of their box.
+    """
+    if config.tables in ("sparse", "dense", "transform"):
+        return config.tables == "sparse"
+    vertices = len(coreset.key_frames) * prod(coreset.box.shape)
+    return len(coreset.values) < SPARSE_BELOW * vertices
 
 
 def _advice(
@@ -128,9 +163,16 @@ def _write_coded_tables(
 
 
 def _header(
-    series: Series, selection: Selection, trained: TrainedModel, config: EncodeConfig
+    series: Series,
+    selection: Selection,
+    trained: TrainedModel,
+    config: EncodeConfig,
+    vertices: int,
 ) -> dict[str, Any]:
-    """Return the container's header (FORMAT.md, Header), without its quality."""
+    """Return the container's header (FORMAT.md, Header), without its quality.
+
+    `vertices` is the number of vertices of all tables in the file.
+    """
     architecture, coreset = selection.architecture, selection.coreset
     seconds = trained.history[-1]["seconds"] if trained.history else 0.0
     restarts = (
@@ -150,9 +192,10 @@ def _header(
             "embedding_size": architecture.embedding_size,
             "hidden_layers": architecture.hidden_layers,
             "width": architecture.width,
-            "tables": config.tables,
+            "tables": number_type(config),
             "levels": [list(level) for level in architecture.levels],
-            "parameters": architecture.parameters,
+            "parameters": architecture.parameters_of(vertices),
+            **_sparse_entry(coreset, config),
         },
         "config": config.to_dict(),
         "training": {
@@ -165,3 +208,10 @@ def _header(
         },
         "history": brief_history(trained.history, timings=config.timings),
     }
+
+
+def _sparse_entry(coreset: Coreset, config: EncodeConfig) -> dict[str, Any]:
+    """Return the header's entry that says whose needed vertices the tables have, if not all."""
+    if not sparse_tables(coreset, config):
+        return {}
+    return {SPARSE: CORESET if coreset.fringe is None else FRINGE}

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.network import Floats
-from fhash_codec.paper.point_tables import Patch, PointTables
+from fhash_codec.paper.point_tables import Patch, PointTables, SparsePatch
 
 __all__ = ["NativePoints", "best_path"]
 
@@ -83,7 +83,7 @@ class NativePoints:
                 values.ctypes.data,
             )
             _check(status)
-            patches.append(Patch(values, (0, *patch.first[1:])))
+            patches.append(patch.at_one_time(values))
         return NativePoints(self._library, self._tables.with_one_time(patches), self._path)
 
     def evaluate(
@@ -97,6 +97,7 @@ class NativePoints:
             slopes: float32 (n, 4), to be written; None for none.
         """
         assert values.flags.c_contiguous
+        assert self._tables.readable, "some vertices are held at several times"
         assert slopes is None or slopes.flags.c_contiguous
         places = np.array(
             [
@@ -121,17 +122,26 @@ class NativePoints:
 def _float32(patch: Patch) -> Patch:
     """Return a part in float32 with two vertices along x at least: corners are read in pairs."""
     values = np.ascontiguousarray(patch.values, np.float32)
+    if isinstance(patch, SparsePatch):
+        return replace(patch, values=values)
     return replace(patch, values=values if values.shape[3] > 1 else np.repeat(values, 2, axis=3))
 
 
 def _facts(patch: Patch, resolution: Sequence[int]) -> list[int]:
     """Return what the native functions need to know of a part."""
-    strides = [stride // 4 for stride in patch.values.strides[:4]]
+    still = len(patch.values) == 1
+    held = [0, 0, 0, 0]
+    if isinstance(patch, SparsePatch) and still:
+        bits, strides = patch.bits, patch.strides
+        arrays = (bits.words, bits.blocks, bits.within)
+        held = [*(array.ctypes.data for array in arrays), bits.count]
+    else:
+        strides = tuple(stride // 4 for stride in patch.values.strides[:4])
     facts = [patch.values.ctypes.data, patch.values.size]
     for vertices, first, stride in zip(resolution, patch.first, strides, strict=True):
         # An axis of one vertex has no corner after it: both corners are the same.
         facts += [vertices, first, stride if vertices > 1 else 0]
-    return facts
+    return [*facts, *held]
 
 
 def _check(status: int) -> None:

@@ -30,12 +30,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.levels import Resolution
+from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.errors import DamagedFileError, InputError
 
 Floats = npt.NDArray[np.float32]
@@ -73,6 +74,15 @@ class TableSource(Protocol):
 
         The region is 5 slices of step 1 with explicit ends.
         """
+        ...
+
+
+@runtime_checkable
+class SparseSource(TableSource, Protocol):
+    """A level's table that holds some vertices only; the embeddings of all others are 0."""
+
+    def frame(self, node: int) -> SparseFrame:
+        """Return the embeddings of a time node."""
         ...
 
 
@@ -147,13 +157,20 @@ class Network:
             DamagedFileError: numbers in the table are not finite.
         """
         values = self.tables[level].read((*region, slice(0, self.embedding_size)))
-        if not np.isfinite(values).all():
-            # Messages count levels from 1, as the arrays of the file do.
-            raise DamagedFileError(
-                f"the table of level {level + 1} holds numbers that are not finite; "
-                "the training diverged or the file is damaged"
-            )
+        _check_finite(values, level)
         return values
+
+    def sparse_frame(self, level: int, node: int) -> SparseFrame | None:
+        """Return the embeddings at a time node of a level that holds some vertices only.
+
+        None for a level that holds all vertices. Arguments and errors are those of `read`.
+        """
+        table = self.tables[level]
+        if not isinstance(table, SparseSource):
+            return None
+        frame = table.frame(node)
+        _check_finite(frame.values, level)
+        return frame
 
     def _check_tables(self) -> None:
         if not self.levels or len(self.tables) != len(self.levels):
@@ -188,6 +205,16 @@ class Network:
             width = weight.shape[0]
         if not self.layers or width != 1:
             raise InputError(f"network: the last of {len(self.layers)} layers must have one output")
+
+
+def _check_finite(values: npt.NDArray[Any], level: int) -> None:
+    """Refuse numbers in the table of a level, counted from 0, that are not finite."""
+    if not np.isfinite(values).all():
+        # Messages count levels from 1, as the arrays of the file do.
+        raise DamagedFileError(
+            f"the table of level {level + 1} holds numbers that are not finite; "
+            "the training diverged or the file is damaged"
+        )
 
 
 class DenseLayers:

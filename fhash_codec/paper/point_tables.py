@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.levels import Resolution
-from fhash_codec.paper.network import Floats, Network
+from fhash_codec.paper.network import Floats, Network, SparseSource
+from fhash_codec.paper.tables.ranked import RankedBits, SparseFrame, row_bits
 
-__all__ = ["Patch", "PointTables", "locate"]
+__all__ = ["Patch", "PointTables", "SparsePatch", "locate"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,57 @@ class Patch:
 
     values: npt.NDArray[Any]
     first: tuple[int, ...]
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Numbers of `embeddings` from one vertex to the next along t, z, y and x."""
+        _, z, y, x, _ = self.values.shape
+        return z * y * x, y * x, x, 1
+
+    def embeddings(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+        """Return the embeddings (..., E) of vertices (...) by their numbers in C order."""
+        return self.values.reshape(-1, self.values.shape[4]).take(numbers, axis=0, mode="clip")
+
+    def at_one_time(self, values: npt.NDArray[Any]) -> Patch:
+        """Return the same part with other values (1, z, y, x, E), those of one time."""
+        return replace(self, values=values, first=(0, *self.first[1:]))
+
+
+@dataclass(frozen=True)
+class SparsePatch(Patch):
+    """A whole level in memory that holds some vertices only.
+
+    Attributes:
+        values: embeddings (t, 1, 1, held + 1, E) of the held vertices. The last of each time is 0.
+        bits: which vertices are held at any of these times. Numbers are those of its bits.
+        vertices: vertices (z, y, x) of the level.
+    """
+
+    bits: RankedBits
+    vertices: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, frames: Sequence[SparseFrame], node: int) -> SparsePatch:
+        """Return the part of one or two neighbouring time nodes, of which `node` is the first."""
+        bits = RankedBits.of_words(np.bitwise_or.reduce([frame.bits.words for frame in frames]))
+        held = bits.positions()
+        size = frames[0].values.shape[1]
+        values = np.zeros((len(frames), 1, 1, len(held) + 1, size), frames[0].values.dtype)
+        for number, frame in enumerate(frames):
+            values[number, 0, 0, :-1] = frame.values[frame.bits.lookup(held)]
+        return cls(values, (node, 0, 0, 0), bits, frames[0].shape)
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Bits from one vertex to the next; the tables must be those of one time."""
+        row = row_bits(self.vertices[2])
+        return 0, self.vertices[1] * row, row, 1
+
+    def embeddings(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+        """Return the embeddings (..., E) of vertices (...) by the numbers of their bits."""
+        assert len(self.values) == 1, "the places of vertices are those at one time"
+        taken: npt.NDArray[Any] = self.values[0, 0, 0].take(self.bits.lookup(numbers), axis=0)
+        return taken
 
 
 @dataclass(frozen=True)
@@ -66,9 +118,22 @@ class PointTables:
 
     @classmethod
     def of_box(cls, network: Network, key_index: float) -> PointTables:
-        """Read the time nodes of the whole box around one time."""
+        """Read the time nodes of the whole box around one time, for `at` this time.
+
+        Levels that hold some vertices only stay so.
+        """
         high = [size - 1 for size in network.box_size]
-        return cls.read(network, (key_index, 0, 0, 0), (key_index, *high))
+        if not all(isinstance(table, SparseSource) for table in network.tables):
+            return cls.read(network, (key_index, 0, 0, 0), (key_index, *high))
+        sizes = (network.key_frames, *network.box_size)
+        patches = []
+        for level, resolution in enumerate(network.levels):
+            point = np.array([[key_index], [0], [0], [0]], np.float64)
+            node = int(locate(sizes, resolution, point)[0][0, 0])
+            nodes = range(node, min(node + 2, resolution[0]))
+            frames = [network.sparse_frame(level, number) for number in nodes]
+            patches.append(SparsePatch.of([frame for frame in frames if frame is not None], node))
+        return cls(network, sizes, network.levels, tuple(patches))
 
     @property
     def vertices(self) -> int:
@@ -80,13 +145,20 @@ class PointTables:
         """Whether the tables are those of one time."""
         return self.sizes[0] == 1
 
+    @property
+    def readable(self) -> bool:
+        """Whether points can be interpolated before `at`: sparse parts know places at one time."""
+        return all(
+            len(patch.values) == 1 for patch in self.patches if isinstance(patch, SparsePatch)
+        )
+
     def at(self, key_index: float) -> PointTables:
         """Return the tables at one time, interpolated once. Time 0 is then the only one."""
         if self.still:
             return self
         patches = [
-            Patch(self._at(level, key_index), (0, *self.patches[level].first[1:]))
-            for level in range(len(self.levels))
+            patch.at_one_time(self._at(level, key_index))
+            for level, patch in enumerate(self.patches)
         ]
         return self.with_one_time(patches)
 

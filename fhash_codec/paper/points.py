@@ -332,8 +332,7 @@ def _groups(
 
 def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[int]) -> Floats:
     """Return the 16 corners around each point, float32 (t 2, z 2, y 2, x 2, E, n)."""
-    shape = patch.values.shape
-    strides = (math.prod(shape[1:4]), math.prod(shape[2:4]), shape[3], 1)
+    strides = patch.strides
     index: npt.NDArray[np.int64] = np.zeros(before.shape[1], np.int64)
     for corner, first, stride in zip(before, patch.first, strides, strict=True):
         index += (corner - first) * stride
@@ -344,9 +343,7 @@ def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[i
     offsets = np.array(
         [t + z + y + x for t in t_offsets for z in z_offsets for y in y_offsets for x in x_offsets]
     )
-    embeddings = patch.values.reshape(-1, shape[4]).take(
-        offsets[:, None] + index, axis=0, mode="clip"
-    )
+    embeddings = patch.embeddings(offsets[:, None] + index)
     return np.ascontiguousarray(np.moveaxis(embeddings, -1, 1), dtype=np.float32).reshape(
-        2, 2, 2, 2, shape[4], -1
+        2, 2, 2, 2, patch.values.shape[4], -1
     )

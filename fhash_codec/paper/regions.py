@@ -14,13 +14,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Spans
 from fhash_codec.paper.network import DenseLayers, Floats, Network
+from fhash_codec.paper.tables.ranked import SparseFrame, between
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -35,6 +36,12 @@ With 5 columns, the sparse blocks of a shock's feature take 0.19 of their produc
 """
 READ_NUMBERS = 2**24
 """Numbers of a table that are read at once for one time node."""
+
+SMALL_NUMBERS = 2**18
+"""Numbers up to which the part of a level that holds some vertices only gets all vertices.
+
+Blocks then take them without looking for their places.
+"""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 BlockIndex = tuple[int, int, int]
@@ -59,9 +66,17 @@ LevelWeights = tuple[dict[int, AxisWeights], ...]
 """Weights of one level for each axis (z, y, x), by the block's place along that axis."""
 
 
+class LevelWindow(Protocol):
+    """The part of one level that a region needs, at one time."""
+
+    def read(self, box: tuple[slice, ...]) -> Floats:
+        """Return the embeddings float32 (E, z, y, x) of a box in vertices of the level."""
+        ...
+
+
 @dataclass(frozen=True)
-class LevelWindow:
-    """The part of one level that a region needs, at one time.
+class DenseWindow:
+    """A `LevelWindow` in memory.
 
     Attributes:
         values: embeddings interpolated in time, float32 (E, z, y, x).
@@ -70,6 +85,29 @@ class LevelWindow:
 
     values: Floats
     first: tuple[int, int, int]
+
+    def read(self, box: tuple[slice, ...]) -> Floats:
+        """Return a box as a view."""
+        inside = (
+            slice(axis.start - first, axis.stop - first)
+            for axis, first in zip(box, self.first, strict=True)
+        )
+        return self.values[(slice(None), *inside)]
+
+
+@dataclass(frozen=True)
+class SparseWindow:
+    """A `LevelWindow` of a level that holds some vertices only; it is the whole level.
+
+    Attributes:
+        frame: the embeddings interpolated in time.
+    """
+
+    frame: SparseFrame
+
+    def read(self, box: tuple[slice, ...]) -> Floats:
+        """Return a box as a copy."""
+        return np.moveaxis(self.frame.read(box).astype(np.float32, copy=False), -1, 0)
 
 
 def decode_region(
@@ -82,7 +120,8 @@ def decode_region(
 ) -> Floats:
     """Return the normalised values float32 (z, y, x) at the vertices of a region.
 
-    The memory for one frame of the region, rounded to blocks, is needed per level.
+    The memory for one frame of the region, rounded to blocks, is needed per level; for a level that
+    holds some vertices only, that of these vertices.
 
     Args:
         network: the trained network.
@@ -260,27 +299,32 @@ def _level_window(
 ) -> LevelWindow:
     """Read the part of a level that all blocks need, and interpolate it in time.
 
-    The part is read at the one or two time nodes around the key index, in a few large reads.
+    The part is read at the one or two time nodes around the key index, in a few large reads. A
+    large part of a level that holds some vertices only does not become an array of all vertices.
     """
-    nodes = network.levels[level][0]
-    position = key_index * (nodes - 1) / max(network.key_frames - 1, 1)
-    node = min(int(position), nodes - 1)
+    last = network.levels[level][0] - 1
+    position = key_index * last / max(network.key_frames - 1, 1)
+    node = min(int(position), last)
     after_weight = np.float32(position - node)
     time = slice(node, node + 1 if after_weight == 0 else node + 2)
     (z0, z1), (y0, y1), (x0, x1) = (
         (min(w.first for w in axis.values()), max(w.stop for w in axis.values()))
         for axis in weights
     )
+    numbers = network.embedding_size * (z1 - z0) * (y1 - y0) * (x1 - x0)
+    if numbers > SMALL_NUMBERS and (frame := network.sparse_frame(level, node)) is not None:
+        after = None if after_weight == 0 else network.sparse_frame(level, node + 1)
+        return SparseWindow(frame if after is None else between(frame, after, after_weight))
     values = np.empty((network.embedding_size, z1 - z0, y1 - y0, x1 - x0), np.float32)
     planes = max(1, READ_NUMBERS // values[:, 0].size)
     for start in range(z0, z1, planes):
         stop = min(start + planes, z1)
-        frames = network.read(level, (time, slice(start, stop), slice(y0, y1), slice(x0, x1)))
-        frame = frames[0].astype(np.float32, copy=False)
+        nodes = network.read(level, (time, slice(start, stop), slice(y0, y1), slice(x0, x1)))
+        dense = nodes[0].astype(np.float32, copy=False)
         if after_weight != 0:
-            frame = frame * (1 - after_weight) + frames[1] * after_weight
-        values[:, start - z0 : stop - z0] = np.moveaxis(frame, -1, 0)
-    return LevelWindow(values, (z0, y0, x0))
+            dense = dense * (1 - after_weight) + nodes[1] * after_weight
+        values[:, start - z0 : stop - z0] = np.moveaxis(dense, -1, 0)
+    return DenseWindow(values, (z0, y0, x0))
 
 
 def _encode(
@@ -298,11 +342,7 @@ def _encode(
     size, (bz, by, bx) = network.embedding_size, shape
     for level, (window, level_weights) in enumerate(zip(windows, weights, strict=True)):
         z, y, x = (level_weights[axis][block[axis]] for axis in range(3))
-        slices = (
-            slice(axis.first - first, axis.stop - first)
-            for axis, first in zip((z, y, x), window.first, strict=True)
-        )
-        values = window.values[(slice(None), *slices)]
+        values = window.read(tuple(slice(axis.first, axis.stop) for axis in (z, y, x)))
         rows = _in_planes(
             layers.inputs[level * size : (level + 1) * size, : bz * _plane_samples(shape)], shape
         )

@@ -1,15 +1,15 @@
 """A trained model and its coreset as arrays of a container, written and read. numpy only.
 
-Tables are stored as arrays of numbers. With `--tables transform` they are coded instead: each level
-then has one array per component, and an embedding is a mixture of the components
-(`mix_components`).
+Tables are stored as arrays of numbers, of all vertices or of those alone that the coreset needs
+(`tables/sparse_table.py`). With `--tables transform` they are coded instead: each level then has
+one array per component, and an embedding is a mixture of the components (`mix_components`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from math import isfinite, prod
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -22,12 +22,18 @@ from fhash_codec.model_parts import TABLE_AXES
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.fringe import fringe_step, round_fringe
 from fhash_codec.paper.network import Floats, Network, TableSource
+from fhash_codec.paper.number_type import NumberType
+from fhash_codec.paper.tables.needed import Needed, needed_by
+from fhash_codec.paper.tables.sparse_table import SparseTable, write_sparse
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.apart import MASK_ARRAY
+from fhash_formats.container.sparse import COUNTS, FRINGE
 from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20
 """Bytes of the largest chunk of a table. Each chunk has a fixed cost; reads decode whole chunks."""
+GRIDS = 16
+"""Key frames whose packed occupancy stays in memory while needed vertices are looked up."""
 BITS = "occupancy/bits"
 """Array of the occupancy as bits."""
 MASK_BITS = 8
@@ -113,8 +119,12 @@ def write_tables(
     fine: Floats,
     tables: list[Floats],
     kind: str,
-) -> None:
+    *,
+    sparse: bool = False,
+) -> int:
     """Write the tables of all levels as plain numbers, those of the fringe in few bits.
+
+    Return the number of vertices that the tables have in the file.
 
     Args:
         writer: the container that is being written.
@@ -122,22 +132,43 @@ def write_tables(
         coreset: the coreset, whose bricks the finest embeddings belong to.
         fine: embeddings of the finest level (bricks, E, vertices of a brick).
         tables: embeddings of the coarser levels, each (buckets, E).
-        kind: name of the number type in the file, as `EncodeConfig.tables`.
+        kind: name of the number type in the file.
+        sparse: whether the file gets the embeddings of needed vertices alone.
 
     Raises:
         InputError: the numbers do not fit in `kind`.
     """
     size = architecture.embedding_size
-    keys = architecture.key_frames
-    step = fringe_step(coreset, keys, lambda key: finest_frame(coreset, fine, key))
-    finest_frames = (
-        round_fringe(coreset, key, finest_frame(coreset, fine, key), step) for key in range(keys)
+    step = fringe_step(
+        coreset, architecture.key_frames, lambda key: finest_frame(coreset, fine, key)
     )
-    _write_table(writer, 1, (*architecture.levels[0], size), fine, finest_frames, kind)
-    for number, (level, table) in enumerate(
-        zip(architecture.levels[1:], tables, strict=True), start=2
+
+    def finest(key: int) -> Floats:
+        return round_fringe(coreset, key, finest_frame(coreset, fine, key), step)
+
+    nodes: list[Callable[[int], Floats]] = [
+        finest,
+        *(
+            table.reshape(*level, size).__getitem__
+            for level, table in zip(architecture.levels[1:], tables, strict=True)
+        ),
+    ]
+    needed = needed_by(architecture, coreset)
+    vertices = 0
+    for number, (level, embeddings, read) in enumerate(
+        zip(architecture.levels, (fine, *tables), nodes, strict=True)
     ):
-        _write_table(writer, number, (*level, size), table, table.reshape(*level, size), kind)
+        number_type = NumberType.of(embeddings, kind)
+        name, stored = table_name(number + 1), partial(_stored, number_type, read)
+        if sparse:
+            counts, mask = needed.counts(number), partial(needed.mask, number)
+            held = (stored(node)[mask(node)] for node in range(level[0]))
+            write_sparse(writer, name, size, number_type, counts, held)
+            vertices += sum(counts)
+        else:
+            _write_dense(writer, name, (*level, size), number_type, stored)
+            vertices += prod(level)
+    return vertices
 
 
 def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
@@ -163,6 +194,7 @@ def load_network(container: Container) -> Network:
     model = header["model"]
     size = model["embedding_size"]
     levels = tuple(tuple(level) for level in model["levels"])
+    needed = _needed(container)
     layers = tuple(
         (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read())
         for n in range(1, model["hidden_layers"] + 2)
@@ -171,7 +203,7 @@ def load_network(container: Container) -> Network:
         return Network(
             levels=levels,
             embedding_size=size,
-            tables=[_table(container, number, size) for number in range(1, len(levels) + 1)],
+            tables=[_table(container, needed, number) for number in range(1, len(levels) + 1)],
             layers=layers,
             box_size=Box.of(header["feature_bounding_box"]).shape,
             key_frames=levels[0][0],
@@ -180,9 +212,14 @@ def load_network(container: Container) -> Network:
         raise DamagedFileError(f"{container.path}: {error}") from error
 
 
+def table_name(level: int) -> str:
+    """Return the name of the array of a level, counted from 1, that is stored as numbers."""
+    return f"tables/level_{level}"
+
+
 def component_name(level: int, component: int) -> str:
     """Return the name of the array of one component of a coded level; both count from 1."""
-    return f"tables/level_{level}/component_{component}"
+    return f"{table_name(level)}/component_{component}"
 
 
 def mix_components(components: Sequence[Floats], mixing: Floats) -> Floats:
@@ -253,107 +290,81 @@ def table_chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     return tuple(chunk)
 
 
-@dataclass(frozen=True, kw_only=True)
-class NumberType:
-    """The numbers of a file that embeddings are stored as.
-
-    Attributes:
-        dtype: type of the numbers, floating or unsigned.
-        scale, offset: an embedding stored as an unsigned number is offset + scale * number.
-    """
-
-    dtype: np.dtype[Any]
-    scale: float = 1.0
-    offset: float = 0.0
-
-    @classmethod
-    def of(cls, values: Floats, kind: str) -> NumberType:
-        """Return the number type named `kind` with the scale and offset that fit some embeddings.
-
-        Raises InputError where the embeddings are not finite or do not fit in the type.
-        """
-        dtype = np.dtype(kind)
-        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-        if not (isfinite(low) and isfinite(high)):
-            raise InputError(
-                "embeddings are not finite: the training diverged; set a lower --learning-rate"
-            )
-        if dtype.kind == "u":
-            # The range includes 0, so that the 0 of untrained vertices costs little.
-            low, high = min(low, 0.0), max(high, 0.0)
-        reached = high - low if dtype.kind == "u" else max(-low, high)
-        if reached > float(np.finfo(np.float32 if dtype.kind == "u" else dtype).max):
-            raise InputError(
-                f"embeddings reach {reached:g}, more than {kind} holds; use --tables float32"
-            )
-        if dtype.kind == "f":
-            return cls(dtype=dtype)
-        # float32 holds numbers below its `tiny` with fewer digits. A scale that small would not
-        # give back the embeddings.
-        scale = (
-            max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny))
-            if high > low
-            else 1.0
-        )
-        return cls(dtype=dtype, scale=scale, offset=low)
-
-    def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
-        """Return embeddings as numbers of the type, of the same shape."""
-        if self.dtype.kind == "f":
-            return embeddings.astype(self.dtype)
-        return np.asarray(
-            np.rint(embeddings / self.scale - self.offset / self.scale).astype(self.dtype)
-        )
-
-
-def _table(container: Container, level: int, size: int) -> TableSource:
+def _table(container: Container, needed: Needed, level: int) -> TableSource:
     """Return the table of a level, counted from 1, however it is stored."""
-    if container.header["model"]["tables"] == "transform":
+    model = container.header["model"]
+    size = model["embedding_size"]
+    if model["tables"] == "transform":
         return CodedTable(
             [container.arrays[component_name(level, number)] for number in range(1, size + 1)]
         )
-    return StoredTable(container.arrays[f"tables/level_{level}"])
+    stored = StoredTable(container.arrays[table_name(level)])
+    if "sparse" not in model:
+        return stored
+
+    def rows(first: int, end: int) -> npt.NDArray[Any]:
+        return stored.read((slice(first, end), slice(0, size)))
+
+    return SparseTable(
+        (*model["levels"][level - 1], size),
+        stored.array.attributes[COUNTS],
+        rows,
+        partial(needed.mask, level - 1),
+        f"{container.path}: array {table_name(level)}",
+    )
 
 
-def _write_table(
+def _needed(container: Container) -> Needed:
+    """Return the vertices that the samples of a file need."""
+    model = container.header["model"]
+
+    @lru_cache(maxsize=GRIDS)
+    def grid(key: int) -> occupancy.Bits:
+        bits = container.arrays[BITS]
+        row: occupancy.Bits = bits.read((slice(key, key + 1), slice(0, bits.shape[1])))[0]
+        return row
+
+    levels = [tuple(level) for level in model["levels"]]
+    return Needed(levels, grid, fringe=model.get("sparse") == FRINGE)
+
+
+def _stored(number_type: NumberType, read: Callable[[int], Floats], node: int) -> npt.NDArray[Any]:
+    """Return the embeddings (z, y, x, E) of a time node as numbers of a type."""
+    return number_type.stored(read(node))
+
+
+def _write_dense(
     writer: ContainerWriter,
-    level: int,
+    name: str,
     shape: tuple[int, ...],
-    embeddings: Floats,
-    frames: Iterable[Floats],
-    kind: str,
+    number_type: NumberType,
+    stored: Callable[[int], npt.NDArray[Any]],
 ) -> None:
-    """Write the table of one level.
+    """Write all embeddings of a level.
 
     Args:
         writer: the container that is being written.
-        level: number of the level, counted from 1.
+        name: of the array.
         shape: lengths of the axes (t, z, y, x, E).
-        embeddings: all embeddings in any order, for the range of the numbers.
-        frames: the embeddings of each time node, (z, y, x, E).
-        kind: name of the number type in the file.
+        number_type: type of the numbers.
+        stored: time node -> its embeddings (z, y, x, E) as numbers of that type.
     """
-    number_type = NumberType.of(embeddings, kind)
-    dtype = number_type.dtype
-    attributes = (
-        {"offset": number_type.offset, "scale": number_type.scale} if dtype.kind == "u" else None
-    )
-    chunk = table_chunk(shape, dtype.itemsize)
+    chunk = table_chunk(shape, number_type.dtype.itemsize)
 
     def chunks() -> Iterator[npt.NDArray[Any]]:
-        for frame in frames:
-            node = number_type.stored(frame)[None]
+        for number in range(shape[0]):
+            node = stored(number)[None]
             for start in np.ndindex(*(-(-n // c) for n, c in zip(node.shape, chunk, strict=True))):
                 yield node[
                     tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))
                 ]
 
     writer.add_array(
-        f"tables/level_{level}",
+        name,
         shape=shape,
-        dtype=dtype,
+        dtype=number_type.dtype,
         chunk_shape=chunk,
         chunks=chunks(),
         dimension_names=TABLE_AXES,
-        attributes=attributes,
+        attributes=number_type.attributes or None,
     )

@@ -103,6 +103,28 @@ GOLDENS = {
         tables="uint8",
         key_frames="0,2,4",
     ),
+    "paper-1.6-sparse": EncodeConfig(
+        profile="paper",
+        hidden_layers=1,
+        width=8,
+        timings=False,
+        features=("interval:1:1.2", "isosurface:0"),
+        dilation=0,
+        tables="sparse",
+        key_frames="0,2,3",
+    ),
+    "paper-1.6-sparse-untrained": EncodeConfig(
+        profile="paper",
+        hidden_layers=0,
+        embedding_size=1,
+        fold=3,
+        timings=False,
+        features=("interval:1:1.5",),
+        fringe="untrained",
+        dilation=0,
+        tables="uint8",
+        key_frames="0,1,4",
+    ),
 }
 
 PLAIN = {

@@ -45,6 +45,8 @@ NAMES = [
     "paper-1.3-coded-occupancy",
     "paper-1.3-features",
     "paper-1.3-plain-coded",
+    "paper-1.6-sparse",
+    "paper-1.6-sparse-untrained",
     *COMPACT,
 ]
 

@@ -177,11 +177,11 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     group = dumped({"zarr_format": 3, "node_type": "group"})
     kept += [(f"{name}/{DOCUMENT}", group) for name in ("tables", "occupancy", "coords")]
     for name, lengths, dtype in new:
-        kept += _array_of_zeros(name, lengths, dtype)
+        kept += array_of_zeros(name, lengths, dtype)
     return [*kept, (DOCUMENT, dumped(root))]
 
 
-def _array_of_zeros(name: str, shape: list[int], dtype: str) -> Parts:
+def array_of_zeros(name: str, shape: list[int], dtype: str) -> Parts:
     """Return the members of an array of one chunk; key frames and positions ascend."""
     size = prod(shape)
     ascending = name.startswith(("key_frames", "coords"))

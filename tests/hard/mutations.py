@@ -21,6 +21,7 @@ import mutated_labels
 import mutated_payload
 import mutated_plain
 import mutated_settings
+import mutated_sparse
 import mutated_zip
 from containers import Parts, pack, unpack
 
@@ -170,6 +171,7 @@ _MODULES = (
     mutated_labels,
     mutated_plain,
     mutated_apart,
+    mutated_sparse,
 )
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
@@ -180,6 +182,8 @@ PLAIN_KINDS = frozenset(mutated_plain.KINDS)
 """Kinds that change plain files, or arrays of occupancy, only."""
 APART_KINDS = frozenset(mutated_apart.KINDS)
 """Kinds that change parts of a table that lie in arrays of their own, only."""
+SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
+"""Kinds that change tables of needed vertices only."""
 
 
 def header_of(parts: Parts) -> Any:

@@ -7,7 +7,7 @@
 namespace {
 
 // Numbers that describe a level.
-constexpr std::int64_t LEVEL = 2 + 3 * AXES;
+constexpr std::int64_t LEVEL = 2 + 3 * AXES + 4;
 
 FHASH_PATHS(std::int64_t, points,
             (const Task& task, const Points& places, std::int64_t count, float* values,
@@ -18,13 +18,17 @@ FHASH_PATHS(std::int64_t, still,
              float* numbers),
             (level, sizes, time, count, numbers))
 
-// A level of an array (address, numbers, and three numbers for each axis).
+// A level of an array: address, numbers, three numbers for each axis, and the bitmap.
 Level level_at(const int64_t* given) {
     Level level;
     level.table = reinterpret_cast<const float*>(given[0]);
     level.numbers = given[1];
     for (int a = 0; a < AXES; ++a)
         level.axes[a] = {given[2 + 3 * a], given[3 + 3 * a], given[4 + 3 * a]};
+    const int64_t* held = given + 2 + 3 * AXES;
+    level.held = {reinterpret_cast<const std::uint64_t*>(held[0]),
+                  reinterpret_cast<const std::uint32_t*>(held[1]),
+                  reinterpret_cast<const std::uint8_t*>(held[2]), held[3]};
     return level;
 }
 
@@ -36,7 +40,9 @@ Level level_at(const int64_t* given) {
 // sizes: key frames and box (t, z, y, x), levels, layers, numbers at a vertex, whether tables hold
 //     several time nodes.
 // levels: for each level the address of a part of its table (t, z, y, x, E), its numbers, and for
-//     each axis the vertices of the level, the first in the part, and the numbers to the next.
+//     each axis the vertices of the level, the first in the part, and the numbers to the next;
+//     then words, blocks and counts of the bitmap of the vertices that it holds, and how many they
+//     are, or four times 0 for all vertices. With a bitmap axes count its bits.
 // layers: for each layer the address of its matrix, its outputs and its inputs.
 // columns: for each coordinate its address, and its numbers from one point to the next.
 // slopes: null for values alone.

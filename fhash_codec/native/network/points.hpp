@@ -28,11 +28,22 @@ struct Axis {
     std::int64_t vertices, first, stride;
 };
 
-// A part of a level's table: its numbers, how many there are, and its axes t, z, y, x.
+// A bitmap of the vertices that a level holds (paper/tables/ranked.py), and the row of zeros behind
+// their embeddings. Without words the level holds all vertices.
+struct Held {
+    const std::uint64_t* words;
+    const std::uint32_t* blocks;
+    const std::uint8_t* within;
+    std::int64_t nothing;
+};
+
+// A part of a level's table: its numbers, how many there are, and its axes t, z, y, x. Where it
+// holds some vertices only, the axes count bits of the bitmap, and the table has one time.
 struct Level {
     const float* table;
     std::int64_t numbers;
     Axis axes[AXES];
+    Held held;
 };
 
 // A layer as a matrix (outputs + 1, inputs + 1) with the bias in its last column; the last row is
@@ -139,9 +150,29 @@ FHASH_INLINE typename Pair<C>::Row row_at(const float* from, std::int64_t embedd
     return row;
 }
 
+// The place of a vertex among those that a level holds: the rank of its bit.
+FHASH_INLINE std::int64_t place_of(const Held& held, std::int64_t bit) {
+    // The bit moves to the top of its word, and all that come after it fall out.
+    const std::uint64_t upto = held.words[bit >> 6] << (63 - (bit & 63));
+    const std::int64_t rank = (std::int64_t)held.blocks[bit >> 8] + held.within[bit >> 6] +
+                              __builtin_popcountll(upto);
+    return (std::int64_t)upto < 0 ? rank - 1 : held.nothing;
+}
+
+// As row_at, of a level that holds some vertices only. `table` begins at the first number to take.
+template <int C>
+FHASH_INLINE typename Pair<C>::Row held_row(const Level& level, const float* table,
+                                            std::int64_t bit, std::int64_t embedding) {
+    typename Pair<C>::Row row;
+    const float* low = table + place_of(level.held, bit) * embedding;
+    const float* high = table + place_of(level.held, bit + level.axes[3].stride) * embedding;
+    for (int c = 0; c < C; ++c) row[c] = low[c], row[C + c] = high[c];
+    return row;
+}
+
 // Write the embeddings of a level at the points of a tile, and with GRADIENT their derivatives per
 // vertex of the box. `inputs` and `changes` begin at the first row of the level.
-template <int C, bool TOGETHER, bool TIMES, bool GRADIENT>
+template <int C, bool TOGETHER, bool TIMES, bool GRADIENT, bool SPARSE>
 FHASH_INLINE void interpolate(const Level& level, const Task& task, const double* offsets,
                               const float* FHASH_RESTRICT after, std::int64_t first,
                               float* FHASH_RESTRICT inputs, float* FHASH_RESTRICT changes) {
@@ -154,16 +185,17 @@ FHASH_INLINE void interpolate(const Level& level, const Task& task, const double
                           (task.sizes[a] > 1 ? (double)(task.sizes[a] - 1) : 1.0));
     const float* table = level.table + first;
     for (int i = 0; i < TILE; ++i) {
-        const float* from = table + (std::int64_t)offsets[i];
+        const std::int64_t from = (std::int64_t)offsets[i];
         const float wt = after[i], wz = after[TILE + i], wy = after[2 * TILE + i],
                     wx = after[3 * TILE + i];
         Row corners[4], by_t[4];
         FHASH_UNROLLED
         for (int k = 0; k < 4; ++k) {
-            const float* corner = from + (k & 2 ? z : 0) + (k & 1 ? y : 0);
-            corners[k] = row_at<C, TOGETHER>(corner, embedding);
+            const std::int64_t corner = from + (k & 2 ? z : 0) + (k & 1 ? y : 0);
+            corners[k] = SPARSE ? held_row<C>(level, table, corner, embedding)
+                                : row_at<C, TOGETHER>(table + corner, embedding);
             if (TIMES) {
-                by_t[k] = row_at<C, TOGETHER>(corner + t, embedding) - corners[k];
+                by_t[k] = row_at<C, TOGETHER>(table + corner + t, embedding) - corners[k];
                 corners[k] = corners[k] + wt * by_t[k];
             }
         }
@@ -192,6 +224,19 @@ FHASH_INLINE void interpolate(const Level& level, const Task& task, const double
     }
 }
 
+// The same for a level that holds all vertices or some.
+template <int C, bool TOGETHER, bool TIMES, bool GRADIENT>
+FHASH_INLINE void interpolate_any(const Level& level, const Task& task, const double* offsets,
+                                  const float* after, std::int64_t first, float* inputs,
+                                  float* changes) {
+    if (!TIMES && level.held.words)
+        interpolate<C, TOGETHER, false, GRADIENT, true>(level, task, offsets, after, first, inputs,
+                                                        changes);
+    else
+        interpolate<C, TOGETHER, TIMES, GRADIENT, false>(level, task, offsets, after, first, inputs,
+                                                         changes);
+}
+
 // All levels of a tile.
 template <bool TIMES, bool GRADIENT>
 FHASH_INLINE void encode(const Task& task, const double* points, Workspace& work) {
@@ -199,7 +244,7 @@ FHASH_INLINE void encode(const Task& task, const double* points, Workspace& work
         const Level& level = task.levels[l];
         double* offsets = work.offsets.data() + l * TILE;
         locate(level, task.sizes, points, offsets, work.after.data() + l * AXES * TILE);
-        if (level.numbers * 4 >= FAR_BYTES) fetch(level, offsets, TIMES);
+        if (level.numbers * 4 >= FAR_BYTES && !level.held.words) fetch(level, offsets, TIMES);
     }
     for (std::int64_t l = 0; l < task.level_count; ++l) {
         const Level& level = task.levels[l];
@@ -208,13 +253,15 @@ FHASH_INLINE void encode(const Task& task, const double* points, Workspace& work
         float* inputs = work.inputs.data() + l * task.embedding * TILE;
         float* changes = work.changes.data() + l * task.embedding * TILE;
         if (task.embedding == 2) {
-            interpolate<2, true, TIMES, GRADIENT>(level, task, offsets, after, 0, inputs, changes);
+            interpolate_any<2, true, TIMES, GRADIENT>(level, task, offsets, after, 0, inputs,
+                                                      changes);
         } else if (task.embedding == 4) {
-            interpolate<4, true, TIMES, GRADIENT>(level, task, offsets, after, 0, inputs, changes);
+            interpolate_any<4, true, TIMES, GRADIENT>(level, task, offsets, after, 0, inputs,
+                                                      changes);
         } else {
             for (std::int64_t e = 0; e < task.embedding; ++e)
-                interpolate<1, false, TIMES, GRADIENT>(level, task, offsets, after, e, inputs,
-                                                       changes);
+                interpolate_any<1, false, TIMES, GRADIENT>(level, task, offsets, after, e, inputs,
+                                                           changes);
         }
     }
 }

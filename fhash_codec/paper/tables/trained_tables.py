@@ -12,6 +12,7 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.bricks import Bricks
+from fhash_codec.paper.tables.needed import needed_by
 
 Region = tuple[slice, ...]
 Mask = npt.NDArray[np.bool_]
@@ -92,51 +93,15 @@ def trained_tables(
         tables: the coarser tables, each (buckets, E).
     """
     size, levels = architecture.embedding_size, architecture.levels
-    needed = [np.zeros(level, bool) for level in levels[1:]]
-    for key in range(architecture.key_frames):
-        # Samples of the fringe need their embeddings as well.
-        in_coreset = bricks.mask(key, Box.of((0, n) for n in architecture.box_size))
-        for level, level_needed in zip(levels[1:], needed, strict=True):
-            around = in_coreset
-            for axis in range(3):
-                around = spread(around, axis, level[axis + 1])
-            first, last = corners(architecture.key_frames, level[0])
-            for node in {int(first[key]), int(last[key])}:
-                level_needed[node] |= around
+    needed = needed_by(architecture, coreset)
     coarse = [
-        CoarseTable(table.reshape(*level, size), level_needed)
-        for table, level, level_needed in zip(tables, levels[1:], needed, strict=True)
+        CoarseTable(
+            table.reshape(*level, size),
+            np.stack([needed.mask(number, node) for node in range(level[0])]),
+        )
+        for number, (table, level) in enumerate(zip(tables, levels[1:], strict=True), start=1)
     ]
     return [FinestTable(coreset, bricks, fine), *coarse]
-
-
-def corners(length: int, resolution: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the vertices of a level before and after each vertex of the box, along one axis.
-
-    They are the same where a vertex of the box lies on a vertex of the level.
-
-    Args:
-        length: vertices of the box along the axis.
-        resolution: vertices of the level along the axis.
-    """
-    before, rest = np.divmod(np.arange(length) * (resolution - 1), max(length - 1, 1))
-    return before, before + (rest > 0)
-
-
-def spread(mask: Mask, axis: int, resolution: int) -> Mask:
-    """Return which vertices of a level surround some vertex of a mask, along one axis.
-
-    Args:
-        mask: vertices of the box along that axis.
-        axis: the axis.
-        resolution: vertices of the level along it.
-    """
-    layers = np.moveaxis(mask, axis, 0)
-    result = np.zeros((resolution, *layers.shape[1:]), bool)
-    for layer, first, last in zip(layers, *corners(len(layers), resolution), strict=True):
-        result[first] |= layer
-        result[last] |= layer
-    return np.moveaxis(result, 0, axis)
 
 
 def _keys_and_box(region: Region) -> tuple[range, Box]:

@@ -29,6 +29,7 @@ from fhash_formats.container.header import (
     TRANSFORM_FEATURE,
 )
 from fhash_formats.container.record import Record
+from fhash_formats.container.sparse import SPARSE, check_occupancy, sparse_shape
 from fhash_formats.errors import DamagedFileError
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
@@ -43,7 +44,9 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
 
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
-    for name, shape, dtypes in _required_arrays(header):
+    if SPARSE in header["model"]:
+        check_occupancy(arrays)
+    for name, shape, dtypes in _required_arrays(header, arrays):
         if name == "occupancy/bits" and MASK_ARRAY in arrays:
             continue
         if name not in arrays:
@@ -107,8 +110,13 @@ def _head_shapes(head: Mapping[str, Any] | None) -> list[tuple[int, int]]:
     return list(zip([*head["hidden"], 1], inputs, strict=True))
 
 
-def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
-    """Yield the arrays that a valid header asks for; levels count from 1, as in FORMAT.md."""
+def _required_arrays(
+    header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]
+) -> Iterator[Expected]:
+    """Yield the arrays that a valid header asks for; levels count from 1, as in FORMAT.md.
+
+    arrays: those of the file, whose attributes say the lengths of sparse tables.
+    """
     model = header["model"]
     compact = model["profile"] == COMPACT
     described = header.get("coordinates", {}) if compact else {}
@@ -126,8 +134,11 @@ def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         if model["tables"] == CODED:
             for component in range(1, model["embedding_size"] + 1):
                 yield f"tables/level_{number}/component_{component}", tuple(level), ("float32",)
-        else:
-            yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
+            continue
+        name, size = f"tables/level_{number}", model["embedding_size"]
+        sparse = SPARSE in model
+        shape = sparse_shape(name, level, size, arrays) if sparse else (*level, size)
+        yield name, shape, (model["tables"],)
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)

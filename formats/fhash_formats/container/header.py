@@ -15,10 +15,11 @@ from fhash_formats.container.array import DTYPES
 from fhash_formats.container.coordinates import FEATURE as ULPS_FEATURE
 from fhash_formats.container.coordinates import MAX_RULED, check_positions
 from fhash_formats.container.record import MAX_LENGTH, Record
+from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 5)
+FORMAT_VERSION = (1, 6)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -37,6 +38,7 @@ KNOWN_FEATURES = frozenset(
         "many-labels",
         "mask",
         "predictor",
+        SPARSE_FEATURE,
         "trellis",
         ULPS_FEATURE,
     }
@@ -104,6 +106,11 @@ def validate_header(header: Mapping[str, Any]) -> None:
     if (profile == COMPACT and not plain) or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
+    check_sparse(
+        top.record("model"),
+        header["required_features"],
+        allowed=profile == PAPER and header["model"]["tables"] != CODED,
+    )
     if profile == COMPACT:
         _check_coordinates(top, shape)
     top.record("config")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, QualityError
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.paper.encode import sparse_tables
 
 
 class Reached(Exception):
@@ -58,3 +62,45 @@ def test_the_history_is_about_the_coreset_alone(tmp_path) -> None:
     )
     figures = fhash_codec.encode(field, tmp_path / "a.fhz", config)
     assert figures["curve"][-1]["psnr"] == pytest.approx(figures["psnr"], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("tables", "share", "expected"),
+    [
+        ("float16", 0.49, True),
+        ("float16", 0.5, False),
+        ("float32", 0.49, True),
+        ("uint8", 0.1, True),
+        ("uint8", 1.0, False),
+        ("sparse", 1.0, True),
+        ("dense", 0.1, False),
+        ("transform", 0.1, False),
+    ],
+)
+def test_tables_are_sparse_below_half_of_the_box(tables, share, expected) -> None:
+    """The share is that of all samples, those of the fringe included."""
+    box = Box.of([(1, 6), (0, 10), (2, 12)])
+    coreset = Mock(box=box, key_frames=(0, 3), values=np.zeros(round(1000 * share)))
+    config = EncodeConfig(profile="paper", tables=tables)
+    assert sparse_tables(coreset, config) == expected
+
+
+@pytest.mark.parametrize(("low", "expected"), [(0.4, False), (0.8, True)])
+def test_a_file_says_which_tables_it_has(tmp_path, low, expected) -> None:
+    field = np.random.default_rng(0).random((3, 8, 9, 10), dtype=np.float32)
+    config = EncodeConfig(
+        profile="paper",
+        epochs=1,
+        width=8,
+        features=(f"interval:{low}:1",),
+        dilation=0,
+        fringe="untrained",
+    )
+    figures = fhash_codec.encode(field, tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        model = volume.info["model"]
+        assert ("sparse" in model) == expected
+        assert model["tables"] == "float16"
+        dense = 2 * sum(np.prod(level) for level in model["levels"]) + volume.mlp.parameters
+        assert (model["parameters"] < dense) == expected
+        assert figures["psnr"] == pytest.approx(volume.info["quality"]["psnr"], abs=1e-3)

@@ -1,0 +1,121 @@
+"""Mutations of what version 1.6 of the format added: tables of needed vertices alone.
+
+All checksums are correct. A file without what a kind changes is passed over.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from math import prod
+from typing import Any
+
+from containers import Parts
+from documents import DOCUMENT, LARGE, OTHERS, dumped, hostile, places
+from mutated_payload import NothingFitsError, documents_of, replaced
+from mutated_plain import array_of_zeros
+
+NAMES = ("tables/level_1", "tables/level_2")
+
+
+def _header(parts: Parts) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the root document of a file of sparse tables, and the header in it."""
+    root = json.loads(dict(parts)[DOCUMENT])
+    header = root["attributes"]["fhash"]
+    if "sparse" not in header["model"]:
+        raise NothingFitsError
+    return root, header
+
+
+def _sparse(chance: random.Random, parts: Parts) -> Parts:
+    """Change what says which vertices a table has: header, counts, levels, features."""
+    root, header = _header(parts)
+    model, turn = header["model"], chance.randrange(7)
+    if turn < 3:
+        return _counts(chance, parts)
+    if turn == 3:
+        kinds = ("coreset", "fringe", "all", *OTHERS)
+        model["sparse"] = chance.choice(kinds)
+        if chance.random() < 0.2:
+            del model["sparse"]
+    elif turn == 4:
+        names = ([], ["sparse-tables"] * 2, ["sparse-tables", "coded-occupancy"], ["transform"])
+        header["required_features"] = chance.choice(names)
+        model["tables"] = chance.choice(("float16", "float32", "uint8", "transform"))
+    elif turn == 5:
+        levels = model["levels"]
+        turned = [level[::-1] for level in levels]
+        model["levels"] = chance.choice(
+            (levels[:1], levels[:-1], [*levels, levels[-1]], levels[::-1], turned, levels[:1] * 3)
+        )
+    else:
+        holder, key = chance.choice(list(places(model)))
+        holder[key] = hostile(chance, holder[key])
+    return replaced(parts, {DOCUMENT: dumped(root)})
+
+
+def _counts(chance: random.Random, parts: Parts) -> Parts:
+    """Change the counts of a table, often so that their sum stays."""
+    name = chance.choice(NAMES)
+    document = documents_of(parts)[name]
+    counts = document["attributes"]["counts"]
+    turn = chance.randrange(6)
+    if turn < 2:
+        a, b = chance.randrange(len(counts)), chance.randrange(len(counts))
+        moved = chance.choice((1, counts[a], -1))
+        counts[a] -= moved
+        counts[b] += moved
+    elif turn == 2:
+        counts[chance.randrange(len(counts))] = chance.choice((*LARGE, *OTHERS, -1, 0, 1.5))
+    elif turn == 3:
+        document["attributes"]["counts"] = chance.choice(
+            ([], counts[1:], [*counts, 0], counts[::-1], *OTHERS)
+        )
+    elif turn == 4:
+        del document["attributes"]["counts"]
+    else:
+        document["shape"] = [sum(counts) + chance.choice((-1, 1, 1 << 40)), document["shape"][1]]
+    return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document)})
+
+
+def _giant_sparse(chance: random.Random, parts: Parts) -> Parts:
+    """Declare a giant volume in a file of a few kilobytes that has few or all of its vertices."""
+    root, header = _header(parts)
+    shape = [1, 1, 1, 1]
+    vertices = 1 << chance.choice((16, 18, 20, 22, 24))
+    while prod(shape) < vertices:
+        shape[chance.randrange(1, 4)] *= 2
+    header["domain"]["shape"] = shape
+    header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
+    header["model"].update(levels=[shape], embedding_size=1, hidden_layers=0, tables="float16")
+    bits = -(-prod(shape) // 8)
+    rows = chance.choice((1, 8, vertices))
+    arrays: list[tuple[str, list[int], str]] = [
+        ("tables/level_1", [rows, 1], "float16"),
+        ("mlp/weight_1", [1, 1], "float32"),
+        ("mlp/bias_1", [1], "float32"),
+        ("key_frames", [1], "int64"),
+        ("occupancy/bits", [1, bits], "uint8"),
+        *(
+            (f"coords/{axis}", [n], "float64")
+            for axis, n in zip(("time", "z", "y", "x"), shape, strict=True)
+        ),
+    ]
+    gone = ("tables/", "mlp/", "key_frames/", "occupancy/", "coords/", "missing/")
+    kept = [(name, data) for name, data in parts if not name.startswith(gone) and name != DOCUMENT]
+    group = dumped({"zarr_format": 3, "node_type": "group"})
+    kept += [(f"{name}/{DOCUMENT}", group) for name in ("tables", "mlp", "occupancy", "coords")]
+    for name, lengths, dtype in arrays:
+        kept += array_of_zeros(name, lengths, dtype)
+    table = documents_of(kept)["tables/level_1"]
+    table["attributes"] = {"counts": [rows]}
+    return replaced(
+        [*kept, (DOCUMENT, dumped(root))], {f"tables/level_1/{DOCUMENT}": dumped(table)}
+    )
+
+
+KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
+    "sparse": _sparse,
+    "sparse giant": _giant_sparse,
+}
