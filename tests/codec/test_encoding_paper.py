@@ -12,6 +12,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, InterruptedEncodingError, OutputError
+from fhash_codec.paper.engines.native import machine_paths
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.fhash import FHash
 from fhash_codec.paper.storage import load_network
@@ -277,3 +278,17 @@ def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tm
     assert trained["psnr_fringe"] > trained["psnr_fringe_linear"] - 5
     assert trained["psnr_key_frames"] > untrained["psnr_key_frames"] - 3
     assert figures["trained"]["psnr_linear"] == figures["untrained"]["psnr_linear"]
+
+
+@pytest.mark.parametrize("engine", ["auto", "native", "slab", "naive"])
+def test_the_header_says_which_engine_trained(field, tmp_path, engine) -> None:
+    paths = machine_paths()
+    if engine == "native" and not paths:
+        pytest.skip("the native library was not built here")
+    fhash_codec.encode(field(), tmp_path / "a.fhz", replace(QUICK, engine=engine))
+    with Container.open(tmp_path / "a.fhz") as container:
+        training = container.header["training"]
+    name = ("native" if paths else "slab") if engine == "auto" else engine
+    assert training["engine"] == name
+    assert training["threads"] >= 1
+    assert training.get("path") == (paths[0] if name == "native" else None)

@@ -1,5 +1,5 @@
-// Adam on numbers that may be behind. The loops are plain, so that the compiler turns their roots into
-// those of vectors.
+// Adam on numbers that may be behind. The loops are plain, so that the compiler turns their roots
+// into those of vectors.
 #pragma once
 
 #include "gaps.hpp"

@@ -1,11 +1,11 @@
-// The kernels of the brick engine for one path (FHASH_ONLY, see vector.hpp): training and evaluation
-// of the paper's network, a brick at a time. Upsampling, MLP forward and backward, the transpose, and
-// Adam of the finest embeddings follow each other while a brick lies in a core's cache.
+// The kernels of the brick engine for one path (FHASH_ONLY, see vector.hpp): training and
+// evaluation of the paper's network, a brick at a time. Upsampling, MLP forward and backward, the
+// transpose, and Adam of the finest embeddings follow each other while a brick lies in the cache.
 //
 // A step has three parts, of which each thread does its own share: catching up the blocks of the
 // largest coarse table that the step touches, the bricks, and Adam of the flat numbers. Threads add
-// gradients to memory of their own, which is summed in their order: the same bricks, path and number
-// of threads give the same bits.
+// gradients to memory of their own, which is summed in their order: the same bricks, path and
+// number of threads give the same bits.
 #include "adam.hpp"
 #include "mlp.hpp"
 #include "upsample.hpp"
@@ -33,7 +33,8 @@ struct Work {
             w.size += (numbers + FHASH_PAD + 15) / 16 * 16;
             return taken;
         };
-        const std::int64_t count = (b.levels + 1) * b.embedding + 1, plane = b.shape[1] * b.shape[2];
+        const std::int64_t count = (b.levels + 1) * b.embedding + 1;
+        const std::int64_t plane = b.shape[1] * b.shape[2];
         std::int64_t nx = 0, lines = 0, planes = 0, rows = 0;
         for (std::int64_t l = 0; l < b.levels; l++) {
             const std::int64_t* corners = b.level[l].corners;

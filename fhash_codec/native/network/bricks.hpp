@@ -2,8 +2,8 @@
 // fhash_codec/paper/engines/native_task.py, which also says what the arrays hold.
 //
 // A brick is a box of vertices of one key frame. Its inputs of the MLP are rows over its vertices:
-// first the finest embeddings, which it stores itself, then those of each coarse level, interpolated
-// from a small sub-lattice of that level's table.
+// first the finest embeddings, which it stores itself, then those of each coarse level,
+// interpolated from a small sub-lattice of that level's table.
 #pragma once
 
 #include "vector.hpp"
@@ -78,7 +78,7 @@ extern "C" struct FhashBricks {
     std::int64_t* stamps;         // (blocks,): last step that touched a block
     std::int64_t* touched;        // (blocks,): blocks that the step touches
     std::int64_t touches;         // their number
-    float* gradient;              // (threads, numbers): zeros before and after a step, up to `coarse`
+    float* gradient;              // (threads, numbers): zeros up to `coarse` between steps
     float* work;                  // (threads, fhash_bricks_work): of each thread
     std::int64_t work_size;       // numbers of `work` for a thread
     double* error;                // (threads,): sums of squared errors

@@ -248,8 +248,8 @@ struct Mlp {
         }
     }
 
-    // Replace inputs by the gradients by them, after `forward` with `keep` and with the gradients by
-    // the outputs in `value`. The row behind the inputs holds ones, and stays.
+    // Replace inputs by the gradients by them, after `forward` with `keep` and with the gradients
+    // by the outputs in `value`. The row behind the inputs holds ones, and stays.
     template <class P>
     FHASH_INLINE void backward(float* in, std::int64_t row, std::int64_t vectors) {
         constexpr std::int64_t CHUNK = Tiles<P>::CHUNK * P::N;

@@ -20,7 +20,8 @@ template <class P> struct Pairs {
         typedef Places<I...> All;
     };
     typedef typename First<P::N>::All All;
-    template <int... I> static FHASH_INLINE void apart(F a, F b, F& first, F& second, Places<I...>) {
+    template <int... I>
+    static FHASH_INLINE void apart(F a, F b, F& first, F& second, Places<I...>) {
         first = __builtin_shufflevector(a, b, 2 * I...);
         second = __builtin_shufflevector(a, b, (2 * I + 1)...);
     }
@@ -134,8 +135,9 @@ template <class P> FHASH_INLINE void interpolate(const Place& p, const float* fl
         }
 }
 
-// Sum `lines` of `length` numbers, `apart` numbers apart, into corners: the transpose of `mix` along
-// one axis. first, weight: the two corners of each line. Corners come `out_apart` numbers apart.
+// Sum `lines` of `length` numbers, `apart` numbers apart, into corners: the transpose of `mix`
+// along one axis. first, weight: the two corners of each line. Corners come `out_apart` numbers
+// apart.
 template <class P> FHASH_INLINE void collect(float* to, std::int64_t corners,
                                              std::int64_t out_apart, const float* from,
                                              std::int64_t lines, std::int64_t apart,

@@ -84,8 +84,11 @@ def diverged(run: Run) -> Iterator[Finding]:
 
 
 def engines(run: Run) -> Iterator[Finding]:
-    """The slab engine trains the same network as the naive engine."""
-    yield _apart(run, "slab = naive", replace(run.config, engine="naive"), MAX_ENGINE_DIFFERENCE)
+    """Other engines train the same network as the one that is chosen."""
+    for engine in ("naive", "slab"):
+        yield _apart(
+            run, f"auto = {engine}", replace(run.config, engine=engine), MAX_ENGINE_DIFFERENCE
+        )
 
 
 def devices(run: Run) -> Iterator[Finding]:

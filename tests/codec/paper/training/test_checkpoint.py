@@ -75,3 +75,11 @@ def test_tables_that_change_the_sizes_of_the_model_have_a_checkpoint_of_their_ow
     assert path() == path(tables="transform", **published)
     for setting in published:
         assert path() != path(tables="transform", **(published | {setting: 0}))
+
+
+def test_engines_that_go_on_from_each_other_share_a_checkpoint(coreset, tmp_path) -> None:
+    def path(engine):
+        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", engine=engine))
+
+    assert path("auto") == path("native") == path("slab")
+    assert path("naive") != path("auto")
