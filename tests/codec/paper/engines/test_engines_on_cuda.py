@@ -65,14 +65,14 @@ def test_an_engine_trains_on_the_device_as_on_the_cpu(
 
 
 def box_of_isabel(feature: Feature) -> Coreset:
-    """The coreset of a smooth series of isabel's shape."""
+    """The coreset of four key frames of a smooth series of isabel's shape."""
     t, z, y, x = np.meshgrid(
-        *(np.linspace(0, 1, n, dtype=np.float32) for n in (12, 25, 125, 125)),
+        *(np.linspace(0, 1, n, dtype=np.float32) for n in (4, 25, 125, 125)),
         indexing="ij",
         sparse=True,
     )
     series = ArraySeries(np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)
-    return build_coreset(series, scan(series, silent), range(12), [feature], 0, silent)
+    return build_coreset(series, scan(series, silent), range(4), [feature], 0, silent)
 
 
 @pytest.mark.parametrize("feature", [Everything(), Interval(1.1, 1.5)], ids=["all", "a feature"])
@@ -81,7 +81,7 @@ def test_a_step_launches_little_waits_for_nothing_and_copies_once(feature: Featu
     batches = np.array_split(np.random.default_rng(0).permutation(len(coreset.bricks)), 8)
     for hidden_layers, launches in LAUNCHES.items():
         architecture = Architecture.for_box(
-            coreset.box.shape, 12, width=64, embedding_size=2, fold=2, hidden_layers=hidden_layers
+            coreset.box.shape, 4, width=64, embedding_size=2, fold=2, hidden_layers=hidden_layers
         )
         assert len(architecture.levels) == 7
         with pretended_cuda() as pretended:
