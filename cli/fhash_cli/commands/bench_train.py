@@ -36,12 +36,11 @@ class EnginesType(click.ParamType[tuple[str, ...]]):
         """The names; refuses one that is unknown."""
         from fhash_codec.config import ENGINES
 
-        known = tuple(dict.fromkeys(("native", *ENGINES)))
         names = tuple(name.strip() for name in str(value).split(","))
         for name in names:
-            if name not in known:
+            if name not in ENGINES:
                 self.fail(
-                    f"'{name}' is no engine; allowed, separated by commas: {', '.join(known)}",
+                    f"'{name}' is no engine; allowed, separated by commas: {', '.join(ENGINES)}",
                     param,
                     ctx,
                 )

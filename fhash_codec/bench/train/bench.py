@@ -32,10 +32,8 @@ from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
-__all__ = ["NAMES", "bench_train"]
+__all__ = ["bench_train"]
 
-NAMES = ("native", *(name for name in ENGINES if name != "native"))
-"""Engines that can be measured."""
 TURNS = 10
 """Turns over which each engine's time is spread, and points of its curve."""
 INFER_SECONDS = 0.12
@@ -175,14 +173,14 @@ def _variants(
     device: torch.device,
 ) -> list[Variant]:
     """Return the engines to measure, in the order of their names."""
-    unknown = sorted(set(engines) - set(NAMES))
+    unknown = sorted(set(engines) - set(ENGINES))
     if unknown:
-        raise InputError(f"unknown engine '{unknown[0]}'; known: {', '.join(NAMES)}")
+        raise InputError(f"unknown engine '{unknown[0]}'; known: {', '.join(ENGINES)}")
     reason = refusal(architecture, device)
     if reason is not None and "native" in engines:
         raise InputError(f"the engine 'native' does not take this model: {reason}")
     variants = []
-    for name in engines or NAMES:
+    for name in engines or ENGINES:
         if name != "native":
             variants += [Variant(name, number) for number in threads]
         elif reason is None:
