@@ -25,7 +25,8 @@ from fhash_formats.series import Series
 SPARSE_BELOW = 0.5
 """Share of samples in their box below which tables have needed vertices alone.
 
-The file is smaller and takes less memory below it; above, a dense table is read faster.
+Sparse tables of a share of 0.52 take 0.58 of the memory of dense ones and 0.99 of the file, and a
+point in them takes 1.7 times as long. At 0.22 these are 0.28, 0.97 and 1.7.
 """
 RESERVE = 0.5
 """dB above a promised PSNR that a model should have before its tables are coded.
