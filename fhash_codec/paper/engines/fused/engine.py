@@ -255,8 +255,8 @@ class FusedEngine(SlabEngine):
         start = [tensor.clone() for tensor in (self.fine[: len(bricks)], self.flat)]
         results = []
         for engine in (FusedEngine, SlabEngine):
-            errors = [float(engine.train(self, batch)) for batch in batches]
-            results.append((np.array(errors), engine.infer(self, bricks).cpu().numpy()))
+            steps = [float(engine.train(self, batch)) for batch in batches]
+            results.append((np.array(steps), engine.infer(self, bricks).cpu().numpy()))
             self._start_again(*start)
         (errors, values), (slab_errors, slab_values) = results
         wrong_errors = not np.allclose(errors, slab_errors, rtol=TRIAL_ERROR, atol=1e-9)

@@ -113,7 +113,15 @@ def find_nvrtc() -> Nvrtc:
 
 
 def _candidates() -> Iterator[Path]:
-    """Yield files of the library: of NVIDIA's packages, of torch, of a toolkit; newest first."""
+    """Yield files of the library, of a folder the newest first."""
+    for folder in _folders():
+        for pattern in NAMES:
+            found = [path for path in folder.glob(pattern) if "builtins" not in path.name]
+            yield from sorted(found, key=_number, reverse=True)
+
+
+def _folders() -> list[Path]:
+    """Return where the library may be: NVIDIA's packages, torch, a toolkit, the loader's path."""
     folders = []
     for package, inner in (("nvidia", ("cu*/lib", "cuda_nvrtc/lib", "*/bin")), ("torch", ("lib",))):
         spec = importlib.util.find_spec(package)
@@ -122,11 +130,8 @@ def _candidates() -> Iterator[Path]:
     toolkits = [os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), "/usr/local/cuda"]
     for toolkit in filter(None, toolkits):
         folders += [Path(toolkit) / "lib64", Path(toolkit) / "bin"]
-    folders += [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
-    for folder in folders:
-        for pattern in NAMES:
-            found = [path for path in folder.glob(pattern) if "builtins" not in path.name]
-            yield from sorted(found, key=_number, reverse=True)
+    paths = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    return folders + [Path(path) for path in paths if path]
 
 
 def _number(path: Path) -> list[int]:

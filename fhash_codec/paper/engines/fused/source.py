@@ -19,7 +19,7 @@ FILES = ("model.cuh", "network.cuh", "brick.cuh", "bricks.cu")
 THREADS = 256
 """Threads of a block."""
 COLUMNS = (128, 64, 32)
-"""Vertices of a tile that are tried, from the fastest on."""
+"""Vertices of a tile at most, in the order in which they are tried."""
 MAX_WIDTH = 128
 """Largest width of a hidden layer."""
 MAX_INPUTS = 64
@@ -34,17 +34,21 @@ class Unavailable(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceLimits:
-    """The limits of a device.
+    """The limits of a device, and the sizes that are tried on it.
 
     Attributes:
         multiprocessors: number of multiprocessors.
         shared_per_block: bytes of shared memory that a block can have.
         shared_per_multiprocessor: bytes of shared memory of a multiprocessor.
+        threads: threads of a block.
+        columns: vertices of a tile at most, in the order in which they are tried.
     """
 
     multiprocessors: int
     shared_per_block: int
     shared_per_multiprocessor: int
+    threads: int = THREADS
+    columns: tuple[int, ...] = COLUMNS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +68,8 @@ class KernelSizes:
     brick_shape: tuple[int, int, int]
     corners: tuple[tuple[int, int, int, int], ...]
     columns: int
-    threads: int = THREADS
-    sums_in_shared: bool = True
+    threads: int
+    sums_in_shared: bool
 
     @property
     def tile_rows(self) -> int:
@@ -198,7 +202,7 @@ def kernel_sizes(
     fitting = [
         sizes
         for sums_in_shared in (True, False)
-        for columns in COLUMNS
+        for columns in limits.columns
         if columns >= coreset.brick_shape[2]
         and (
             sizes := KernelSizes(
@@ -206,6 +210,7 @@ def kernel_sizes(
                 brick_shape=coreset.brick_shape,
                 corners=corners,
                 columns=columns,
+                threads=limits.threads,
                 sums_in_shared=sums_in_shared,
             )
         ).shared_bytes
@@ -228,7 +233,7 @@ def _starts(sizes: Sequence[int]) -> list[int]:
 
 
 def _table(kind: str, name: str, numbers: Sequence[int]) -> str:
-    """Return the line of a table of constants; an empty table has one entry, which is never read."""
+    """Return the line of a table of constants. An empty table has one entry, never read."""
     values = ", ".join(map(str, numbers)) or "0"
     return f"__constant__ {kind} {name}[{max(len(numbers), 1)}] = {{{values}}};"
 

@@ -132,7 +132,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 512 / THREADS) train_brick
         }
         scatter(model, at, item, places, entries);
     }
-    __syncthreads();
     add_last_gradient(last_sums, sums + LAST_LAYER_AT, at.parts);
     double* const thread_errors = reinterpret_cast<double*>(at.parts);
     thread_errors[threadIdx.x] = error;
@@ -175,7 +174,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 512 / THREADS) infer_brick
                     values[first[item] +
                            samples_before(model, brick, at.samples, vertex + column)] =
                         output_of(at.parts, column);
-            __syncthreads();
         }
     }
 }
@@ -228,7 +226,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) settle_bricks(
                 model.fine_square[place] = square * effect.square_decay;
             }
         }
-        __syncthreads();
+        // All threads have read it: `catch_up` has barriers unless it is the step already.
         if (threadIdx.x == 0 && visited > 0) model.visited[id] = step;
     }
 }

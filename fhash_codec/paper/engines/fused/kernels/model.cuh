@@ -69,7 +69,8 @@ __device__ inline void adam(
     number -= rate.rate * mean / (sqrtf(square) * rate.root + EPSILON);
 }
 
-// The sum of a number of each thread, for all of them. `scratch` holds THREADS + 16 numbers.
+// The sum of a number of each thread, for all of them. `scratch` holds THREADS + 16 numbers; after
+// the last of several sums, a barrier must come before another use of it.
 __device__ inline float block_sum(float value, float* scratch) {
     scratch[threadIdx.x] = value;
     __syncthreads();
@@ -81,7 +82,6 @@ __device__ inline float block_sum(float value, float* scratch) {
     __syncthreads();
     float sum = 0.f;
     for (int i = 0; i < 16; i++) sum += scratch[THREADS + i];
-    __syncthreads();
     return sum;
 }
 

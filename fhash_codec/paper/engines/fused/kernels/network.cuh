@@ -37,12 +37,12 @@ __device__ inline int place_in_matrices(int number) {
     return LAST_LAYER_AT + number;
 }
 
+// A barrier must come before the matrices are used.
 __device__ inline void load_matrices(const float* network, float* matrices) {
     for (int i = threadIdx.x; i < MATRICES; i += THREADS) matrices[i] = 0.f;
     __syncthreads();
     for (int i = threadIdx.x; i < PARAMETERS; i += THREADS)
         matrices[place_in_matrices(i)] = network[i];
-    __syncthreads();
 }
 
 __device__ inline int thread_group() { return threadIdx.x / COLUMN_GROUP; }
@@ -119,7 +119,7 @@ __device__ inline void backward(const float* matrix, const float* down, float* i
 #pragma unroll
         for (int r = 0; r < ROWS; r++)
             rows[r] = matrix + (first + r < ROWS_OUT ? first + r : ROWS_OUT) * STRIDE;
-#pragma unroll 2
+#pragma unroll(ROWS == 8 ? 1 : 2)
         for (int h = 0; h < WHOLE; h += 4) {
             float4 weights[ROWS];
 #pragma unroll

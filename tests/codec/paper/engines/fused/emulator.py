@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import ctypes
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from fhash_codec.paper.engines.fused.source import DeviceLimits, KernelSizes, Unavailable
 
 HERE = Path(__file__).parent
 LIMITS = DeviceLimits(
-    multiprocessors=2, shared_per_block=96 << 10, shared_per_multiprocessor=200 << 10
+    multiprocessors=2,
+    shared_per_block=160 << 10,
+    shared_per_multiprocessor=400 << 10,
+    threads=64,
+    columns=(32,),
 )
-"""A small device: several bricks for each block."""
+"""A small device: several bricks for each block, and few fibres."""
+FAILURES = {1: "threads met at different barriers", 2: "unknown kernel", 3: "wild address"}
+"""Meaning of the answers of `launch` in emulated.cpp."""
 
 
 class EmulatedProgram:
@@ -23,7 +30,8 @@ class EmulatedProgram:
     new = False
 
     def __init__(self, library: Path, order: int) -> None:
-        self._launch = ctypes.CDLL(str(library)).launch
+        self.library = ctypes.CDLL(str(library))
+        self._launch = self.library.launch
         self._launch.argtypes = [
             ctypes.c_char_p,
             ctypes.c_uint,
@@ -42,7 +50,7 @@ class EmulatedProgram:
         addresses = (ctypes.c_void_p * len(arguments))(*map(ctypes.addressof, arguments))
         answer = self._launch(kernel.encode(), blocks, shared_bytes, self.order, addresses)
         if answer:
-            raise Unavailable(f"{kernel}: {('', 'barriers differ', 'unknown kernel')[answer]}")
+            raise Unavailable(f"{kernel}: {FAILURES[answer]}")
 
     def forget(self) -> None:
         self.forgotten = True
@@ -51,8 +59,8 @@ class EmulatedProgram:
 class EmulatedDevice:
     """A device without a GPU.
 
-    `change` is applied to the text of the kernels, `threads` and `columns` replace those of the
-    sizes, `flags` go to the compiler.
+    `change` is applied to the text of the kernels, `flags` go to the compiler, `limits` replace
+    those of LIMITS.
     """
 
     def __init__(
@@ -60,27 +68,18 @@ class EmulatedDevice:
         folder: Path,
         *,
         order: int = 0,
-        threads: int = 64,
-        columns: int = 32,
-        change=str,
+        change: Callable[[str], str] = str,
         flags: Sequence[str] = (),
         new: bool = False,
-        limits: DeviceLimits = LIMITS,
+        **limits: Any,
     ) -> None:
-        self.limits, self.order, self.new = limits, order, new
+        self.limits, self.order, self.new = replace(LIMITS, **limits), order, new
         self._folder, self._change, self._flags = folder, change, flags
-        self._sizes = {"threads": threads, "columns": columns}
-        self.programs: list[EmulatedProgram] = []
 
     def load(self, sizes: KernelSizes) -> EmulatedProgram:
-        # The engine must see the replaced sizes as well, and it holds this very object.
-        for name, value in self._sizes.items():
-            object.__setattr__(sizes, name, value)
-        sizes.__dict__.pop("places", None)
         text = self._change(sizes.text())
         program = EmulatedProgram(compiled(text, self._folder, self._flags), self.order)
         program.new = self.new
-        self.programs.append(program)
         return program
 
 
