@@ -237,10 +237,10 @@ class EncodeConfig:
         "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
     )
     device: str = option(
-        "auto",
-        "paper: where to train",
-        choices=("auto", "cpu", "cuda"),
-        profile="paper",
+        "auto", "paper: where to train", choices=("auto", "cpu", "cuda"), profile="paper"
+    )
+    deterministic: bool = option(
+        False, "paper: the same bits in every run on CUDA, too; slower there", profile="paper"
     )
     seed: int = option(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = option(
@@ -293,10 +293,11 @@ class EncodeConfig:
         return self.width or (16 if self.tables == "transform" else 64)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values by field name; `from_dict` gives the same record back."""
+        """JSON values by field name, `deterministic` where it is on; `from_dict` takes them."""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in vars(self).items()
+            if name != "deterministic" or value
         }
 
     @classmethod

@@ -38,7 +38,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Cases": ("all", "case", "group"),
     "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
     "Run": (
-        "seed", "timings", "processes", "explain", "json", "q", "quiet", "v", "verbose", "help",
+        "seed", "timings", "deterministic", "processes", "explain", "json", "q", "quiet", "v",
+        "verbose", "help",
     ),
 }  # fmt: skip
 """Names of options by group, in the order of the help; options that none names come last."""

@@ -39,6 +39,18 @@ class CatchUp(NamedTuple):
     square_decay: Column
 
 
+def corrections(step: int, rate: float) -> tuple[float, float]:
+    """Return the numbers of a step of Adam: the factor of the mean square's root, and the pace.
+
+    A parameter moves by -pace * mean / (factor * root + EPSILON).
+
+    Args:
+        step: number of the step, from 1 on.
+        rate: learning rate.
+    """
+    return 1 / (1 - BETA2**step) ** 0.5, rate / (1 - BETA1**step)
+
+
 def adam_step(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
 ) -> None:
@@ -55,10 +67,37 @@ def adam_step(
         step: number of the step, from 1 on.
         rate: learning rate.
     """
+    correction, pace = corrections(step, rate)
+    _average(gradient, mean, square)
+    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
+
+
+def adam_step_on_device(
+    parameter: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    correction: Tensor,
+    pace: Tensor,
+) -> None:
+    """Do what `adam_step` does, by numbers on the device: a captured graph reads them anew.
+
+    Args:
+        parameter: the numbers to move.
+        gradient: their gradient.
+        mean: mean of the gradients.
+        square: mean of the squared gradients.
+        correction: factor of the root, of no axis (`corrections`).
+        pace: pace, of no axis.
+    """
+    _average(gradient, mean, square)
+    parameter.addcdiv_(mean * pace, square.sqrt().mul_(correction).add_(EPSILON), value=-1.0)
+
+
+def _average(gradient: Tensor, mean: Tensor, square: Tensor) -> None:
+    """Let a gradient into the mean of gradients and the mean of their squares, in place."""
     mean.lerp_(gradient, 1 - BETA1)
     square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    root = square.sqrt().mul_(1 / (1 - BETA2**step) ** 0.5).add_(EPSILON)
-    parameter.addcdiv_(mean, root, value=-rate / (1 - BETA1**step))
 
 
 def catch_up(visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.float64]) -> CatchUp:

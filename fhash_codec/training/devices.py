@@ -1,14 +1,28 @@
-"""torch, which the extra `train` installs, and the choice of the device that it computes on."""
+"""torch, which the extra `train` installs, and the device that it computes on."""
 
 from __future__ import annotations
 
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
 
 if TYPE_CHECKING:
     import torch
+
+# The matrix products of CUDA give the same bits in every run only with workspaces of one kind.
+# torch looks at this variable once, at the first product of the process.
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+
+CUDA_PAYS = 1 << 27
+"""Samples of all epochs from which on `auto` trains on CUDA.
+
+An unmeasured guess: some 2 s to start CUDA against 3e7 to 1e8 samples a second on a CPU.
+"""
 
 
 def has_torch() -> bool:
@@ -42,3 +56,73 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("device is 'cuda', but torch finds no CUDA device here; use --device cpu")
     return torch.device(name)
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's text: CUDA adds advice for programmers to it."""
+    return str(error).strip().split("\n")[0]
+
+
+def training_device(name: str, samples: int, needed_bytes: int) -> torch.device:
+    """Return the torch device for a training; auto is CUDA where that pays and fits.
+
+    Args:
+        name: cpu, cuda or auto.
+        samples: samples that the training takes, those of all epochs.
+        needed_bytes: memory that it needs on a device of its own.
+
+    Raises:
+        InputError: cuda has no device, or one with too little free memory.
+        MissingDependencyError: torch is not installed.
+    """
+    device = choose_device(name)
+    import torch
+
+    if device.type == "cpu" or (name == "auto" and samples < CUDA_PAYS):
+        return torch.device("cpu")
+    free, _ = torch.cuda.mem_get_info(device)
+    if needed_bytes <= free:
+        return device
+    lack = (
+        f"training needs about {needed_bytes / 2**30:.1f} GiB on the CUDA device,"
+        f" of which {free / 2**30:.1f} GiB are free"
+    )
+    if name == "auto":
+        warnings.warn(f"{lack}; it takes the CPU", FhashWarning, stacklevel=2)
+        return torch.device("cpu")
+    raise InputError(f"{lack}; use --device cpu, or a feature or key frames that select less")
+
+
+@contextmanager
+def enough_memory(device: torch.device) -> Iterator[None]:
+    """Raise InputError where the memory of a CUDA device runs out while the context lasts."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise InputError(
+            f"the memory of the device {device} ran out in training ({first_line(error)});"
+            " use --device cpu, which goes on from a checkpoint, too"
+        ) from error
+
+
+@contextmanager
+def same_bits(device: torch.device, wanted: bool) -> Iterator[None]:
+    """Let torch compute the same bits in every run on a CUDA device while the context lasts.
+
+    Sums are then sorted instead of added by atomic operations in any order. An operation that has
+    no such way is a RuntimeError. On a CPU nothing changes.
+    """
+    import torch
+
+    if device.type == "cpu" or not wanted:
+        yield
+        return
+    before = torch.are_deterministic_algorithms_enabled()
+    only_warns = torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=only_warns)

@@ -57,7 +57,7 @@ class Engine(Protocol):
         """Return everything that the next step depends on, as arrays for a checkpoint."""
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Continue from a `state`; KeyError, RuntimeError or ValueError for another model."""
+        """Continue from a `state`; raises KeyError or ValueError for one of another model."""
 
 
 def make_engine(

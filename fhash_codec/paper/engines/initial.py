@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -74,3 +77,19 @@ def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) 
         bound = inputs**-0.5
         layers.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
     return Parameters(fine=fine, coarse=coarse, network=torch.cat(layers))
+
+
+def check_state(
+    state: Mapping[str, npt.NDArray[np.generic]], shapes: Mapping[str, Sequence[int]]
+) -> None:
+    """Raise KeyError or ValueError where a state of a checkpoint is of another model.
+
+    It does so before a device is asked for memory: whatever fails then is not the checkpoint.
+
+    Args:
+        state: arrays by name.
+        shapes: the shape that each array must have.
+    """
+    for name, shape in shapes.items():
+        if state[name].shape != tuple(shape):
+            raise ValueError(f"{name} is {state[name].shape}; the model has {tuple(shape)}")

@@ -16,7 +16,7 @@ from torch import Tensor
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import Parameters, initial_parameters
+from fhash_codec.paper.engines.initial import Parameters, check_state, initial_parameters
 from fhash_codec.paper.fhash import FHash
 from fhash_codec.training.adam import BETA1, BETA2, EPSILON
 
@@ -103,7 +103,10 @@ class NaiveEngine:
 
     @torch.no_grad()
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Continue from a `state`."""
+        """Continue from a `state`; raises KeyError or ValueError for one of another model."""
+        shapes = {name: parameter.shape for name, parameter in self.model.named_parameters()}
+        for ending in ("", ".exp_avg", ".exp_avg_sq"):
+            check_state(state, {name + ending: shape for name, shape in shapes.items()})
         self.step = int(state["step"])
         for name, parameter in self.model.named_parameters():
             parameter.copy_(torch.from_numpy(state[name]))

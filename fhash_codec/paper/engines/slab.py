@@ -3,7 +3,8 @@
 A training sample is a lattice vertex. Its embedding at the finest level is therefore one entry of
 the table, and every coarser level is a separable linear upsampling of a small sub-lattice; no 16
 corners are looked up per sample. The unit of work is a brick of vertices of one key frame, and a
-batch is a random set of bricks. The same code runs on a CPU and on CUDA.
+batch is a random set of bricks. The same code runs on a CPU and on CUDA; there the host never waits
+for a step, sends it one message (sending.py), and launches it as one graph (graphs.py).
 
 The finest embeddings are stored brick by brick, only for bricks that hold coreset vertices. Adam
 visits just the bricks of a batch, yet gives what a dense Adam gives: a brick that was passed over
@@ -24,21 +25,32 @@ from torch import Tensor
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import Parameters, initial_parameters, layer_matrices
+from fhash_codec.paper.engines.graphs import StepGraphs
+from fhash_codec.paper.engines.initial import (
+    Parameters,
+    check_state,
+    initial_parameters,
+    layer_matrices,
+)
+from fhash_codec.paper.engines.sending import Sender, Sent
 from fhash_codec.paper.engines.upsampling import Lattices, Upsampling
-from fhash_codec.training.adam import adam_step, catch_up
+from fhash_codec.training.adam import adam_step, adam_step_on_device, catch_up, corrections
+from fhash_codec.training.positions import true_positions
 
 CHUNK = 1 << 13
-"""Samples that go through the MLP at a time: their activations stay in a core's cache."""
+"""Samples that go through the MLP at a time: their activations stay in a core's cache.
+
+On CUDA all of a batch do: a launch costs more than a pass through the memory.
+"""
 FULL = 0.9
 """Share of samples among the vertices of a batch above which all vertices go through the MLP.
 
 To pick a sample moves a few numbers; the MLP multiplies thousands for it.
 """
 ADAM_PART = 1 << 17
-"""Numbers of the flat vector that Adam moves at a time, so that they stay in the cache."""
-STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "flat_square")
-"""Attributes that a checkpoint stores, by name."""
+"""Numbers of the flat vector that Adam moves at a time on a CPU: they stay in the cache."""
+STATE = ("fine", "fine_mean", "fine_square", "flat", "flat_mean", "flat_square")
+"""Tensors that a checkpoint stores, by name, besides `visited` and the step."""
 FLUSH = 1024
 """Bricks that are brought up to date at a time."""
 
@@ -49,7 +61,8 @@ class SlabEngine:
     Attributes:
         fine: finest embeddings (bricks, E, vertices of a brick); `fine_mean` and `fine_square` are
             their moments of Adam.
-        visited: number of the last training step that used each brick, 0 for none, int64 (bricks,).
+        visited: number of the last training step that used each brick, 0 for none, int64 (bricks,)
+            on the host.
         flat: the used numbers of the coarse tables, followed by the layers of the MLP, in one
             vector; `flat_mean` and `flat_square` are their moments, `gradient` is their gradient.
         coarse: number of the used numbers of the coarse tables.
@@ -75,18 +88,21 @@ class SlabEngine:
         """
         self.architecture, self.coreset = architecture, coreset
         self.rates, self.device = rates, device
-        self.vertices = prod(coreset.brick_shape)
+        self.on_cpu = device.type == "cpu"
+        self.vertices, self.counts = prod(coreset.brick_shape), np.diff(coreset.offsets)
         self.bricks = torch.from_numpy(coreset.bricks.astype(np.int64)).to(device)
         self.mask_bits = torch.from_numpy(coreset.mask_bits).to(device)
         self.values = torch.from_numpy(coreset.values).to(device)
         self.offsets = torch.from_numpy(coreset.offsets).to(device)
+        self._bits = torch.arange(7, -1, -1, device=device, dtype=torch.uint8)
         self._scratch_memory: dict[str, Tensor] = {}
+        self._sender, self._graphs = Sender(device), StepGraphs()
         self.upsampling = Upsampling(architecture, coreset, device)
 
         start = initial_parameters(architecture, coreset, seed)
         self.fine = start.fine.to(device)
         self.fine_mean, self.fine_square = torch.zeros_like(self.fine), torch.zeros_like(self.fine)
-        self.visited = torch.zeros(len(self.bricks), dtype=torch.int64, device=device)
+        self.visited = np.zeros(len(self.bricks), dtype=np.int64)
         self.step = self.settled = 0
         self.coarse = len(self.upsampling.used)
         self.flat = torch.cat(
@@ -101,50 +117,70 @@ class SlabEngine:
     @torch.no_grad()
     def train(self, chosen: Chosen) -> Tensor:
         """Do one training step on a batch; return the sum of squared errors before it."""
-        ids = torch.from_numpy(chosen).to(self.device)
+        samples = int(self.counts[chosen].sum())
         self.step += 1
-        mean, square, fine = self._caught_up(ids, self.step - 1)
-        target, in_coreset = self._targets(ids)
-        lattices = self.upsampling.lattices(self.bricks[ids])
+        sent = self._sender.send(
+            chosen,
+            catch_up(self.visited[chosen], self.step - 1, self.rates),
+            (*corrections(self.step, float(self.rates[self.step])), 2.0 / max(samples, 1)),
+        )
+        if self.on_cpu:
+            error = self._step(sent, samples)
+        else:
+            picked = samples if self._is_sparse(samples, len(chosen)) else None
+            error = self._graphs.run((len(chosen), picked), lambda: self._step(sent, samples))
+        self.visited[chosen] = self.step
+        return error
+
+    def _step(self, sent: Sent, samples: int) -> Tensor:
+        """Do a training step on the device; return the sum of squared errors before it.
+
+        Args:
+            sent: the batch.
+            samples: samples of the batch.
+        """
+        mean, square, fine = self._caught_up(sent)
+        target, in_coreset = self._targets(sent.ids)
+        lattices = self.upsampling.lattices(self.bricks[sent.ids])
         inputs = self._inputs(lattices, fine)
-        scale = 2.0 / max(int(np.diff(self.coreset.offsets)[chosen].sum()), 1)
         self.gradient.zero_()
-        error, input_gradient = self._backpropagate_samples(inputs, target, in_coreset, scale)
+        error, input_gradient = self._backpropagate_samples(
+            inputs, target, in_coreset, samples, sent.scale
+        )
         level_gradients = input_gradient.view(
-            -1, self.architecture.embedding_size, len(ids), *self.coreset.brick_shape
+            -1, self.architecture.embedding_size, len(fine), *self.coreset.brick_shape
         )
         lattices.add_transposed(self.gradient, level_gradients[1:])
 
-        rate = float(self.rates[self.step])
         fine_gradient = level_gradients[0].flatten(2).transpose(0, 1)
-        adam_step(fine, fine_gradient, mean, square, self.step, rate)
-        self._store(ids, mean, square, fine)
-        self.visited[ids] = self.step
-        for first in range(0, len(self.flat), ADAM_PART):
-            part = slice(first, first + ADAM_PART)
-            adam_step(
-                self.flat[part],
-                self.gradient[part],
-                self.flat_mean[part],
-                self.flat_square[part],
-                self.step,
-                rate,
-            )
+        self._move((fine, fine_gradient, mean, square), sent)
+        vectors = (self.flat, self.gradient, self.flat_mean, self.flat_square)
+        for part in self._parts(len(self.flat), ADAM_PART):
+            self._move(tuple(vector[part] for vector in vectors), sent)
+        self._store(sent.ids, mean, square, fine)
         return error
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
         """Return the values (n,) at the samples of some bricks."""
-        ids = torch.from_numpy(chosen).to(self.device)
-        return self._infer(ids, self._in_coreset(ids))
+        sent = self._sent(chosen)
+        fine = self.fine[sent.ids] if self.settled == self.step else self._caught_up(sent)[2]
+        lattices = self.upsampling.lattices(self.bricks[sent.ids])
+        inputs = self._inputs(lattices, fine)
+        in_coreset, count = self._in_coreset(sent.ids).reshape(-1), int(self.counts[chosen].sum())
+        samples = true_positions(in_coreset, count)
+        if not self._is_sparse(count, len(chosen)):
+            return self._value(inputs)[samples]
+        # Only samples go through the MLP where the bricks are sparse.
+        return self._value(self._picked(inputs, samples))
 
     @torch.no_grad()
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
         for first in range(0, len(self.bricks), FLUSH):
-            ids = torch.arange(first, min(first + FLUSH, len(self.bricks)), device=self.device)
-            self._store(ids, *self._caught_up(ids, self.step))
-        self.visited.masked_fill_(self.visited > 0, self.step)
+            sent = self._sent(np.arange(first, min(first + FLUSH, len(self.bricks))))
+            self._store(sent.ids, *self._caught_up(sent))
+        self.visited[self.visited > 0] = self.step
         self.settled = self.step
 
     @torch.no_grad()
@@ -174,13 +210,14 @@ class SlabEngine:
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return parameters, Adam's moments and the step number as arrays."""
-        return {"step": np.array(self.step)} | {
-            name: getattr(self, name).cpu().numpy() for name in STATE
-        }
+        tensors = {name: getattr(self, name).cpu().numpy() for name in STATE}
+        return {"step": np.array(self.step), "visited": self.visited, **tensors}
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Continue from a `state`; raises KeyError or RuntimeError for one of another model."""
+        """Continue from a `state`; raises KeyError or ValueError for one of another model."""
+        check_state(state, {name: getattr(self, name).shape for name in (*STATE, "visited")})
         self.step, self.settled = int(state["step"]), -1
+        self.visited[:] = state["visited"]
         for name in STATE:
             getattr(self, name).copy_(torch.from_numpy(state[name]))
 
@@ -189,15 +226,22 @@ class SlabEngine:
         for array, rows in ((self.fine_mean, mean), (self.fine_square, square), (self.fine, fine)):
             array.index_copy_(0, ids, rows)
 
-    def _caught_up(self, ids: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what a dense Adam has for bricks after a step: mean, square and embeddings."""
-        mean, square, fine = self.fine_mean[ids], self.fine_square[ids], self.fine[ids]
-        factor, epsilon, mean_decay, square_decay = (
-            torch.from_numpy(column).to(self.device)[:, None, None]
-            for column in catch_up(self.visited[ids].cpu().numpy(), step, self.rates)
+    def _sent(self, chosen: Chosen) -> Sent:
+        """Return bricks on the device, with what they missed up to the present step."""
+        return self._sender.send(chosen, catch_up(self.visited[chosen], self.step, self.rates))
+
+    def _caught_up(self, sent: Sent) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what a dense Adam has for bricks that missed steps: mean, square, embeddings."""
+        mean, square, fine = (
+            array[sent.ids] for array in (self.fine_mean, self.fine_square, self.fine)
         )
+        factor, epsilon, mean_decay, square_decay = sent.caught_up.unbind()
         fine.addcdiv_(mean * factor, square.sqrt().add_(epsilon), value=-1.0)
         return mean.mul_(mean_decay), square.mul_(square_decay), fine
+
+    def _is_sparse(self, samples: int, bricks: int) -> bool:
+        """Return whether a batch has so few samples that the MLP takes them alone."""
+        return samples <= FULL * bricks * self.vertices
 
     def _targets(self, ids: Tensor) -> tuple[Tensor, Tensor]:
         """Return the samples of bricks, and the vertices that are samples, (bricks, vertices).
@@ -214,8 +258,7 @@ class SlabEngine:
 
     def _in_coreset(self, ids: Tensor | slice) -> Tensor:
         """Return which vertices (bricks, vertices) are in the coreset, as 0 and 1, uint8."""
-        bits = torch.arange(7, -1, -1, device=self.device, dtype=torch.uint8)
-        return (self.mask_bits[ids].unsqueeze(-1) >> bits & 1).flatten(1)[:, : self.vertices]
+        return (self.mask_bits[ids].unsqueeze(-1) >> self._bits & 1).flatten(1)[:, : self.vertices]
 
     def _inputs(self, lattices: Lattices, fine: Tensor) -> Tensor:
         """Return the inputs of the MLP (levels E + 1, samples) at the vertices of bricks.
@@ -235,19 +278,6 @@ class SlabEngine:
         lattices.interpolate(self.flat, levels[1:])
         return inputs
 
-    def _infer(self, ids: Tensor, in_coreset: Tensor) -> Tensor:
-        """Return the values (n,) at the samples of bricks, given the mask of `_targets`.
-
-        Only samples go through the MLP where the bricks are sparse.
-        """
-        fine = self.fine[ids] if self.settled == self.step else self._caught_up(ids, self.step)[2]
-        lattices = self.upsampling.lattices(self.bricks[ids])
-        inputs = self._inputs(lattices, fine)
-        samples = in_coreset.reshape(-1).nonzero().squeeze(1)
-        if len(samples) > FULL * in_coreset.numel():
-            return self._value(inputs)[samples]
-        return self._value(self._picked(inputs, samples))
-
     def _picked(self, inputs: Tensor, samples: Tensor) -> Tensor:
         """Return the columns of some samples; the next call overwrites them."""
         picked = self._scratch("picked inputs", len(inputs), len(samples))
@@ -257,13 +287,26 @@ class SlabEngine:
     def _value(self, inputs: Tensor) -> Tensor:
         """Return the output of the MLP (samples,)."""
         result = torch.empty(inputs.shape[1], device=self.device)
-        for first in range(0, len(result), CHUNK):
-            activations = self._forward(inputs[:, first : first + CHUNK])
-            result[first : first + CHUNK] = activations[-1][0]
+        for part in self._parts(len(result), CHUNK):
+            result[part] = self._forward(inputs[:, part])[-1][0]
         return result
 
+    def _parts(self, count: int, most: int) -> list[slice]:
+        """Return slices of `count` numbers, each of at most `most` on a CPU; one of all on CUDA."""
+        size = most if self.on_cpu else max(count, 1)
+        return [slice(first, first + size) for first in range(0, count, size)]
+
+    def _move(self, tensors: tuple[Tensor, ...], sent: Sent) -> None:
+        """Do a step of Adam on parameters, their gradient and its moments."""
+        parameter, gradient, mean, square = tensors
+        if self.on_cpu:
+            rate = float(self.rates[self.step])
+            adam_step(parameter, gradient, mean, square, self.step, rate)
+        else:
+            adam_step_on_device(parameter, gradient, mean, square, sent.correction, sent.pace)
+
     def _forward(self, inputs: Tensor) -> list[Tensor]:
-        """Return the activations of each layer for at most CHUNK samples, the inputs first.
+        """Return the activations of each layer for a chunk of samples, the inputs first.
 
         The next call overwrites them.
         """
@@ -281,16 +324,16 @@ class SlabEngine:
         return activations
 
     def _backpropagate_samples(
-        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: float
+        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, count: int, scale: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Do what `_backpropagate` does, through the samples of sparse bricks alone.
+        """Do what `_backpropagate` does, through the `count` samples of sparse bricks alone.
 
         Around a feature most vertices of many bricks are no samples.
         """
-        flat_mask = in_coreset.reshape(-1)
-        samples = flat_mask.nonzero().squeeze(1)
-        if len(samples) > FULL * len(flat_mask):
+        if not self._is_sparse(count, len(in_coreset)):
             return self._backpropagate(inputs, target, in_coreset, scale)
+        flat_mask = in_coreset.reshape(-1)
+        samples = true_positions(flat_mask, count)
         error, gradient = self._backpropagate(
             self._picked(inputs, samples), target.reshape(-1)[samples], flat_mask[samples], scale
         )
@@ -298,7 +341,7 @@ class SlabEngine:
         return error, whole.index_copy_(1, samples, gradient)
 
     def _backpropagate(
-        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: float
+        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the sum of squared errors, and the gradient of scale/2 times it by the inputs.
 
@@ -308,13 +351,12 @@ class SlabEngine:
             inputs: inputs of the MLP (levels E + 1, samples).
             target: normalised values, as many as there are columns, of any shape.
             in_coreset: which of them are samples, of the same shape, 0 or 1.
-            scale: factor of the gradients.
+            scale: factor of the gradients, of no axis.
         """
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
         flat_target, flat_mask = target.reshape(-1), in_coreset.reshape(-1)
-        for first in range(0, inputs.shape[1], CHUNK):
-            part = slice(first, first + CHUNK)
+        for part in self._parts(inputs.shape[1], CHUNK):
             activations = self._forward(inputs[:, part])
             residual = (activations[-1][0] - flat_target[part]).mul_(flat_mask[part])
             error += residual.square().sum(dtype=torch.float64)
@@ -334,10 +376,13 @@ class SlabEngine:
         return error, gradient
 
     def _scratch(self, name: str, rows: int, columns: int) -> Tensor:
-        """Return an uninitialised matrix in the same memory at every call with a name.
+        """Return an uninitialised matrix, on a CPU in the same memory at every call with a name.
 
-        Fresh pages would cost more than the arithmetic on them.
+        Fresh pages would cost more than the arithmetic on them. On CUDA torch keeps freed memory
+        itself, and a captured graph must not refer to memory that a larger batch replaces.
         """
+        if not self.on_cpu:
+            return torch.empty(rows, columns, device=self.device)
         memory = self._scratch_memory.get(name)
         if memory is None or len(memory) < rows * columns:
             memory = self._scratch_memory[name] = torch.empty(rows * columns, device=self.device)

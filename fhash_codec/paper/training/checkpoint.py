@@ -1,6 +1,8 @@
 """Checkpoints: interrupted trainings on disk, beside their output.
 
-A checkpoint is named after the data and the settings, so that only the same command continues it.
+A checkpoint is named after the data and the settings, so that only the same command continues it,
+on the same device or another one: a state is the same arrays on all of them. On another device the
+training goes on with another rounding.
 """
 
 from __future__ import annotations
@@ -28,8 +30,8 @@ MAX_NAME_BYTES = 250
 """Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
 PARTIAL_BYTES = 24
 """Bytes that a temporary name adds while the checkpoint is written."""
-UNRELATED = ("psnr", "tables", "timings", "train_on_seconds", "without")
-"""Settings that do not change the course of a training, but at most where it ends."""
+UNRELATED = ("device", "psnr", "tables", "timings", "train_on_seconds", "without")
+"""Settings that do not change the course of a training, but at most its rounding and its end."""
 
 
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:

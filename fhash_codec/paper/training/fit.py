@@ -17,7 +17,7 @@ from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.training.rounds import Goal, Round, decide, extended
 from fhash_codec.progress import Progress, silent
 from fhash_codec.stage_clock import stage
-from fhash_codec.training.devices import choose_device
+from fhash_codec.training.devices import enough_memory, same_bits, training_device
 from fhash_formats.errors import (
     FhashWarning,
     InputError,
@@ -97,7 +97,8 @@ def train_model(
     Raises:
         TrainingError: no learning rate gives a model.
         InterruptedEncodingError: a signal asked for the end; a checkpoint was saved.
-        InputError: the checkpoint cannot be read, or the device or the engine is not available.
+        InputError: the checkpoint cannot be read, or the device or the engine is not available,
+            or the memory of the device is not enough.
     """
     with stage("engine", "tables and network at their random start"):
         from fhash_codec.paper.training.probe import Diverged
@@ -131,7 +132,7 @@ class _Fitting:
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress, self._goal = progress, goal
         self._limited = False
-        self._device: torch.device = choose_device(config.device)
+        self._device = self._choose_device()
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
         self._saved_state = saved[0] if saved else None
@@ -139,6 +140,12 @@ class _Fitting:
 
     def run(self) -> TrainedModel:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
+        # With --no-timings the same input gives the same file, on CUDA, too.
+        wanted = self._config.deterministic or not self._config.timings
+        with enough_memory(self._device), same_bits(self._device, wanted):
+            return self._run()
+
+    def _run(self) -> TrainedModel:
         from fhash_codec.training.threads import threads_for
 
         with stage("engine", "tables and network at their random start"):
@@ -245,6 +252,19 @@ class _Fitting:
             plan = extended(plan, int(earlier["epochs"]), self._config.schedule)
         return plan
 
+    def _choose_device(self) -> torch.device:
+        """Return the device, by the plan without further rounds: the same at each continuation."""
+        from fhash_codec.paper.engines.memory import needed_bytes
+        from fhash_codec.paper.training.train import usual_batches, usual_epochs
+
+        samples, bricks = len(self._coreset.values), len(self._coreset.bricks)
+        batches = usual_batches(samples, bricks, self._config.batch)
+        return training_device(
+            self._config.device,
+            samples * (self._config.epochs or usual_epochs(batches)),
+            needed_bytes(self._architecture, self._coreset, batches),
+        )
+
     def _engine(self, plan: TrainingPlan) -> Engine:
         """Return a new engine, in the state of the checkpoint if there is one."""
         from fhash_codec.paper.engines import make_engine
@@ -260,7 +280,7 @@ class _Fitting:
         if self._saved_state is not None:
             try:
                 engine.restore(self._saved_state)
-            except (KeyError, RuntimeError, ValueError) as error:
+            except (KeyError, ValueError) as error:
                 raise InputError(
                     f"checkpoint {self._checkpoint} does not fit; delete it to train from the start"
                 ) from error
