@@ -9,7 +9,7 @@ order differs from run to run.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from fhash_codec.paper.engines.fused.source import (
     kernel_sizes,
 )
 from fhash_codec.paper.engines.slab import SlabEngine
-from fhash_codec.training.adam import BETA1, BETA2
+from fhash_codec.training.adam import corrections
 
 TRIAL_BRICKS = 4
 """Bricks of the trial of newly compiled kernels."""
@@ -86,7 +86,7 @@ class ModelRecord(ctypes.Structure):
 class RateRecord(ctypes.Structure):
     """The record `Rate` of kernels/model.cuh."""
 
-    _fields_ = (("rate", ctypes.c_float), ("root", ctypes.c_float))
+    _fields_ = (("root", ctypes.c_float), ("pace", ctypes.c_float))
 
 
 class FusedEngine(SlabEngine):
@@ -119,6 +119,8 @@ class FusedEngine(SlabEngine):
             for axis in axes
         ]
         self._missed = [torch.from_numpy(table).to(device) for table in missed_step_tables(rates)]
+        # The kernels read on the device what slab keeps on the host.
+        self._visited = torch.from_numpy(self.visited).to(device, copy=True)
         limits = kernels.limits
         # The driver keeps a kilobyte of each block's shared memory.
         resident = limits.shared_per_multiprocessor // (self._sizes.shared_bytes + 1024)
@@ -133,11 +135,8 @@ class FusedEngine(SlabEngine):
         """Do one training step on a batch; return the sum of squared errors before it."""
         ids = self._transferred(chosen)
         self.step += 1
-        scale = 2.0 / max(int(np.diff(self.coreset.offsets)[chosen].sum()), 1)
-        rate = RateRecord(
-            float(self.rates[self.step]) / (1 - BETA1**self.step),
-            1 / (1 - BETA2**self.step) ** 0.5,
-        )
+        scale = 2.0 / max(int(self.counts[chosen].sum()), 1)
+        rate = RateRecord(*corrections(self.step, float(self.rates[self.step])))
         # A batch of few bricks is cut into parts, so that all multiprocessors have work.
         parts = max(1, min(self._slots // len(chosen), self._sizes.tiles))
         items = len(chosen) * parts
@@ -182,12 +181,13 @@ class FusedEngine(SlabEngine):
                 ctypes.c_int(blocks),
             ],
         )
+        self.visited[chosen] = self.step
         return self._errors[:blocks].sum()
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
         """Return the values (n,) at the samples of some bricks."""
-        ends = np.cumsum(np.diff(self.coreset.offsets)[chosen])
+        ends = np.cumsum(self.counts[chosen])
         values = torch.empty(int(ends[-1]) if len(ends) else 0, device=self.device)
         ids, first = self._transferred(np.stack([chosen, np.concatenate([[0], ends[:-1]])]))
         if len(values):
@@ -221,7 +221,13 @@ class FusedEngine(SlabEngine):
                 ctypes.c_longlong(self.step),
             ],
         )
+        self.visited[self.visited > 0] = self.step
         self.settled = self.step
+
+    def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
+        """Continue from a `state`; raises KeyError or ValueError for one of another model."""
+        super().restore(state)
+        self._visited.copy_(torch.from_numpy(self.visited))
 
     def _add_in_order(self, model: ModelRecord, places: Tensor, entries: Tensor) -> None:
         """Add coarse gradients, of each number in the order of the bricks.
@@ -274,18 +280,19 @@ class FusedEngine(SlabEngine):
         for tensor in (
             self.fine_mean[: len(fine)],
             self.fine_square[: len(fine)],
-            self.visited,
+            self._visited,
             self.flat_mean,
             self.flat_square,
             self.gradient,
         ):
             tensor.zero_()
+        self.visited[:] = 0
         self.step = self.settled = 0
 
     def _transferred(self, numbers: npt.NDArray[np.int64]) -> Tensor:
         """Return numbers on the device, without waiting for it."""
         tensor = torch.from_numpy(np.ascontiguousarray(numbers))
-        if self.device.type == "cpu":
+        if self.on_cpu:
             return tensor
         return tensor.pin_memory().to(self.device, non_blocking=True)
 
@@ -304,8 +311,9 @@ class FusedEngine(SlabEngine):
             "powers": self._missed[0],
             "weights": self._missed[1],
             **{name: getattr(self, name) for name in ("fine", "fine_mean", "fine_square")},
-            **{name: getattr(self, name) for name in ("visited", "flat", "flat_mean")},
-            **{name: getattr(self, name) for name in ("flat_square", "gradient")},
+            "visited": self._visited,
+            **{name: getattr(self, name) for name in ("flat", "flat_mean", "flat_square")},
+            "gradient": self.gradient,
         }
         return ModelRecord(
             start=start,

@@ -55,18 +55,18 @@ struct Model {
     int steps;                        // length of `weights`
 };
 
-// Adam's numbers of one step: the rate over the correction of the mean, and the root of the
-// correction of the square, inverted.
+// Adam's numbers of one step, `corrections` in training/adam.py: the factor of the mean square's
+// root, and the pace.
 struct Rate {
-    float rate;
     float root;
+    float pace;
 };
 
 __device__ inline void adam(
     float& number, float gradient, float& mean, float& square, const Rate& rate) {
     mean += REST1 * (gradient - mean);
     square = BETA2 * square + REST2 * gradient * gradient;
-    number -= rate.rate * mean / (sqrtf(square) * rate.root + EPSILON);
+    number -= rate.pace * mean / (sqrtf(square) * rate.root + EPSILON);
 }
 
 // The sum of a number of each thread, for all of them. `scratch` holds THREADS + 16 numbers; after
