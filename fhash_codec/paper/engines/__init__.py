@@ -72,7 +72,7 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: slab, naive, or auto for the fastest.
+        name: fused, slab, naive, or auto for the fastest that can be had on the device.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
@@ -80,8 +80,16 @@ def make_engine(
         device: where the engine computes.
 
     Raises:
-        InputError: the name is unknown.
+        InputError: the name is unknown, or the engine cannot be had on the device.
     """
+    if name in ("auto", "fused") and (name == "fused" or device.type == "cuda"):
+        from fhash_codec.paper.engines.fused.start import start_fused
+
+        fused = start_fused(
+            architecture, coreset, rates, seed=seed, device=device, required=name == "fused"
+        )
+        if fused is not None:
+            return fused
     if name in ("auto", "slab"):
         from fhash_codec.paper.engines.slab import SlabEngine
 
@@ -90,4 +98,4 @@ def make_engine(
         from fhash_codec.paper.engines.naive import NaiveEngine
 
         return NaiveEngine(architecture, coreset, rates, seed=seed, device=device)
-    raise InputError(f"unknown engine '{name}'; known: auto, slab, naive")
+    raise InputError(f"unknown engine '{name}'; known: auto, fused, slab, naive")
