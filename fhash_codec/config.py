@@ -18,7 +18,7 @@ from fhash_formats.support.suggestions import suggestion
 TABLE_TYPES = ("float32", "float16", "uint8", "transform")
 """Storage of the paper profile's tables: a number type, or the transform codec."""
 
-ENGINES = ("slab", "naive")
+ENGINES = ("fused", "slab", "naive")
 """Training engines of the paper profile."""
 
 FRINGES = ("trained", "untrained")

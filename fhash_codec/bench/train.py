@@ -17,11 +17,11 @@ import torch
 
 from fhash_codec.bench.decode import bench_decode
 from fhash_codec.bench.machine import machine
-from fhash_codec.config import ENGINES, EncodeConfig
+from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.engines import engines_on, make_engine
 from fhash_codec.paper.selection import select
 from fhash_codec.paper.training.probe import Probe
 from fhash_codec.paper.training.train import TrainingPlan, plan_training
@@ -50,7 +50,7 @@ def bench_train(
     source: Source | None = None,
     config: EncodeConfig | None = None,
     *,
-    engines: Sequence[str] = ENGINES,
+    engines: Sequence[str] | None = None,
     seconds: float = 12.0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def bench_train(
     Args:
         source: the series; None for a made one, a blast's shell.
         config: the settings; the made series has a feature of its own where they name none.
-        engines: names of the engines.
+        engines: names of the engines; None for all that the device has.
         seconds: training of each engine.
         progress: called with each step of the work.
 
@@ -83,12 +83,13 @@ def bench_train(
         InputError: an engine is unknown, or the seconds are not positive.
     """
     config = config or EncodeConfig(profile="paper")
+    device = choose_device(config.device)
+    engines = engines_on(device) if engines is None else engines
     if seconds <= 0 or not engines:
         raise InputError(
             f"seconds is {seconds:g} for {len(engines)} engines;"
             " a positive time and at least one engine are needed"
         )
-    device = choose_device(config.device)
     if source is None:
         scene = simulate(MADE, MADE_SHAPE)
         source = scene

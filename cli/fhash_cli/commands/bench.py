@@ -66,7 +66,7 @@ command.add_command(rate_table)
 @command.command("train", short_help="training and inference speed of each engine")
 @click.argument("data", type=click.Path(), required=False)
 @series_options
-@click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
+@click.option("--engines", type=EnginesType(), help="Which to measure. Default: all of the device.")
 @click.option(
     "--seconds",
     type=RealRange(0.1, 3600),
@@ -105,7 +105,6 @@ def train(
     Without DATA: a made series, a blast's shell as a feature, and whole. "of peak" is the
     arithmetic of the network over the rate of a large matrix product, measured in the same run.
     """
-    from fhash_codec.config import ENGINES
     from fhash_codec.training.devices import need_torch
 
     need_torch("bench train")
@@ -115,9 +114,7 @@ def train(
         from fhash_codec.bench.train import bench_train
 
         series = None if data is None else stack.enter_context(source.open(data, progress))
-        result = bench_train(
-            series, config, engines=engines or ENGINES, seconds=seconds, progress=progress
-        )
+        result = bench_train(series, config, engines=engines, seconds=seconds, progress=progress)
     emit(result, _text(result), as_json)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.config import ENGINES
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,6 +61,11 @@ class Engine(Protocol):
         """Continue from a `state`; raises KeyError or ValueError for one of another model."""
 
 
+def engines_on(device: torch.device) -> tuple[str, ...]:
+    """Return the names of the engines that a device may have, the fastest first."""
+    return tuple(name for name in ENGINES if name != "fused" or device.type == "cuda")
+
+
 def make_engine(
     name: str,
     architecture: Architecture,
@@ -98,4 +104,4 @@ def make_engine(
         from fhash_codec.paper.engines.naive import NaiveEngine
 
         return NaiveEngine(architecture, coreset, rates, seed=seed, device=device)
-    raise InputError(f"unknown engine '{name}'; known: auto, fused, slab, naive")
+    raise InputError(f"unknown engine '{name}'; known: auto, {', '.join(ENGINES)}")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.engines import engines_on, make_engine
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")
@@ -18,6 +18,16 @@ def test_unknown_engines_are_refused(noise_coreset) -> None:
     with pytest.raises(InputError, match="unknown engine 'quick'"):
         make_engine(
             "quick", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
+        )
+
+
+def test_a_processor_has_all_engines_but_the_fused_one(noise_coreset) -> None:
+    assert engines_on(CPU) == ("slab", "naive")
+    assert engines_on(torch.device("cuda")) == ("fused", "slab", "naive")
+    architecture = Architecture.for_box((2, 2, 2), 1)
+    with pytest.raises(InputError, match="'fused', which needs a CUDA device"):
+        make_engine(
+            "fused", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
         )
 
 
