@@ -86,7 +86,7 @@ class Canvas:
         )
         if self.task.depth or self.task.normal:
             behind = after < 0.5
-            new = xp.isinf(self.depth[alive]) & xp.any(behind, axis=1)
+            (new,) = arrays.nonzero(xp.isinf(self.depth[alive]) & xp.any(behind, axis=1))
             event = xp.argmax(arrays.to_int64(behind[new]), axis=1)
             self.see(alive[new], arrays.take_along(events.at[new], event[:, None], 1)[:, 0])
 
@@ -123,18 +123,16 @@ class Canvas:
     def _colours(self, rays: Array, events: Events, row: Array, column: Array) -> Array:
         """Lit colours (n, 3) of events (row, column) of rays (n,)."""
         arrays, which = self.arrays, events.which[row, column]
-        of_volume = which == len(self._surfaces)
         colours = self._unlit(events, row, column, which)
-        is_lit = arrays.xp.ones_like(of_volume) if self.task.shaded else ~of_volume
-        (lit,) = arrays.nonzero(is_lit)
-        if self._light is None and not len(lit):
+        lit = self._lit(which)
+        if self._light is None and lit is None:
             return colours
         places = self.beams.places(rays, events.at[row, column])
         lamp, around = (
             (arrays.full(len(rays), 1.0),) * 2 if self._light is None else self._light(places)
         )
         result = colours * (lamp * around)[:, None]
-        if len(lit):
+        if lit is not None:
             assert self._phong is not None
             slopes = self._slopes(self._phong, places[lit])
             result[lit] = self._phong(
@@ -142,17 +140,29 @@ class Canvas:
             )
         return result
 
+    def _lit(self, which: Array) -> Array | None:
+        """Index of the events that are lit by their gradient; None where none is."""
+        if self.task.shaded:
+            return slice(None)
+        if not self._surfaces:
+            return None
+        (lit,) = self.arrays.nonzero(which < len(self._surfaces))
+        return lit if len(lit) else None
+
     def _unlit(self, events: Events, row: Array, column: Array, which: Array) -> Array:
         """Colours (n, 3) of events without light."""
-        surfaces = len(self._surfaces)
-        colours = self.arrays.full((len(row), 3), 0.0)
-        of_volume = which == surfaces
+        arrays, surfaces = self.arrays, len(self._surfaces)
+        if self.palette is not None and not surfaces:
+            return self.palette.colour(events.values[row, column])
+        colours = arrays.full((len(row), 3), 0.0)
         if self.palette is not None:
-            colours[of_volume] = self.palette.colour(
-                events.values[row[of_volume], column[of_volume] // (surfaces + 1)]
-            )
+            of_volume = which == surfaces
+            some = arrays.candidates(of_volume)
+            values = events.values[row[some], column[some] // (surfaces + 1)]
+            values = arrays.kept(of_volume, values, self.palette.low)
+            colours[some] = self.palette.colour(values)
         for number, colour in enumerate(self._surfaces):
-            colours[which == number] = colour
+            colours = arrays.xp.where((which == number)[:, None], colour, colours)
         return colours
 
     def _slopes(self, phong: Phong, places: Array) -> Array:

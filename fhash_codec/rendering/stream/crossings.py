@@ -40,7 +40,7 @@ class Crossings:
 
 
 def crossings(
-    values: Callable[[Array, Array], Array],
+    values: Callable[[Array, Array, Array], Array],
     at: Array,
     steps: Array,
     surfaces: Sequence[Surface],
@@ -48,7 +48,8 @@ def crossings(
 ) -> Crossings:
     """The crossings of a pass.
 
-    values: function of rows (n,) of the pass and places (n,) in samples; values (n,) there.
+    values: function of rows (n,) of the pass, places (n,) in samples, and which of them count, bool
+        (n,); values (n,) there.
     at: (rays, 1 + samples), places of the samples and, first, of the one before the pass.
     steps: (rays, 1 + samples), the values there, NaN where there is none.
     """
@@ -57,28 +58,29 @@ def crossings(
     places, opacity = arrays.full(shape, np.inf), arrays.full(shape, 0.0)
     before, after = steps[:, :-1], steps[:, 1:]
     both = ~xp.isnan(before) & ~xp.isnan(after)
-    for number, surface in enumerate(surfaces):
-        row, column = arrays.nonzero(both & ((before < surface.value) != (after < surface.value)))
-        if not len(row):
-            continue
+    crossed = [both & ((before < each.value) != (after < each.value)) for each in surfaces]
+    row, column, number = arrays.nonzero(xp.stack(crossed, axis=2))
+    if len(row):
+        level, share = (arrays.full(len(row), 0.0) for _ in range(2))
+        for count, surface in enumerate(surfaces):
+            level = xp.where(number == count, surface.value, level)
+            share = xp.where(number == count, surface.opacity, share)
 
-        def above(
-            chosen: Array, place: Array, row: Array = row, value: float = surface.value
-        ) -> Array:
-            return values(row[chosen], place) - value
+        def above(chosen: Array, place: Array, counted: Array) -> Array:
+            return values(row[chosen], place, counted) - level[chosen]
 
-        ends = before[row, column] - surface.value, after[row, column] - surface.value
+        ends = before[row, column] - level, after[row, column] - level
         root = _roots(above, at[row, column], at[row, column + 1], *ends, arrays)
         exists = xp.isfinite(root)
-        places[row[exists], column[exists], number] = root[exists]
-        opacity[row[exists], column[exists], number] = surface.opacity
+        places[row, column, number] = xp.where(exists, root, np.inf)
+        opacity[row, column, number] = xp.where(exists, share, 0.0)
     which = xp.argsort(places, axis=2, stable=True)
     places, opacity = (arrays.take_along(array, which, 2) for array in (places, opacity))
     return Crossings(at=xp.where(xp.isfinite(places), places, 0.0), opacity=opacity, which=which)
 
 
 def _roots(
-    function: Callable[[Array, Array], Array],
+    function: Callable[[Array, Array, Array], Array],
     near: Array,
     far: Array,
     at_near: Array,
@@ -87,7 +89,8 @@ def _roots(
 ) -> Array:
     """Roots of a function between places, where its values have two signs.
 
-    function: values (m,) for numbers (m,) of the roots searched for and places (m,).
+    function: values (m,) for numbers (m,) of the roots searched for, places (m,), and which of them
+        are searched for still, bool (m,).
     near, far: places (n,) around the roots. at_near, at_far: values (n,) there.
     The result is NaN where the search met a place without a value.
     """
@@ -95,25 +98,31 @@ def _roots(
     near, far, at_near, at_far = (arrays.copy(array) for array in (near, far, at_near, at_far))
     root = xp.where(at_far == 0, far, near)
     (going,) = arrays.nonzero((at_near != 0) & (at_far != 0))
-    for _ in range(MAX_TURNS):
+    for _ in range(0, MAX_TURNS, arrays.turns):
         if not len(going):
             break
-        place = far[going] - at_far[going] * (far[going] - near[going]) / (
-            at_far[going] - at_near[going]
-        )
-        value = function(going, place)
-        root[going] = xp.where(xp.isnan(value), np.nan, place)
-        same = (value < 0) == (at_far[going] < 0)
-        moved = xp.abs(place - far[going])
-        # The end that stays twice has its value halved, so that the other one moves, too.
-        at_near[going] = xp.where(same, at_near[going] / 2, at_far[going])
-        near[going] = xp.where(same, near[going], far[going])
-        far[going], at_far[going] = place, value
-        unfinished = (
-            (moved > CLOSE)
-            & (xp.abs(far[going] - near[going]) > CLOSE)
-            & (value != 0)
-            & ~xp.isnan(value)
-        )
-        going = going[unfinished]
+        active = going >= 0
+        for _ in range(arrays.turns):
+            place = far[going] - at_far[going] * (far[going] - near[going]) / (
+                at_far[going] - at_near[going]
+            )
+            place = arrays.kept(active, place, far[going])
+            value = function(going, place, active)
+            root[going] = arrays.kept(active, xp.where(xp.isnan(value), np.nan, place), root[going])
+            same = (value < 0) == (at_far[going] < 0)
+            moved = xp.abs(place - far[going])
+            # The end that stays twice has its value halved, so that the other one moves, too.
+            halved = xp.where(same, at_near[going] / 2, at_far[going])
+            at_near[going] = arrays.kept(active, halved, at_near[going])
+            near[going] = arrays.kept(active, xp.where(same, near[going], far[going]), near[going])
+            far[going] = place
+            at_far[going] = arrays.kept(active, value, at_far[going])
+            active = (
+                active
+                & (moved > CLOSE)
+                & (xp.abs(far[going] - near[going]) > CLOSE)
+                & (value != 0)
+                & ~xp.isnan(value)
+            )
+        going = going[arrays.nonzero(active)]
     return root

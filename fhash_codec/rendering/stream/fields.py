@@ -69,8 +69,12 @@ class Field(Protocol):
         """
         ...
 
-    def values(self, places: Array) -> Array:
-        """Values, float64 (n,), NaN where there is none."""
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
+        """Values, float64 (n,), NaN where there is none, and where none is wanted.
+
+        wanted: bool (n,). A device may wait in order to compute no others; without it a device
+            computes all and does not wait.
+        """
         ...
 
     def slopes(self, places: Array) -> Array:
@@ -144,12 +148,13 @@ class FrameField:
             visible.append(palette.visible(low, high))
         return xp.concatenate(visible)
 
-    def values(self, places: Array) -> Array:
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
         result = self.arrays.empty((len(places),))
         for start in range(0, len(places), self.arrays.batch):
-            inside, low, share = self._located(
-                places[start : start + self.arrays.batch], self._last
-            )
+            part = slice(start, start + self.arrays.batch)
+            inside, low, share = self._located(places[part], self._last)
+            if wanted is not None:
+                inside &= wanted[part]
             # The corner after a place counts only where it has weight: a missing vertex beyond a
             # place on a vertex does not matter.
             jumps = [
@@ -279,21 +284,27 @@ class NetworkField:
         """Cells with a vertex of the coreset: their values are not known before evaluation."""
         return _of_cells(self._in_coreset, self.arrays.xp.logical_or)
 
-    def values(self, places: Array) -> Array:
-        at, inside = self._inside(places)
-        result = self.arrays.full(len(places), np.nan)
-        if len(at := at[inside]):
-            unit = self.arrays.xp.clip(self.arrays.to_float64(self._inference.values(at)), 0.0, 1.0)
-            result[inside] = self._low + unit * (self._high - self._low)
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
+        arrays, (at, inside) = self.arrays, self._inside(places)
+        result = arrays.full(len(places), np.nan)
+        if wanted is None:
+            some = arrays.candidates(inside)
+        else:
+            (some,) = arrays.nonzero(inside & wanted)
+        if len(at := at[some]):
+            unit = arrays.xp.clip(arrays.to_float64(self._inference.values(at)), 0.0, 1.0)
+            values = self._low + unit * (self._high - self._low)
+            result[some] = arrays.kept(inside[some], values, np.nan)
         return result
 
     def slopes(self, places: Array) -> Array:
         """Derivatives as `Field` has them, analytic, through interpolation and network."""
-        at, inside = self._inside(places)
-        result = self.arrays.full((len(places), 3), 0.0)
-        if len(at := at[inside]):
-            slopes = self.arrays.to_float64(self._inference.slopes(at)) * (self._high - self._low)
-            result[inside] = self.arrays.xp.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
+        arrays, (at, inside) = self.arrays, self._inside(places)
+        result, some = arrays.full((len(places), 3), 0.0), arrays.candidates(inside)
+        if len(at := at[some]):
+            slopes = arrays.to_float64(self._inference.slopes(at)) * (self._high - self._low)
+            slopes = arrays.xp.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
+            result[some] = arrays.kept(inside[some], slopes, 0.0)
         return result
 
     def _inside(self, places: Array) -> tuple[Array, Array]:

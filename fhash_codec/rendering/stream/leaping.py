@@ -52,41 +52,60 @@ class Leaping:
         """Whether places (..., 3) lie in bricks that matter."""
         return self.distance[self._bricks(places)[1]] == 0
 
-    def leap(self, origin: Array, pace: Array, sample: Array, end: Array) -> tuple[Array, int]:
+    def leap(
+        self, origin: Array, pace: Array, sample: Array, end: Array, going: Array
+    ) -> tuple[Array, Array | int]:
         """The next sample (n,) of each ray, from `sample` on, in a brick that matters, or `end`.
 
         Also returns the number of leaps that it took.
 
         origin: places (n, 3) of the samples 0. pace: (n, 3), from one sample to the next.
+        going: bool (n,), rays that leap, all of those that the host picked; others stay.
+        """
+        arrays, xp = self.arrays, self.arrays.xp
+        sample = arrays.copy(sample)
+        pending = arrays.range(len(sample))
+        leaps: Array | int = 0
+        while len(pending):
+            for _ in range(arrays.turns):
+                brick, index = self._bricks(
+                    origin[pending] + sample[pending][:, None] * pace[pending]
+                )
+                away = self.distance[index]
+                leaping = (away > 0) & going
+                some = arrays.candidates(leaping)
+                pending, brick, away = pending[some], brick[some], away[some][:, None]
+                going = leaping[some]
+                onward = xp.maximum(
+                    self._beyond(origin[pending], pace[pending], brick, away), sample[pending] + 1
+                )
+                sample[pending] = arrays.kept(
+                    going, xp.minimum(onward, end[pending]), sample[pending]
+                )
+                leaps += xp.count_nonzero(going)
+                going = going & (sample[pending] < end[pending])
+            (left,) = arrays.nonzero(going)
+            pending, going = pending[left], going[left]
+        return sample, leaps
+
+    def _beyond(self, start: Array, step: Array, brick: Array, away: Array) -> Array:
+        """The first sample (n,) of each ray beyond the cube of bricks in which none matters.
+
+        start: places (n, 3) of the samples 0. step: (n, 3), from one sample to the next.
+        brick: numbers (n, 3) of the bricks in the middle of the cubes.
+        away: (n, 1), distances of these bricks to the nearest that matters.
         """
         xp = self.arrays.xp
-        sample = self.arrays.copy(sample)
-        pending = self.arrays.range(len(sample))
-        leaps = 0
-        while len(pending):
-            brick, index = self._bricks(origin[pending] + sample[pending][:, None] * pace[pending])
-            away = self.distance[index]
-            invisible = away > 0
-            pending, brick, away = pending[invisible], brick[invisible], away[invisible][:, None]
-            start, step = origin[pending], pace[pending]
-            # The faces towards which the ray goes of the cube of bricks around this one in which
-            # none matters.
-            face = (
-                self.arrays.to_float64(xp.where(step > 0, brick + away, brick - away + 1))
-                * self.side
-                + self.first
+        # The faces of the cube towards which the ray goes.
+        face = (
+            self.arrays.to_float64(xp.where(step > 0, brick + away, brick - away + 1)) * self.side
+            + self.first
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = xp.clip(
+                xp.amin(xp.where(step == 0, np.inf, (face - start) / step), axis=1), None, ENDLESS
             )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                reach = xp.clip(
-                    xp.amin(xp.where(step == 0, np.inf, (face - start) / step), axis=1),
-                    None,
-                    ENDLESS,
-                )
-            onward = xp.maximum(self.arrays.to_int64(xp.floor(reach)) + 1, sample[pending] + 1)
-            sample[pending] = xp.minimum(onward, end[pending])
-            leaps += len(pending)
-            pending = pending[sample[pending] < end[pending]]
-        return sample, leaps
+        return self.arrays.to_int64(xp.floor(reach)) + 1
 
     def _bricks(self, places: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         """Numbers (..., 3), x, y, z, of the bricks at places, and their index (z, y, x)."""

@@ -87,5 +87,7 @@ class Projection:
             rank = xp.where(known, sign * values, -np.inf)
         best = xp.argmax(rank, axis=1)[:, None]
         rank, place = (arrays.take_along(array, best, 1)[:, 0] for array in (rank, place))
-        better = rank > self._best[alive]
-        self._best[alive[better]], self.at[alive[better]] = rank[better], place[better]
+        best_before, at_before = self._best[alive], self.at[alive]
+        better = rank > best_before
+        self._best[alive] = xp.where(better, rank, best_before)
+        self.at[alive] = xp.where(better, place, at_before)

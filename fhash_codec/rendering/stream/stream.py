@@ -9,7 +9,8 @@ computed without the other samples of the pass (inference.py). On a device a net
 by the rounding of matrix products, and the picture with them.
 
 A pass is computed where the field has its values: by numpy on the host, or by torch on a device.
-From a device only counts come back before the picture is finished.
+From a device only counts come back before the picture is finished. The host waits for a few of them
+in each pass: those that the size of further arrays depends on.
 """
 
 from __future__ import annotations
@@ -151,44 +152,53 @@ class _Marcher:
         (alive,) = self.arrays.nonzero(self.next < self.end)
         total = max(len(alive), 1)
         while len(alive):
-            alive = self._leapt(alive)
-            if len(alive):
-                pace = int(min(max(budget // len(alive), 1), MAX_SAMPLES)) if adaptive else 1
-                self._pass(
-                    alive,
-                    min(pace, int((self.end[alive] - self.next[alive]).max())) if pace > 1 else 1,
-                )
-            alive = alive[
-                (self.next[alive] < self.end[alive])
-                & (self.canvas.clear[alive] >= self.task.threshold)
-            ]
-            if self.projection is not None:
-                alive = alive[~self.projection.finished(alive)]
-            report(total - len(alive), total)
+            self._leap(alive)
+            left = self.end[alive] - self.next[alive]
+            count, longest = self.arrays.counts(self.arrays.xp.count_nonzero(left > 0), left.max())
+            alive = alive[self.arrays.chosen(left > 0, count)]
+            if count:
+                pace = int(min(max(budget // count, 1), MAX_SAMPLES)) if adaptive else 1
+                self._pass(alive, min(pace, longest))
+                self._end_finished(alive)
+            report(total - count, total)
         if self.projection is not None:
             self.canvas.show_values(self.projection.values, self.projection.at)
 
-    def _leapt(self, alive: Array) -> Array:
-        """Move rays on to their next sample in a brick that matters; the rays that have one."""
+    def _end_finished(self, alive: Array) -> None:
+        """Let rays end that no light comes through, or whose projection no sample can change."""
+        finished = self.canvas.clear[alive] < self.task.threshold
+        if self.projection is not None:
+            finished = finished | self.projection.finished(alive)
+        self.next[alive] = self.arrays.xp.where(finished, self.end[alive], self.next[alive])
+
+    def _leap(self, alive: Array) -> None:
+        """Move rays on to their next sample in a brick that matters, or to their end."""
         if not self.skipping:
-            return alive
-        leapers = alive
+            return
+        arrays, xp = self.arrays, self.arrays.xp
+        going = self.next[alive] < self.end[alive]
         if self.task.surfaces:
             # A surface may lie between the last sample inside a brick and the first one outside it.
-            near = ~self.arrays.xp.isnan(self.from_[alive])
-            near[self.arrays.nonzero(near)] = self.leaping.matters(
-                self.beams.places(alive[near], self.from_[alive[near]])
-            )
-            leapers = alive[~near]
+            near = going & ~xp.isnan(self.from_[alive])
+            some = arrays.candidates(near)
+            at = arrays.kept(near, self.from_[alive[some]], 0.0)
+            near[some] &= self.leaping.matters(self.beams.places(alive[some], at))
+            going = going & ~near
+        some = arrays.candidates(going)
+        leapers = alive[some]
         before = self.next[leapers]
         reached, leaps = self.leaping.leap(
-            self.beams.origin[leapers], self.beams.pace[leapers], before, self.end[leapers]
+            self.beams.origin[leapers],
+            self.beams.pace[leapers],
+            before,
+            self.end[leapers],
+            going[some],
         )
         self.counters["skipped_bricks"] += leaps
-        moved = leapers[reached > before]
-        self.before[moved], self.from_[moved] = np.nan, np.nan
+        if self.task.surfaces:
+            for array in (self.before, self.from_):
+                array[leapers] = xp.where(reached > before, np.nan, array[leapers])
         self.next[leapers] = reached
-        return alive[self.next[alive] < self.end[alive]]
 
     def _pass(self, alive: Array, pace: int) -> None:
         """Take `pace` samples of each ray."""
@@ -196,8 +206,7 @@ class _Marcher:
         sample = self.next[alive][:, None] + arrays.range(pace)
         places = self.beams.places(alive, sample)
         requested = self._requested(sample < self.beams.end[alive][:, None], places)
-        values = arrays.full(sample.shape, np.nan)
-        values[requested] = self._looked_up(places[requested])
+        values = self._looked_up(places, requested)
         self.counters["passes"] += 1
         self.next[alive] += pace
         if self.projection is not None:
@@ -214,7 +223,9 @@ class _Marcher:
         within: the samples that lie on their rays' paths. places: (rays, samples, 3).
         """
         if self.cells is not None:
-            within[self.arrays.nonzero(within)] = self._visible(places[within])
+            flat = within.reshape(-1)
+            some = self.arrays.candidates(flat)
+            flat[some] &= self._visible(places.reshape(-1, 3)[some])
             return within
         if not self.skipping or within.shape[1] == 1:
             return within
@@ -237,12 +248,20 @@ class _Marcher:
         )
         return self.arrays.xp.take(self.cells, (k * y + j) * x + i)
 
-    def _looked_up(self, places: Array) -> Array:
-        """Values (n,) at places (n, 3), counted."""
-        values = self.field.values(places)
-        self.counters["samples"] += len(places)
-        self.counters["evaluations"] += self.arrays.xp.count_nonzero(~self.arrays.xp.isnan(values))
-        return values
+    def _looked_up(self, places: Array, wanted: Array) -> Array:
+        """Values (rays, samples) at places (rays, samples, 3), counted; NaN where not wanted."""
+        arrays, flat = self.arrays, wanted.reshape(-1)
+        some, values = arrays.candidates(flat), arrays.full(flat.shape, np.nan)
+        counted = flat[some]
+        values[some] = looked_up = self.field.values(places.reshape(-1, 3)[some], counted)
+        self._count(counted, looked_up)
+        return values.reshape(wanted.shape)
+
+    def _count(self, counted: Array, values: Array) -> None:
+        """Count the samples of a mask (n,), and those of them that have a value."""
+        count = self.arrays.xp.count_nonzero
+        self.counters["samples"] += count(counted)
+        self.counters["evaluations"] += count(counted & ~self.arrays.xp.isnan(values))
 
     def _events(self, alive: Array, sample: Array, values: Array) -> Events:
         """The events of a pass. sample: int64 (rays, samples). values: (rays, samples)."""
@@ -274,22 +293,24 @@ class _Marcher:
         beams, arrays, xp = self.beams, self.arrays, self.arrays.xp
         leaving, places = beams.leaving[alive][:, None], arrays.to_float64(sample)
         to = xp.minimum(places, leaving)
-        values = arrays.copy(values)
         beyond = (places >= leaving) & (sample < self.end[alive][:, None])
-        values[beyond] = self._looked_up(beams.borders(alive, to)[beyond])
-        rays = alive[xp.isnan(self.before[alive])]
-        self.from_[rays] = xp.maximum(
-            arrays.to_float64(self.next[rays] - sample.shape[1] - 1), beams.entered[rays]
-        )
-        self.before[rays] = self._looked_up(beams.borders(rays, self.from_[rays]))
-        result = crossings(
-            lambda row, at: self._looked_up(beams.places(alive[row], at)),
-            xp.concatenate([self.from_[alive][:, None], to], axis=1),
-            xp.concatenate([self.before[alive][:, None], values], axis=1),
-            self.task.surfaces,
-            arrays,
-        )
-        self.before[alive], self.from_[alive] = values[:, -1], to[:, -1]
+        before = self.before[alive]
+        entering = xp.isnan(before)
+        first = arrays.to_float64(self.next[alive] - sample.shape[1] - 1)
+        first = xp.where(entering, xp.maximum(first, beams.entered[alive]), self.from_[alive])
+        at = xp.concatenate([first[:, None], to], axis=1)
+        wanted = xp.concatenate([entering[:, None], beyond], axis=1)
+        known = xp.concatenate([before[:, None], values], axis=1)
+        looked_up = self._looked_up(beams.borders(alive, at), wanted)
+
+        def between(row: Array, place: Array, counted: Array) -> Array:
+            found = self.field.values(beams.places(alive[row], place))
+            self._count(counted, found)
+            return found
+
+        known = xp.where(wanted, looked_up, known)
+        result = crossings(between, at, known, self.task.surfaces, arrays)
+        self.before[alive], self.from_[alive] = known[:, -1], to[:, -1]
         return result
 
     def _length(self, alive: Array, sample: Array) -> Array:
@@ -300,14 +321,19 @@ class _Marcher:
     def _opacity(self, palette: Palette, alive: Array, sample: Array, values: Array) -> Array:
         """Opacities (rays, samples), 0 where there is no value. The last step may be shorter."""
         arrays, xp = self.arrays, self.arrays.xp
-        row, column = arrays.nonzero(~xp.isnan(values))
-        length = self._length(alive, sample)[row, column] * self.task.step
-        depth = palette.extinction(values[row, column]) * length
+        flat = values.reshape(-1)
+        known = ~xp.isnan(flat)
+        some = arrays.candidates(known)
+        length = self._length(alive, sample).reshape(-1)[some] * self.task.step
+        depth = palette.extinction(arrays.kept(known, flat[some], palette.low)) * length
+        depth = arrays.kept(known, depth, 0.0)
         if self.factors is not None:
             (thick,) = arrays.nonzero(depth > 0)
-            at = arrays.to_float64(sample[row, column][thick])
-            depth[thick] *= self.factors(self.beams.places(alive[row[thick]], at))
+            number = arrays.range(len(flat))[some][thick]
+            at = arrays.to_float64(sample.reshape(-1)[number])
+            rays = alive[number // sample.shape[1]]
+            depth[thick] *= self.factors(self.beams.places(rays, at))
             self.counters["gradients"] += len(thick)
-        opacity = arrays.full(values.shape, 0.0)
-        opacity[row, column] = -xp.expm1(-depth)
-        return opacity
+        opacity = arrays.full(flat.shape, 0.0)
+        opacity[some] = -xp.expm1(-depth)
+        return opacity.reshape(values.shape)

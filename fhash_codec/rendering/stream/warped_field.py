@@ -92,9 +92,9 @@ class WarpedField:
             seen = _extremes(seen, begin, end, axis, np.logical_or)
         return self.arrays.array(seen)
 
-    def values(self, places: Array) -> Array:
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
         """Values (n,) at places (n, 3) in drawn vertices, NaN where there is none."""
-        return self._field.values(self._moved(places)[0])
+        return self._field.values(self._moved(places)[0], wanted)
 
     def slopes(self, places: Array) -> Array:
         """Derivatives (n, 3) by x, y and z per drawn vertex, 0 where there are none."""

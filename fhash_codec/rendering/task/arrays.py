@@ -4,6 +4,10 @@ Marching calls functions that both libraries have under one name and with one me
 `Arrays.xp`. Where the libraries differ, `Arrays` has a method, which `TorchArrays` replaces. An
 operation never mixes an array with a Python number of the other kind, integer or float: torch would
 make float32 of them.
+
+The host picks elements by a mask and works on those alone. On a device it would have to wait until
+their number is known, which takes longer than work on all. So marching takes the `candidates` of a
+mask and what is `kept` of their results, and lets the host wait only where the work is large.
 """
 
 from __future__ import annotations
@@ -27,10 +31,12 @@ class Arrays:
     Attributes:
         xp: the library.
         batch: elements to work on at a time, so few that they stay in a processor's cache.
+        turns: turns of a search after which the elements that are found are left out.
     """
 
     xp: Any = np
     batch = 1 << 15
+    turns = 1
 
     def array(self, values: npt.ArrayLike, dtype: str | None = None) -> Array:
         """An array of numbers from the host, of their own type or of another, as 'float64'."""
@@ -71,6 +77,25 @@ class Arrays:
     def nonzero(self, array: Array) -> tuple[Array, ...]:
         """Indices of the elements that are not 0, one array for each axis, in C order."""
         return array.nonzero()  # type: ignore[no-any-return]
+
+    def candidates(self, mask: Array) -> Array:
+        """An index of elements (n,) with those of a mask (n,) among them; on the host no others."""
+        return mask.nonzero()[0]
+
+    def kept(self, mask: Array, results: Array, other: Array | float) -> Array:
+        """Results (m, ...) for the candidates of a mask, and `other` for those not in the mask.
+
+        mask: the mask at the candidates (m,).
+        """
+        return results
+
+    def counts(self, *numbers: Array) -> list[int]:
+        """Integers of no axis as numbers of Python, for one wait."""
+        return [int(number) for number in numbers]
+
+    def chosen(self, mask: Array, count: int) -> Array:
+        """Indices (count,) of the elements of a mask (n,), whose number is known, ascending."""
+        return mask.nonzero()[0]
 
     def take_along(self, array: Array, index: Array, axis: int) -> Array:
         """Pick the elements that `index` names from each line along an axis."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from fhash_codec.rendering.task.arrays import Array, Arrays
+from fhash_codec.training.positions import true_positions
 from fhash_formats.errors import InputError
 
 __all__ = ["TorchArrays"]
@@ -24,6 +25,7 @@ class TorchArrays(Arrays):
     """
 
     xp = torch
+    turns = 4
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -65,6 +67,18 @@ class TorchArrays(Arrays):
 
     def nonzero(self, array: Array) -> tuple[Array, ...]:
         return torch.nonzero(array, as_tuple=True)
+
+    def candidates(self, mask: Array) -> Array:
+        return slice(None)
+
+    def kept(self, mask: Array, results: Array, other: Array | float) -> Array:
+        return torch.where(mask.view(-1, *(1,) * (results.ndim - 1)), results, other)
+
+    def counts(self, *numbers: Array) -> list[int]:
+        return [int(number) for number in torch.stack(numbers).tolist()]
+
+    def chosen(self, mask: Array, count: int) -> Array:
+        return true_positions(mask, count)
 
     def take_along(self, array: Array, index: Array, axis: int) -> Array:
         return torch.take_along_dim(array, index, dim=axis)
