@@ -127,6 +127,7 @@ class FusedEngine(SlabEngine):
         self._slots = limits.multiprocessors * max(1, min(2, resident))
         self._matrix_gradients = torch.empty(self._slots * self._sizes.matrices, device=device)
         self._errors = torch.empty(self._slots, dtype=torch.float64, device=device)
+        self._record = self._model()
         if self._program.new:
             self._try_kernels()
 
@@ -146,7 +147,7 @@ class FusedEngine(SlabEngine):
             shape = (items, self._sizes.lattice, 2)
             places = torch.empty(shape, dtype=torch.int32, device=self.device)
             entries = torch.empty(shape, device=self.device)
-        model, step = self._model(), ctypes.c_longlong(self.step)
+        model, step = self._record, ctypes.c_longlong(self.step)
         self._program.launch(
             "train_bricks",
             blocks,
@@ -196,7 +197,7 @@ class FusedEngine(SlabEngine):
                 min(len(chosen), self._slots),
                 self._sizes.shared_bytes,
                 [
-                    self._model(),
+                    self._record,
                     _pointer(ids),
                     ctypes.c_int(len(chosen)),
                     _pointer(first),
@@ -215,7 +216,7 @@ class FusedEngine(SlabEngine):
             min(bricks, 8 * self._slots),
             4 * (self._sizes.threads + 16),
             [
-                self._model(),
+                self._record,
                 ctypes.c_longlong(0),
                 ctypes.c_int(bricks),
                 ctypes.c_longlong(self.step),
@@ -297,7 +298,7 @@ class FusedEngine(SlabEngine):
         return tensor.pin_memory().to(self.device, non_blocking=True)
 
     def _model(self) -> ModelRecord:
-        """Return the arrays of the engine as the kernels take them."""
+        """Return the arrays of the engine, whose memory never moves, as the kernels take them."""
         start, before, after = (
             (ctypes.c_void_p * 4)(*(axis[table].data_ptr() for axis in self._axes))
             for table in range(3)

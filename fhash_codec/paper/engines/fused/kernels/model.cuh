@@ -20,9 +20,9 @@ constexpr int TILES = (BRICK_ROWS + TILE_ROWS - 1) / TILE_ROWS;
 constexpr int MASK_BYTES = (VERTICES + 7) / 8;
 constexpr int INPUTS = LEVELS * SIZE;
 
-constexpr float BETA1 = 0.9f;
+// Adam's decays, 0.9 and 0.999. Computed in float32, 1 - 0.999f would be off by 1e-5.
+constexpr float REST1 = 0.1f;
 constexpr float BETA2 = 0.999f;
-constexpr float REST1 = 0.1f;  // 1 - BETA1 in float32 would be off by 2e-7, 1 - BETA2 by 1e-5
 constexpr float REST2 = 0.001f;
 constexpr float EPSILON = 1e-8f;
 constexpr float LOG_BETA1 = -0.10536051565782628f;
