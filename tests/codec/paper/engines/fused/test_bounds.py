@@ -1,4 +1,4 @@
-"""No kernel reads or writes beyond an array: AddressSanitizer watches the emulated ones."""
+"""AddressSanitizer watches the emulated kernels: none reads or writes beyond an array."""
 
 from __future__ import annotations
 
