@@ -99,9 +99,14 @@ def machine(device: str) -> dict[str, Any]:
     }
     if device == "cuda":
         from fhash_codec.paper.engines.fused.nvrtc import find_nvrtc
+        from fhash_codec.paper.engines.fused.source import Unavailable
 
-        nvrtc = find_nvrtc()
-        found |= {"nvrtc": f"{nvrtc.path} {nvrtc.version}", "cuda": str(torch.version.cuda)}
+        try:
+            nvrtc = find_nvrtc()
+            compiler = f"{nvrtc.path} {nvrtc.version}"
+        except Unavailable as error:
+            compiler = str(error)
+        found |= {"nvrtc": compiler, "cuda": str(torch.version.cuda)}
     return found
 
 

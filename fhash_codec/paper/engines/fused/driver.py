@@ -49,8 +49,10 @@ class Driver:
 
     def call(self, name: str, *arguments: Any) -> None:
         """Call a function of the library."""
-        answer = getattr(self._library, name)(*arguments)
-        if answer:
+        function = getattr(self._library, name, None)
+        if function is None:
+            raise Unavailable(f"the CUDA driver is too old: it has no {name}")
+        if answer := function(*arguments):
             text = ctypes.c_char_p()
             self._library.cuGetErrorString(answer, ctypes.byref(text))
             reason = text.value.decode() if text.value else f"error {answer}"
@@ -147,11 +149,21 @@ class CudaDevice:
 
     def load(self, sizes: KernelSizes) -> CudaProgram:
         """Compile the kernels for some sizes, or find them in the cache."""
-        cubin, file = compiled(sizes.text(), self._architecture, cache_folder())
+        text, folder = sizes.text(), cache_folder()
+        cubin, file = compiled(text, self._architecture, folder)
+        try:
+            return CudaProgram(self._driver, cubin, self._device, sizes.threads, file)
+        except Unavailable:
+            if file is not None:
+                raise
+        # The file in the cache is damaged.
+        cubin, file = compiled(text, self._architecture, folder, anew=True)
         return CudaProgram(self._driver, cubin, self._device, sizes.threads, file)
 
 
-def compiled(text: str, architecture: int, folder: Path) -> tuple[bytes, Path | None]:
+def compiled(
+    text: str, architecture: int, folder: Path, *, anew: bool = False
+) -> tuple[bytes, Path | None]:
     """Return machine code for a text, from the cache where it was compiled before.
 
     The name in the cache holds for one text, architecture and version of NVRTC. Where the cache
@@ -161,6 +173,7 @@ def compiled(text: str, architecture: int, folder: Path) -> tuple[bytes, Path | 
         text: CUDA C++.
         architecture: as in 90 for sm_90.
         folder: the cache.
+        anew: whether to compile even if the cache has the machine code.
 
     Returns:
         The machine code, and its file in the cache if it was compiled just now.
@@ -177,10 +190,12 @@ def compiled(text: str, architecture: int, folder: Path) -> tuple[bytes, Path | 
     major, minor = nvrtc.version
     digest = hashlib.sha256(text.encode()).hexdigest()
     file = folder / f"{digest[:32]}-sm_{target}-nvrtc_{major}.{minor}.cubin"
-    try:
-        return file.read_bytes(), None
-    except OSError:
-        cubin, _ = nvrtc.compile(text, target)
+    if not anew:
+        try:
+            return file.read_bytes(), None
+        except OSError:
+            pass
+    cubin, _ = nvrtc.compile(text, target)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(file, force=True) as temporary:

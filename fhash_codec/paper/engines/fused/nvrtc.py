@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from fhash_codec.paper.engines.fused.source import Unavailable
 
@@ -40,16 +41,16 @@ class Nvrtc:
     def version(self) -> tuple[int, int]:
         """The version, major and minor."""
         major, minor = ctypes.c_int(), ctypes.c_int()
-        self._check(self._library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
+        self._call("nvrtcVersion", ctypes.byref(major), ctypes.byref(minor))
         return major.value, minor.value
 
     @cached_property
     def architectures(self) -> list[int]:
         """The architectures that it compiles for, as in 90 for sm_90."""
         count = ctypes.c_int()
-        self._check(self._library.nvrtcGetNumSupportedArchs(ctypes.byref(count)))
+        self._call("nvrtcGetNumSupportedArchs", ctypes.byref(count))
         numbers = (ctypes.c_int * count.value)()
-        self._check(self._library.nvrtcGetSupportedArchs(numbers))
+        self._call("nvrtcGetSupportedArchs", numbers)
         return list(numbers)
 
     def compile(self, text: str, architecture: int) -> tuple[bytes, str]:
@@ -65,33 +66,34 @@ class Nvrtc:
         Raises:
             Unavailable: the text cannot be compiled.
         """
-        program, call = ctypes.c_void_p(), self._library
-        self._check(
-            call.nvrtcCreateProgram(
-                ctypes.byref(program), text.encode(), b"fhash.cu", 0, None, None
-            )
-        )
+        program = ctypes.c_void_p()
+        name = b"fhash.cu"
+        self._call("nvrtcCreateProgram", ctypes.byref(program), text.encode(), name, 0, None, None)
         try:
             options = [f"--gpu-architecture=sm_{architecture}", *OPTIONS]
             array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
-            answer = call.nvrtcCompileProgram(program, len(options), array)
+            answer = self._library.nvrtcCompileProgram(program, len(options), array)
             log = self._bytes(program, "ProgramLog").rstrip(b"\0").decode(errors="replace")
             if answer:
                 raise Unavailable(f"NVRTC {self._error(answer)}:\n{log}")
             return self._bytes(program, "CUBIN"), log
         finally:
-            call.nvrtcDestroyProgram(ctypes.byref(program))
+            self._library.nvrtcDestroyProgram(ctypes.byref(program))
 
     def _bytes(self, program: ctypes.c_void_p, name: str) -> bytes:
         """Return what nvrtcGetNAME has for a program."""
         size = ctypes.c_size_t()
-        self._check(getattr(self._library, f"nvrtcGet{name}Size")(program, ctypes.byref(size)))
+        self._call(f"nvrtcGet{name}Size", program, ctypes.byref(size))
         data = ctypes.create_string_buffer(size.value)
-        self._check(getattr(self._library, f"nvrtcGet{name}")(program, data))
+        self._call(f"nvrtcGet{name}", program, data)
         return data.raw
 
-    def _check(self, answer: int) -> None:
-        if answer:
+    def _call(self, name: str, *arguments: Any) -> None:
+        """Call a function; Unavailable where it fails or the library is too old to have it."""
+        function = getattr(self._library, name, None)
+        if function is None:
+            raise Unavailable(f"NVRTC {self.path} is too old: it has no {name}")
+        if answer := function(*arguments):
             raise Unavailable(f"NVRTC {self._error(answer)}")
 
     def _error(self, answer: int) -> str:

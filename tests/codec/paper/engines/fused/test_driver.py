@@ -115,6 +115,37 @@ def test_code_is_for_the_device_or_an_earlier_one_of_its_generation(
             compiled("a", architecture, tmp_path)
 
 
+def test_a_damaged_file_of_the_cache_is_compiled_anew(
+    nvrtc, library_of, monkeypatch, tmp_path
+) -> None:
+    library = library_of()
+    monkeypatch.setattr(driver_module, "cache_folder", lambda: tmp_path)
+    compiled("a", 90, tmp_path)
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(b"damaged")
+    device = CudaDevice.__new__(CudaDevice)
+    device._driver, device._device, device._architecture = Driver(), torch.device("cuda", 0), 90
+    usual = library.__class__.__getattr__
+
+    def refuse_damaged(self, name):
+        def load(module, code):
+            return int(code == b"damaged")
+
+        return load if name == "cuModuleLoadData" else usual(self, name)
+
+    monkeypatch.setattr(FakeLibrary, "__getattr__", refuse_damaged)
+    program = device.load(SimpleNamespace(text=lambda: "a", threads=256))
+    assert program.new
+    assert nvrtc.compiled == [90, 90]
+    assert file.read_bytes() == b"code of a"
+
+
+def test_a_library_without_a_function_is_too_old(monkeypatch) -> None:
+    monkeypatch.setattr(driver_module, "_loaded", lambda names: SimpleNamespace())
+    with pytest.raises(Unavailable, match="too old: it has no cuInit"):
+        Driver()
+
+
 def test_the_cache_is_in_the_users_folder(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
