@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
+from importlib.metadata import distributions
 from pathlib import Path
+
+import fhash_codec
 
 SCRIPT = Path(__file__).parent / "run.py"
 WITHOUT_ZARR = """
@@ -49,3 +53,11 @@ def test_a_part_that_fails_is_recorded_and_the_others_run(tmp_path) -> None:
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["pictures"]["figures"]["error"].startswith("IsADirectoryError")
     assert figures["speed"]["figures"]
+
+
+def test_a_working_tree_that_is_not_installed_is_described(tmp_path) -> None:
+    folder = runpy.run_path(str(SCRIPT))["described"](tmp_path / "site")
+    (found,) = distributions(path=[str(folder)])
+    assert (found.name, found.version) == ("fhash", fhash_codec.__version__)
+    names = {(point.group, point.name) for point in found.entry_points}
+    assert ("zarr.codecs", "fhash.transform") in names
