@@ -94,9 +94,14 @@ class EncodingField:
         """Cells with a vertex of the coreset, as the product's occupancy has them."""
         return self.arrays.array(self._cells)
 
-    def values(self, places: Array) -> Array:
-        inside = ~self.arrays.xp.isnan(self._coreset.values(places))
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
         result = self.arrays.full(len(places), np.nan)
+        if wanted is not None:
+            # An encoding is evaluated at no more samples than it is asked for.
+            (asked,) = self.arrays.nonzero(wanted)
+            result[asked] = self.values(places[asked])
+            return result
+        inside = ~self.arrays.xp.isnan(self._coreset.values(places))
         if self._occupancy:
             result[inside] = self._evaluated(places[inside])
         else:

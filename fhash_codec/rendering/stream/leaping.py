@@ -67,7 +67,7 @@ class Leaping:
         pending = arrays.range(len(sample))
         leaps: Array | int = 0
         while len(pending):
-            for _ in range(arrays.turns):
+            for _ in range(arrays.leaps):
                 brick, index = self._bricks(
                     origin[pending] + sample[pending][:, None] * pace[pending]
                 )

@@ -31,11 +31,13 @@ class Arrays:
     Attributes:
         xp: the library.
         batch: elements to work on at a time, so few that they stay in a processor's cache.
-        turns: turns of a search after which the elements that are found are left out.
+        leaps: leaps over invisible bricks after which the rays that arrived are left out.
+        turns: turns of a search for roots after which those that are found are left out.
     """
 
     xp: Any = np
     batch = 1 << 15
+    leaps = 1
     turns = 1
 
     def array(self, values: npt.ArrayLike, dtype: str | None = None) -> Array:

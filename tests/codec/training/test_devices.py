@@ -6,9 +6,18 @@ import sys
 
 import pytest
 import torch
+from pretended_cuda import pretended_cuda
 
-from fhash_codec.training.devices import choose_device, has_torch, need_torch
-from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_codec.training.devices import (
+    CUDA_PAYS,
+    choose_device,
+    enough_memory,
+    has_torch,
+    need_torch,
+    same_bits,
+    training_device,
+)
+from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
 
 
 def test_a_device_that_is_not_there_is_refused(monkeypatch) -> None:
@@ -37,3 +46,44 @@ def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     for name in ("auto", "cpu", "cuda"):
         with pytest.raises(MissingDependencyError, match=f"device '{name}' needs torch"):
             choose_device(name)
+
+
+def test_a_training_takes_the_device_where_that_pays_and_fits() -> None:
+    with pretended_cuda() as pretended:
+        pretended.free = 2**30
+        assert training_device("cpu", CUDA_PAYS, 0).type == "cpu"
+        assert training_device("auto", CUDA_PAYS - 1, 0).type == "cpu"
+        assert training_device("auto", CUDA_PAYS, 2**30).type == "cuda"
+        assert training_device("cuda", 1, 2**30).type == "cuda"
+        with pytest.raises(InputError, match=r"3\.0 GiB .* 1\.0 GiB are free; use --device cpu"):
+            training_device("cuda", 1, 3 * 2**30)
+        with pytest.warns(FhashWarning, match="takes the CPU"):
+            assert training_device("auto", CUDA_PAYS, 3 * 2**30).type == "cpu"
+
+
+def test_memory_that_runs_out_is_one_line_with_advice() -> None:
+    with (
+        pytest.raises(InputError, match=r"ran out .*\(out\); use --device cpu") as told,
+        enough_memory(torch.device("cuda")),
+    ):
+        raise torch.OutOfMemoryError("out\nof 5 GiB ...")
+    assert "\n" not in str(told.value)
+    with pytest.raises(RuntimeError, match="CUDA error"), enough_memory(torch.device("cuda")):
+        raise RuntimeError("CUDA error: an illegal memory access was encountered")
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_the_same_bits_are_asked_of_torch_on_a_device_alone(before: bool) -> None:
+    usual = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(before)
+    try:
+        for device, wanted, asked in (
+            ("cuda", True, True),
+            ("cuda", False, before),
+            ("cpu", True, before),
+        ):
+            with same_bits(torch.device(device), wanted):
+                assert torch.are_deterministic_algorithms_enabled() is asked
+            assert torch.are_deterministic_algorithms_enabled() is before
+    finally:
+        torch.use_deterministic_algorithms(usual)

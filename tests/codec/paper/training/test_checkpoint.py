@@ -48,6 +48,9 @@ def test_a_checkpoint_belongs_to_its_coreset_and_settings(coreset, other_coreset
     assert one == checkpoint_path(
         output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False)
     )
+    assert one == checkpoint_path(output, coreset, EncodeConfig(profile="paper", device="cpu"))
+    other_bits = EncodeConfig(profile="paper", deterministic=True)
+    assert one != checkpoint_path(output, coreset, other_bits)
     assert one != checkpoint_path(output, coreset, EncodeConfig(profile="paper", epochs=3))
     assert one != checkpoint_path(output, other_coreset, EncodeConfig(profile="paper"))
 

@@ -11,7 +11,7 @@ from fhash_codec.rendering.task.task import Surface
 def test_roots_are_exact() -> None:
     sample = np.arange(6.0)[None]
     found = crossings(
-        lambda row, at: (at - 2.3) ** 3,
+        lambda row, at, counted: (at - 2.3) ** 3,
         sample,
         (sample - 2.3) ** 3,
         (
@@ -28,8 +28,8 @@ def test_nothing_is_crossed_where_a_value_is_missing() -> None:
     """Neither between samples of which one has no value, nor where the search meets none."""
     surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
     sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
-    missing = crossings(lambda row, at: np.full(len(at), np.nan), sample, values, (surface,))
+    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
     assert not missing.opacity.any()
-    there = crossings(lambda row, at: at - 2, sample, values, (surface,))
+    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
     assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
     assert there.at[0, 2, 0] == 2.5

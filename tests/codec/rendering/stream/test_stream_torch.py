@@ -73,9 +73,9 @@ def test_nothing_leaves_the_device_before_the_picture(
         def __torch_function__(
             self, function: Any, types: Any, args: Any = (), kwargs: Any = None
         ) -> Any:
-            assert function.__name__ not in ("cpu", "numpy", "tolist", "__array__", "cuda"), (
-                function.__name__
-            )
+            name = function.__name__
+            assert name not in ("cpu", "numpy", "__array__", "cuda"), name
+            assert name != "tolist" or args[0].numel() <= 2  # the counts of a pass
             assert function.__name__ == "from_numpy" or not any(
                 isinstance(each, (np.ndarray, np.generic)) for each in args
             ), function
@@ -170,7 +170,7 @@ def test_a_device_without_enough_memory_says_so(
 ) -> None:
     import torch
 
-    def full(places: object) -> None:
+    def full(places: object, wanted: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     field, task = planned(volume, {}, tensors)

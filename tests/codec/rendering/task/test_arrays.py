@@ -60,3 +60,27 @@ def test_rows_that_are_named_twice_are_added_twice(arrays: Arrays) -> None:
     values = arrays.array([[1.0, 2.0], [10.0, 20.0], [100.0, 200.0]])
     arrays.add_rows(total, arrays.array([2, 0, 2]), values)
     assert arrays.host(total).tolist() == [[11.0, 21.0], [1.0, 1.0], [102.0, 203.0]]
+
+
+def test_candidates_are_those_of_the_mask_on_the_host_and_all_on_a_device(arrays: Arrays) -> None:
+    mask = arrays.array([False, True, True, False])
+    values = arrays.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]])
+    some = arrays.candidates(mask)
+    assert (
+        arrays.host(values[some]).tolist()
+        == arrays.host(values[mask] if arrays is NUMPY else values).tolist()
+    )
+    result = arrays.full((4, 2), 0.0)
+    result[some] = arrays.kept(mask[some], values[some], 0.0)
+    assert arrays.host(result)[:, 0].tolist() == [0.0, 2.0, 3.0, 0.0]
+    other = arrays.array([9.0, 9.0, 9.0, 9.0])
+    kept = arrays.kept(mask[some], values[:, 1][some], other[some])
+    assert arrays.host(kept)[arrays.host(mask[some])].tolist() == [2.0, 3.0]
+
+
+def test_counts_come_together_and_positions_by_their_count(arrays: Arrays) -> None:
+    mask = arrays.array([False, True, True, False, True])
+    count, largest = arrays.counts(arrays.xp.count_nonzero(mask), arrays.range(7).max())
+    assert (count, largest) == (3, 6)
+    assert arrays.host(arrays.chosen(mask, count)).tolist() == [1, 2, 4]
+    assert len(arrays.chosen(mask & False, 0)) == 0

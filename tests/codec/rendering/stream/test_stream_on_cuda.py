@@ -1,0 +1,112 @@
+"""Streaming on a pretended CUDA device: every operand is on it, and a pass waits a few times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pretended_cuda import MixedDevices, pretended_cuda
+
+import fhash_codec
+from fhash_codec import Volume
+from fhash_codec.rendering.stream import canvas, fields
+from fhash_codec.rendering.stream.fields import Field
+from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.task.arrays import NUMPY, Arrays
+from fhash_codec.rendering.task.devices import arrays_on
+from fhash_codec.rendering.task.task import Task
+
+Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
+
+OF_A_PICTURE = 8
+"""Waits of a picture besides those of its passes: the rays at the start, counters, and results."""
+WAITS = 8
+"""Waits that a pass may take."""
+WAITS_WITH_SURFACES = 14
+"""Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
+FRAMES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "surfaces and buffers": {
+        "effects": {"isosurfaces": [{"value": 3, "opacity": 0.4}], "buffers": ["depth", "normal"]}
+    },
+    "maximum": {"effects": {"maximum_intensity": True, "buffers": ["depth"]}},
+    "graded": {"transfer_function": {"gradient_opacity": [[0.02, 0], [0.15, 1]]}},
+    "all light": {
+        "effects": {
+            "shadows": True,
+            "ambient_occlusion": True,
+            "shading": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        }
+    },
+}
+"""Scenes of a decoded frame."""
+
+
+def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, Any]) -> None:
+    """March on the pretended device and on the host, and compare the pictures."""
+    scene = {**scene, "size": [24, 20]}
+    with fhash_codec.open(path) as volume:
+        here = stream(*planned(volume, scene, NUMPY), adaptive=True, budget=700)
+        with pretended_cuda() as pretended:
+            field, task = planned(volume, scene, arrays_on("cuda"))
+            pretended.forget()
+            there = stream(field, task, adaptive=True, budget=700)
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
+    assert there.counters["passes"] == here.counters["passes"] > 0
+    most = WAITS_WITH_SURFACES if task.surfaces else WAITS
+    waits = pretended.counts["waits"] - OF_A_PICTURE
+    assert 0 < waits <= most * here.counters["passes"], pretended.waits
+
+
+@pytest.mark.parametrize("scene", FRAMES)
+def test_a_pass_through_a_frame_waits_little(
+    planned: Planned, files: dict[str, Path], scene: str
+) -> None:
+    assert_a_pass_waits_little(planned, files["compact"], FRAMES[scene])
+
+
+def test_a_pass_through_a_network_waits_little(
+    planned: Planned, files: dict[str, Path], network_scene: dict[str, Any]
+) -> None:
+    assert_a_pass_waits_little(planned, files["paper"], network_scene)
+
+
+@pytest.mark.parametrize(
+    ("cls", "name"),
+    [
+        (fields.FrameField, "_flat"),
+        (fields.FrameField, "_last"),
+        (fields.FrameField, "first"),
+        (canvas.Canvas, "_spacing"),
+        (canvas.Canvas, "colour"),
+    ],
+)
+def test_an_array_of_the_host_in_a_pass_is_seen(
+    planned: Planned,
+    files: dict[str, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    cls: Any,
+    name: str,
+) -> None:
+    """Planted faults: one array of a march stays on the host."""
+    plain = cls.__init__
+
+    def spoilt(*arguments: Any) -> None:
+        plain(*arguments)
+        setattr(arguments[0], name, getattr(arguments[0], name).cpu())
+
+    monkeypatch.setattr(cls, "__init__", spoilt)
+    with pretended_cuda(), pytest.raises(MixedDevices):
+        draw(planned, files)
+
+
+def draw(planned: Planned, files: dict[str, Path]) -> None:
+    """Draw a frame with depth and normal on the device."""
+    scene = {"size": [12, 10], "effects": {"buffers": ["depth", "normal"]}}
+    with fhash_codec.open(files["compact"]) as volume:
+        stream(*planned(volume, scene, arrays_on("cuda")), adaptive=True)
