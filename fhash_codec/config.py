@@ -18,8 +18,8 @@ from fhash_formats.support.suggestions import suggestion
 TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
 """Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
 
-ENGINES = ("native", "slab", "naive")
-"""Training engines of the paper profile, the fastest first."""
+ENGINES = ("fused", "native", "slab", "naive")
+"""Training engines of the paper profile, the fastest first; `fused` is for CUDA alone."""
 
 FRINGES = ("trained", "untrained")
 """Treatments of vertices in the coreset of one neighbouring key frame only, in profile paper."""
@@ -236,8 +236,7 @@ class EncodeConfig:
     )
     engine: str = option(
         "auto",
-        "paper: training engine; 'auto' for 'native' (C++ on a CPU) where it takes the model, "
-        "else 'slab'",
+        "paper: training engine; 'auto' takes the fastest that takes the model",
         choices=("auto", *ENGINES),
         profile="paper",
     )

@@ -43,7 +43,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, native, slab, naive"),
+        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab, naive"),
         (
             {"profile": "paper", "max_error": 1.0},
             "max-error belongs to --profile compact; the profile is paper",

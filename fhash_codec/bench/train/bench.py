@@ -181,6 +181,8 @@ def _variants(
         raise InputError(f"the engine 'native' does not take this model: {reason}")
     variants = []
     for name in engines or ENGINES:
+        if name == "fused" and not engines and device.type != "cuda":
+            continue
         if name != "native":
             variants += [Variant(name, number) for number in threads]
         elif reason is None:

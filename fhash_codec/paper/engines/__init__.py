@@ -75,7 +75,8 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: native, slab, naive, or auto for native where it takes the model, and else slab.
+        name: fused, native, slab, naive, or auto for the fastest that can be had on the device and
+            takes the model.
         architecture: the sizes of the model.
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
@@ -83,8 +84,16 @@ def make_engine(
         device: where the engine computes.
 
     Raises:
-        InputError: the name is unknown, or the engine does not take the model.
+        InputError: the name is unknown, or the engine cannot be had or does not take the model.
     """
+    if name == "fused" or (name == "auto" and device.type == "cuda"):
+        from fhash_codec.paper.engines.fused.start import start_fused
+
+        fused = start_fused(
+            architecture, coreset, rates, seed=seed, device=device, required=name == "fused"
+        )
+        if fused is not None:
+            return fused
     from fhash_codec.paper.engines.native import NativeEngine, refusal
 
     if name == "auto":

@@ -53,6 +53,14 @@ def test_an_engine_that_was_named_is_never_replaced(noise_coreset, monkeypatch) 
         )
 
 
+def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:
+    architecture = Architecture.for_box((2, 2, 2), 1)
+    with pytest.raises(InputError, match="'fused', which needs a CUDA device"):
+        make_engine(
+            "fused", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
+        )
+
+
 @pytest.mark.parametrize("name", ["auto", "slab", "naive"])
 def test_restoring_a_state_goes_on_bit_for_bit(noise_coreset, name) -> None:
     coreset = noise_coreset((3, 9, 10, 20))

@@ -1,0 +1,59 @@
+"""Engines of every shape that the fused kernels do, on an emulated device.
+
+Tests of this folder import the module `emulator` beside them; pytest's importlib mode puts no
+folder of tests on the path.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines.fused.engine import FusedEngine
+from fhash_codec.paper.engines.naive import NaiveEngine
+from fhash_codec.paper.engines.slab import SlabEngine
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(scope="session")
+def library_folder(tmp_path_factory) -> Path:
+    """The folder of the compiled kernels; the test is skipped without g++."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ compiles the emulated kernels, and is not here")
+    return tmp_path_factory.mktemp("kernels")
+
+
+@pytest.fixture
+def emulated(library_folder):
+    """A function of the arguments of `EmulatedDevice` after the folder."""
+    from emulator import EmulatedDevice
+
+    return lambda **settings: EmulatedDevice(library_folder, **settings)
+
+
+@pytest.fixture
+def engines_of(noise_coreset, emulated):
+    """A function of a shape, settings and a device: coreset, fused engine, slab, and the oracle."""
+
+    def make(shape, settings, steps=40, **device):
+        settings = dict(settings)
+        coreset = noise_coreset(shape, settings.pop("low", 0.3))
+        settings = {"width": 16, **settings}
+        architecture = Architecture.for_box(coreset.box.shape, shape[0], **settings)
+        rates, cpu = np.full(steps + 1, 0.01), torch.device("cpu")
+        common = {"seed": 7, "device": cpu}
+        return (
+            coreset,
+            FusedEngine(architecture, coreset, rates, kernels=emulated(**device), **common),
+            SlabEngine(architecture, coreset, rates, **common),
+            NaiveEngine(architecture, coreset, rates, dtype=torch.float64, **common),
+        )
+
+    return make

@@ -1,0 +1,113 @@
+"""A device that runs the kernels on the processor: g++ compiles their text with emulate.hpp."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fhash_codec.paper.engines.fused.source import DeviceLimits, KernelSizes, Unavailable
+
+HERE = Path(__file__).parent
+LIMITS = DeviceLimits(
+    multiprocessors=2,
+    shared_per_block=160 << 10,
+    shared_per_multiprocessor=400 << 10,
+    threads=64,
+    columns=(32,),
+)
+"""A small device: several bricks for each block, and few fibres."""
+FAILURES = {1: "threads met at different barriers", 2: "unknown kernel", 3: "wild address"}
+"""Meaning of the answers of `launch` in emulated.cpp."""
+
+
+class EmulatedProgram:
+    """Kernels in a shared library. Threads run in `order`: 0 up, 1 down, else shuffled."""
+
+    new = False
+
+    def __init__(self, library: Path, order: int) -> None:
+        self.library = ctypes.CDLL(str(library))
+        self._launch = self.library.launch
+        self._launch.argtypes = [
+            ctypes.c_char_p,
+            ctypes.c_uint,
+            ctypes.c_size_t,
+            ctypes.c_int,
+            ctypes.c_void_p,
+        ]
+        self.order = order
+        self.launched: list[str] = []
+        self.forgotten = False
+
+    def launch(
+        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[ctypes._CDataType]
+    ) -> None:
+        self.launched.append(kernel)
+        addresses = (ctypes.c_void_p * len(arguments))(*map(ctypes.addressof, arguments))
+        answer = self._launch(kernel.encode(), blocks, shared_bytes, self.order, addresses)
+        if answer:
+            raise Unavailable(f"{kernel}: {FAILURES[answer]}")
+
+    def forget(self) -> None:
+        self.forgotten = True
+
+
+class EmulatedDevice:
+    """A device without a GPU.
+
+    `change` is applied to the text of the kernels, `flags` go to the compiler, `limits` replace
+    those of LIMITS.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        order: int = 0,
+        change: Callable[[str], str] = str,
+        flags: Sequence[str] = (),
+        new: bool = False,
+        **limits: Any,
+    ) -> None:
+        self.limits, self.order, self.new = replace(LIMITS, **limits), order, new
+        self._folder, self._change, self._flags = folder, change, flags
+
+    def load(self, sizes: KernelSizes) -> EmulatedProgram:
+        text = self._change(sizes.text())
+        program = EmulatedProgram(compiled(text, self._folder, self._flags), self.order)
+        program.new = self.new
+        return program
+
+
+def compiled(text: str, folder: Path, flags: Sequence[str] = ()) -> Path:
+    """The library of some kernels' text, from `folder` where it was compiled before."""
+    name = f"kernels_{abs(hash((text, tuple(flags)))):x}"
+    library = folder / f"{name}.so"
+    if not library.exists():
+        source = folder / f"{name}.cu"
+        source.write_text(text)
+        subprocess.run(
+            [
+                "g++",
+                "-std=c++17",
+                "-O1",
+                "-shared",
+                "-fPIC",
+                "-Wall",
+                "-Wno-unknown-pragmas",
+                "-Wno-unused-function",
+                "-Wno-unused-variable",
+                "-U_FORTIFY_SOURCE",
+                f'-DKERNELS="{source}"',
+                *flags,
+                str(HERE / "emulated.cpp"),
+                "-o",
+                str(library),
+            ],
+            check=True,
+        )
+    return library
