@@ -235,10 +235,7 @@ class EncodeConfig:
         profile="paper",
     )
     engine: str = option(
-        "auto",
-        "paper: training engine; 'auto' takes the fastest that takes the model",
-        choices=("auto", *ENGINES),
-        profile="paper",
+        "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
     )
     device: str = option(
         "auto", "paper: where to train", choices=("auto", "cpu", "cuda"), profile="paper"
