@@ -101,6 +101,11 @@ def goal_of(
     return Goal(psnr=psnr, data_range=data_range, bulk=part)
 
 
+def exact_integers(data_range: float) -> Goal:
+    """Return the promise that integers keep their values, see `goal_of`."""
+    return Goal(error=0.5, data_range=data_range, lossless=True)
+
+
 def promise(
     config: EncodeConfig, value_range: ValueRange | None = None, bulk: ValueRange | None = None
 ) -> dict[str, float]:

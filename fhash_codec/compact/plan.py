@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from fhash_codec.compact.choices.labels import (
 )
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
-from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.goal import Goal, exact_integers
 from fhash_codec.compact.stages import (
     choose_step,
     choose_tiles,
@@ -35,7 +36,7 @@ from fhash_codec.compact.stages import (
 )
 from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding
+from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
@@ -57,6 +58,10 @@ MAX_BYTES_KEPT = 128 << 20
 """Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
 LIKELY = 1.5
 """Ratio of labels to the rest up to which tiles are chosen for labels, which may then win."""
+ROUNDING_ERROR = 12**-0.5
+"""Root of the mean squared error of rounding to integers, in data units."""
+NEARLY = 0.5
+"""Distance in dB that a sample may be below a promise that all tiles then keep."""
 STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
@@ -81,6 +86,9 @@ class CodingPlan:
     """Training of the head; empty without one."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
+    size: float | None = None
+    """Bytes that the tiles are likely to take: infinite where the sample missed the promise, None
+    where nothing was tried."""
     keeps_decoded: bool = False
     """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
@@ -119,9 +127,41 @@ def plan(
         gains=gains,
         parts=Parts("planning", STAGES, progress),
     )
+    tiled = blocks.retile(tile)
+    found = _planned(task, tiled)
+    if not _may_be_exact(task, found):
+        return found
+    exact_task = replace(
+        task,
+        goal=exact_integers(goal.data_range),
+        gains=GainLog(overhead),
+        parts=Parts("planning exact values", STAGES, progress),
+    )
+    exact = _planned(exact_task, tiled)
+    assert exact.size is not None
+    assert found.size is not None
+    return exact if exact.size < found.size else found
+
+
+def _may_be_exact(task: PlanTask, found: CodingPlan) -> bool:
+    """Whether exact integers may take fewer bytes than a PSNR that leaves hardly any error.
+
+    Decoded values are rounded to integers. Below the error of that rounding, hardly any step of the
+    quantiser gives the PSNR: a little finer, and all values are exact.
+    """
+    return (
+        task.goal.psnr is not None
+        and task.blocks.dtype.kind in "iu"
+        and found.size is not None
+        and not found.settings.labels
+        and task.goal.expected_error < ROUNDING_ERROR
+    )
+
+
+def _planned(task: PlanTask, tiled: Blocks) -> CodingPlan:
+    """Return the plan for the goal of a task, from the tiles of a first guess on."""
     parts = task.parts
     parts.begin("first guess")
-    tiled = blocks.retile(tile)
     with stage("first guess", "mean and approximate bytes, by which tiles are chosen"):
         settings = first_settings(task, tiled)
     trial = _label_trial(task, tiled, settings)
@@ -183,6 +223,7 @@ def _by_trial(
         gains=task.gains.entries,
         history=attempt.history,
         tiling=attempt.tiling,
+        size=attempt.outcome.size if _keeps_promise(task, attempt.outcome) else math.inf,
     )
 
 
@@ -201,6 +242,12 @@ def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
     return attempt
 
 
+def _keeps_promise(task: PlanTask, outcome: Outcome) -> bool:
+    """Whether a sample keeps a promised PSNR, or nearly so; another promise is always kept."""
+    goal = task.goal
+    return goal.psnr is None or outcome.psnr(goal.data_range) > goal.psnr - NEARLY
+
+
 def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
     """Return the plan of a series that is coded as labels."""
     return CodingPlan(
@@ -210,6 +257,7 @@ def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
         goal=task.goal,
         gains=task.gains.entries,
         tiling=labelled.tiling,
+        size=labelled.outcome.size,
     )
 
 
