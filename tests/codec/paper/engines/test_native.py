@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from engine_checks import assert_near
 
 from fhash_codec.native import network
 from fhash_codec.paper.architecture import Architecture
@@ -100,22 +101,6 @@ def threads():
     torch.set_num_threads(before)
 
 
-def _assert_near(ours, theirs) -> None:
-    """Parameters agree by median and count: near a ReLU's kink float32 may take the other side."""
-    for a, b in (
-        (ours.fine, theirs.fine),
-        (ours.coarse, theirs.coarse),
-        (ours.network, theirs.network),
-    ):
-        if not a.numel():
-            continue
-        # What no sample moved is 0 in ours and still at its start in the oracle's.
-        apart = (a - b)[a != 0].abs()
-        # A thousandth of one Adam step, after STEPS of them.
-        assert float(apart.median()) < 1e-3 * 0.01
-        assert float((apart > 1e-3).double().mean()) < 0.01
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_it_trains_like_a_dense_adam_in_float64(model_of, oracle_of, path, case) -> None:
     coreset, architecture = model_of(case)
@@ -126,7 +111,7 @@ def test_it_trains_like_a_dense_adam_in_float64(model_of, oracle_of, path, case)
     np.testing.assert_allclose(values, first, atol=3e-7)
     ours = [float(engine.train(batch)) for batch in batches]
     np.testing.assert_allclose(ours, errors, rtol=1e-3, atol=1e-6)
-    _assert_near(engine.parameters(), expected)
+    assert_near(engine.parameters(), expected)
 
 
 def test_gradients_equal_those_of_autograd_in_float64(model_of, path) -> None:
@@ -194,7 +179,7 @@ def test_slab_and_native_go_on_from_each_other(model_of, case) -> None:
         error = float(slab.train(batch))
         assert float(alternating.train(batch)) == pytest.approx(error, rel=1e-3, abs=1e-6)
     assert alternating.name == "native"
-    _assert_near(alternating.parameters(), slab.parameters())
+    assert_near(alternating.parameters(), slab.parameters())
 
 
 def test_a_step_moves_no_block_that_it_does_not_need(model_of) -> None:
