@@ -44,11 +44,15 @@ def strata(costs: Sequence[float], max_tiles: int) -> list[tuple[int, int]]:
     """Choose tiles by cost: pairs of a tile and the number of tiles it stands for, in tile order.
 
     Tiles of similar cost form a stratum; its middle tile stands for all of them. All strata cost
-    about the same, so an expensive tile stands for itself and a cheap one for many.
+    about the same, so an expensive tile stands for itself and a cheap one for many. A single
+    stratum has tiles of all costs: the one nearest to their mean stands for them, since most of
+    them may be nearly empty.
 
     costs: approximate cost of each tile.
     max_tiles: number of tiles chosen at most.
     """
+    if max_tiles == 1:
+        return [(int(np.abs(np.asarray(costs) - np.mean(costs)).argmin()), len(costs))]
     order = np.argsort(costs, kind="stable")
     floor = MIN_COST_SHARE * float(np.mean(costs)) or 1.0
     so_far = np.cumsum(np.asarray(costs, dtype=np.float64)[order] + floor)

@@ -79,6 +79,11 @@ def test_strata_cover_all_tiles(max_tiles: int) -> None:
     assert [weight for _, weight in strata([0.0] * 40, 4)] == [10] * 4
 
 
+def test_a_single_tile_of_many_is_the_one_nearest_to_the_mean() -> None:
+    """Most tiles around a small feature are nearly empty, the middle one by cost as well."""
+    assert strata([1.0, 0.0, 50.0, 0.0, 400.0, 0.0, 2.0], 1) == [(2, 7)]
+
+
 def test_each_beginning_of_the_order_is_spread_evenly() -> None:
     order = spread_order(100)
     assert sorted(order) == list(range(100))
