@@ -83,8 +83,7 @@ def goal_of(
     if config.max_error_rel is not None:
         error = config.max_error_rel * data_range
     if error is not None and integers and error < MAX_INTEGER_ERROR:
-        # Before a decoded value is rounded to an integer, it may be off by half of one more.
-        return Goal(error=math.floor(error) + 0.5, data_range=data_range, lossless=error < 1)
+        return integer_goal(error, data_range)
     if error is not None:
         return Goal(error=error, data_range=data_range, lossless=error == 0)
     if config.ratio is not None:
@@ -101,9 +100,10 @@ def goal_of(
     return Goal(psnr=psnr, data_range=data_range, bulk=part)
 
 
-def exact_integers(data_range: float) -> Goal:
-    """Return the promise that integers keep their values, see `goal_of`."""
-    return Goal(error=0.5, data_range=data_range, lossless=True)
+def integer_goal(error: float, data_range: float) -> Goal:
+    """Return the promise that integers are off by an error at most; below 1 they are exact."""
+    # Before a decoded value is rounded to an integer, it may be off by half of one more.
+    return Goal(error=math.floor(error) + 0.5, data_range=data_range, lossless=error < 1)
 
 
 def promise(

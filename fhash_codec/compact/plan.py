@@ -23,7 +23,7 @@ from fhash_codec.compact.choices.labels import (
 )
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
-from fhash_codec.compact.goal import Goal, exact_integers
+from fhash_codec.compact.goal import Goal, integer_goal
 from fhash_codec.compact.stages import (
     choose_step,
     choose_tiles,
@@ -133,7 +133,7 @@ def plan(
         return found
     exact_task = replace(
         task,
-        goal=exact_integers(goal.data_range),
+        goal=integer_goal(0, goal.data_range),
         gains=GainLog(overhead),
         parts=Parts("planning exact values", STAGES, progress),
     )

@@ -13,15 +13,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.native.network import best_path
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.point_tables import Patch, PointTables, SparsePatch
 
-__all__ = ["NativePoints", "best_path"]
-
-
-def best_path(library: ctypes.CDLL) -> int:
-    """Return the path with the widest vectors that this machine has, a bit; 0 for none."""
-    return 1 << int(library.fhash_network_paths()).bit_length() >> 1
+__all__ = ["NativePoints"]
 
 
 class NativePoints:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.native import network as native
-from fhash_codec.paper.native_points import NativePoints, best_path
+from fhash_codec.paper.native_points import NativePoints
 from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
 from fhash_codec.paper.point_tables import Patch, PointTables, locate
 from fhash_codec.paper.pointwise import PointwiseLayers
@@ -129,7 +129,7 @@ class PointSampler:
                 points' own time is then 0, and their derivative by time.
         """
         library = native.library()
-        path = 0 if library is None else best_path(library)
+        path = 0 if library is None else native.best_path(library)
         self._native: NativePoints | None = None
         if library is not None and path:
             points = NativePoints(library, tables, path)

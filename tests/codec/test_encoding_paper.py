@@ -12,7 +12,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, InterruptedEncodingError, OutputError
-from fhash_codec.paper.engines.native import machine_paths
+from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.fhash import FHash
 from fhash_codec.paper.storage import load_network

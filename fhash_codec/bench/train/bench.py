@@ -22,8 +22,9 @@ from fhash_codec.bench.train.run import EngineRun, Variant
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines.native import machine_paths, refusal
+from fhash_codec.paper.engines.native import refusal
 from fhash_codec.paper.selection import select
 from fhash_codec.paper.training.train import plan_training
 from fhash_codec.progress import Progress, silent

@@ -15,8 +15,6 @@ import torch
 
 from fhash_codec.bench.train.clock import now
 from fhash_codec.native import network as native
-from fhash_codec.paper.engines.native import machine_paths
-from fhash_codec.paper.engines.native_task import PATHS
 
 __all__ = ["Peak", "Peaks"]
 
@@ -59,7 +57,7 @@ class Peaks:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._library = native.library() if device.type == "cpu" else None
-        self._paths = [] if self._library is None else machine_paths()
+        self._paths = [] if self._library is None else native.machine_paths()
         self.peaks = [_multiply_adds(name) for name in self._paths]
         if not self._paths:
             self.peaks += [_product(name, device) for name in _precisions(device)]
@@ -111,7 +109,7 @@ class Peaks:
     def _fma(self, path: str) -> float:
         assert self._library is not None
         begun = now()
-        done = self._library.fhash_network_fma(PATHS[path], FMA_ROUNDS)
+        done = self._library.fhash_network_fma(native.PATHS[path], FMA_ROUNDS)
         return float(done) / (now() - begun).on("cpu")
 
     def _matrix_product(self, precision: str) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
-__all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
+__all__ = ["ABI_VERSION", "PATHS", "PROTOTYPES", "best_path", "library", "machine_paths"]
 
 ABI_VERSION = 1
 """Number that `fhash_network_abi_version()` must return, and `FHASH_NETWORK_ABI` in network.cpp."""
@@ -33,6 +33,9 @@ PROTOTYPES: Prototypes = {
 }
 """Functions of this package's library that Python calls."""
 
+PATHS = {"x86-64-v4": 4, "x86-64-v3": 2, "baseline": 1}
+"""Instructions that the kernels are compiled for, the fastest first, with their bits."""
+
 _FOLDER = Path(__file__).parent
 
 
@@ -41,3 +44,18 @@ def library() -> ctypes.CDLL | None:
     return load_library(
         _FOLDER, "_network", ABI_VERSION, PROTOTYPES, version_symbol="fhash_network_abi_version"
     )
+
+
+def machine_paths() -> list[str]:
+    """Return the names of the instructions that the kernels can use here, the fastest first.
+
+    The list is empty where the library is missing.
+    """
+    native = library()
+    bits = 0 if native is None else native.fhash_network_paths()
+    return [name for name, bit in PATHS.items() if bits & bit]
+
+
+def best_path(native: ctypes.CDLL) -> int:
+    """Return the path with the widest vectors that this machine has, a bit; 0 for none."""
+    return 1 << int(native.fhash_network_paths()).bit_length() >> 1

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.native.network import library
+from fhash_codec.native.network import PATHS, library, machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.initial import Parameters, initial_parameters
@@ -33,7 +33,6 @@ from fhash_codec.paper.engines.native_task import (
     CATCH_UP,
     INFER,
     MOST_HIDDEN,
-    PATHS,
     TRAIN,
     WIDEST,
     Bricks,
@@ -54,16 +53,6 @@ CPU = torch.device("cpu")
 """The device of the engine."""
 
 Floats = npt.NDArray[np.float32]
-
-
-def machine_paths() -> list[str]:
-    """Return the names of the instructions that the kernels can use here, the fastest first.
-
-    The list is empty where the native library is missing.
-    """
-    native = library()
-    bits = 0 if native is None else native.fhash_network_paths()
-    return [name for name, bit in PATHS.items() if bits & bit]
 
 
 def refusal(architecture: Architecture, device: torch.device) -> str | None:

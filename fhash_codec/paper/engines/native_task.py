@@ -29,8 +29,6 @@ MOST_HIDDEN = 2
 """Hidden layers at most."""
 CATCH_UP, TRAIN, ADAM, INFER = range(4)
 """Parts of a step, and an evaluation, as train_bricks.cpp numbers them."""
-PATHS = {"x86-64-v4": 4, "x86-64-v3": 2, "baseline": 1}
-"""Instructions that the kernels are compiled for, the fastest first, with their bits."""
 
 _POINTER = ctypes.c_void_p
 _INTEGER = ctypes.c_int64

@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 
 from fhash_codec.bench.train import bench, clock, made
-from fhash_codec.paper.engines.native import machine_paths
+from fhash_codec.native.network import machine_paths
 
 Fhash = Callable[..., Result]
 WORDS = ("bench", "train", "--seconds", "0.1", "--width", "4", "--hidden-layers", "1", "-q")

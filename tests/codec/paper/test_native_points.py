@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from fhash_codec.native import network as native
+from fhash_codec.native.network import best_path
 from fhash_codec.paper import points
-from fhash_codec.paper.native_points import NativePoints, best_path
+from fhash_codec.paper.native_points import NativePoints
 from fhash_codec.paper.network import Network
 from fhash_codec.paper.point_tables import PointTables
 from fhash_codec.paper.points import sample_points

@@ -17,7 +17,7 @@ from fhash_codec import EncodeConfig
 from fhash_codec.bench.train import bench, made
 from fhash_codec.bench.train.bench import TURNS, bench_train
 from fhash_codec.bench.train.curves import GOALS
-from fhash_codec.paper.engines.native import machine_paths
+from fhash_codec.native.network import machine_paths
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fhash_codec.bench.train.peak import Peaks
-from fhash_codec.paper.engines.native import machine_paths
+from fhash_codec.native.network import machine_paths
 
 CPU = torch.device("cpu")
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from fhash_codec.native import network
+from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import describe_engine, make_engine
-from fhash_codec.paper.engines.native import machine_paths
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")

@@ -10,10 +10,11 @@ import torch
 from engine_checks import assert_near
 
 from fhash_codec.native import network
+from fhash_codec.native.network import PATHS, machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.naive import NaiveEngine
-from fhash_codec.paper.engines.native import NativeEngine, machine_paths, refusal
-from fhash_codec.paper.engines.native_task import BLOCK, PATHS
+from fhash_codec.paper.engines.native import NativeEngine, refusal
+from fhash_codec.paper.engines.native_task import BLOCK
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_formats.errors import InputError
 
