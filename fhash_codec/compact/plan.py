@@ -16,6 +16,7 @@ from fhash_codec.compact.choices.labels import (
     LabelTrial,
     ends_trials,
     has_labels,
+    holds_beside,
     look_at_labels,
     may_be_many,
     tiled_labels,
@@ -209,7 +210,7 @@ def _by_trial(
     settings = attempt.settings
     if trial is not None and trial.attempt.outcome.size <= LIKELY * attempt.outcome.size:
         labelled = tiled_labels(task, trial)
-        if labelled.outcome.size <= attempt.outcome.size:
+        if holds_beside(task, labelled, attempt):
             return _label_plan(task, labelled)
     if trial is not None and task.goal.lossless:
         many = may_be_many(task.value_range, attempt.sample)

@@ -121,7 +121,7 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
 
 def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose the tiles, by trial or by the size of the first guess, and the transform."""
-    tiled, tiling = attempt.sample.blocks, attempt.tiling
+    tiled, tiling, guessed = attempt.sample.blocks, attempt.tiling, attempt.sample.blocks.tile
     if task.fixed_tile is None:
         tiling = _tiling(task, attempt)
         tiled = task.blocks.retile(tiling.tile)
@@ -137,6 +137,11 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     if task.config.effort == 1:
         skip("transform", "effort 1 tries none; from 2 on")
         return attempt
+    if sample.is_single and task.goal.error and tiled.tile != guessed:
+        # Under a bound, the step of the first guess may be six times too coarse for other tiles.
+        with stage("step", "first guess for the tiles that were chosen"):
+            found, _ = find_step(sample, settings, attempt.coding, task.goal, tries=2)
+        attempt = replace(attempt, settings=found)
     if _asked(task, "transform"):
         with stage("transform", f"trials along each axis, at effort {task.config.effort}"):
             attempt = _choose_transform(task, attempt)

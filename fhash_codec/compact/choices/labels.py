@@ -31,6 +31,7 @@ __all__ = [
     "LabelTrial",
     "ends_trials",
     "has_labels",
+    "holds_beside",
     "is_hopeless",
     "look_at_labels",
     "may_be_many",
@@ -204,6 +205,20 @@ def tiled_labels(task: PlanTask, trial: LabelTrial) -> Attempt:
         transform=usual_transform(sample.blocks.tile),
     )
     return replace(attempt, sample=sample, settings=settings, outcome=outcome, tiling=tiling)
+
+
+def holds_beside(task: PlanTask, labelled: Attempt, other: Attempt) -> bool:
+    """Whether labels take no more bytes than another attempt does.
+
+    Where that is known of a sample only, they must also do so on the sample of the other one: their
+    own may lie on a plateau.
+    """
+    if labelled.outcome.size > other.outcome.size or other.sample.complete:
+        return labelled.outcome.size <= other.outcome.size
+    transform = usual_transform(other.sample.blocks.tile)
+    settings = replace(labelled.settings, transform=transform)
+    outcome = other.sample.run(settings, task.goal.bounded(labelled.coding))
+    return outcome.size <= other.outcome.size
 
 
 def _tiling(task: PlanTask, settings: TileSettings, coding: Coding, size: float) -> Tiling:

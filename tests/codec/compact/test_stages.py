@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from planned import plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact import stages as planning
+from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort
 from fhash_codec.compact.stages import (
     choose_step,
@@ -24,6 +27,8 @@ from fhash_codec.compact.stages import (
     try_head,
     try_predictor,
 )
+from fhash_codec.compact.tiles.access import Tiling
+from fhash_formats.transform.tile.settings import TileSettings
 
 Field = Callable[..., npt.NDArray[Any]]
 
@@ -47,15 +52,43 @@ def test_the_stages_follow_each_other_and_leave_out_what_does_not_apply(field: F
     assert task.gains.entries[1]["bytes"] == attempt.outcome.size + 100
 
 
+def test_transforms_of_a_large_tile_are_tried_at_a_step_of_its_own(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first guess has a step that is much too coarse for the tiles."""
+    monkeypatch.setattr(planning, "TRIAL_VERTICES", 1)
+    monkeypatch.setattr(planning, "SAMPLE_VERTICES", 1)
+    monkeypatch.setattr(planning, "MAX_SEARCHED_VERTICES", 1)
+    steps = []
+    tried = planning._transform_of_large_tile
+
+    def noted(task: PlanTask, attempt: Attempt) -> TileSettings:
+        steps.append(attempt.settings.step)
+        return tried(task, attempt)
+
+    monkeypatch.setattr(planning, "_transform_of_large_tile", noted)
+    with ThreadPoolExecutor(2) as workers:
+        for factor in (1, 100):
+            task = plan_task(field((8, 8, 24, 32)), workers, max_error_rel=1e-3)
+            tiled = task.blocks.retile((2, 4, 6, 8))
+            guess = first_guess(task, tiled, first_settings(task, tiled))
+            guess = replace(guess, settings=replace(guess.settings, step=factor * 1e-3))
+            monkeypatch.setattr(
+                planning, "_tiling", lambda *_: Tiling(tile=(8, 8, 12, 16), price=1.0)
+            )
+            assert choose_tiles(task, guess).sample.is_single
+    assert steps[0] == pytest.approx(steps[1], rel=0.3)
+
+
 def test_under_a_bound_a_predictor_is_tried(tmp_path: Path, field: Field) -> None:
     figures = fhash_codec.encode(
         field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2, max_error_rel=1e-3)
     )
     whats = [gain["what"] for gain in figures["gains"]]
-    stages = [what for what in whats if not what.startswith("coarser bases")]
-    assert stages[:2] == ["start", "transform by trial"]
-    assert stages[2] in ("prediction", "prediction (left out)")
-    assert stages[3:] == ["all tiles"]
+    noted = [what for what in whats if not what.startswith("coarser bases")]
+    assert noted[:2] == ["start", "transform by trial"]
+    assert noted[2] in ("prediction", "prediction (left out)")
+    assert noted[3:] == ["all tiles"]
 
 
 def test_more_effort_is_no_larger_and_keeps_the_promise(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lzma
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,13 +13,17 @@ from planned import plan_task
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact import plan as planning
+from fhash_codec.compact.attempt import Attempt
 from fhash_codec.compact.choices.labels import (
     ends_trials,
+    holds_beside,
     is_hopeless,
     look_at_labels,
     rank_share,
 )
 from fhash_codec.compact.stages import first_settings
+from fhash_codec.compact.tiles.coding import Coding
+from fhash_codec.compact.tiles.sample import Sample
 
 
 def moving_regions() -> np.ndarray:
@@ -96,6 +101,31 @@ def test_a_plateau_beside_a_shell_of_many_values_does_not_end_the_trials() -> No
             trial = look_at_labels(task, tiled, first_settings(task, tiled))
             assert trial.alone is alone
             assert ends_trials(trial, 1e9) is alone
+
+
+def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:
+    """The first tile is of two values, the one with the highest cost is smooth beside them."""
+    values = np.zeros((2, 8, 16, 64), "f4")
+    values[..., 5:11] = 1.0
+    values[..., 16:] = np.sin(np.tensordot((0.1, 0.11, 0.13, 0.17), np.indices((2, 8, 16, 48)), 1))
+    with ThreadPoolExecutor(2) as workers:
+        task = plan_task(values, workers, psnr=30.0)
+        tiled = task.blocks.retile((2, 8, 16, 16))
+        settings, coding = first_settings(task, tiled), Coding(filled=True)
+
+        def attempt(costs: list[float] | None, *, labels: bool) -> Attempt:
+            sample = Sample(tiled, 1, workers, costs)
+            found = replace(settings, labels=labels, many_labels=labels)
+            outcome = sample.run(found, coding)
+            return Attempt(sample=sample, settings=found, outcome=outcome, coding=coding)
+
+        plateau = attempt(None, labels=True)
+        smooth = attempt([0.0, 0.0, 1.0, 3.0], labels=False)
+        # Its tile is no label: by these settings it takes what a first guess takes, not less.
+        smooth = replace(smooth, outcome=replace(smooth.outcome, size=smooth.outcome.size - 1))
+        assert plateau.outcome.size < smooth.outcome.size
+        assert not holds_beside(task, plateau, smooth)
+        assert holds_beside(task, plateau, attempt(None, labels=False))
 
 
 def test_values_that_a_transform_codes_in_fewer_bytes_are_no_labels(tmp_path) -> None:
