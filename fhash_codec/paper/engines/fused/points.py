@@ -170,7 +170,8 @@ class FusedPoints:
 
     def _launched(self, kernel: str, places: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return what a kernel writes at places."""
-        assert places.dtype == torch.float64 and places.shape[1:] == (3,)
+        assert places.dtype == torch.float64
+        assert places.shape[1:] == (3,)
         places = places.contiguous()
         results = torch.empty(shape, dtype=torch.float32, device=self._device)
         record = PlacesRecord(
