@@ -132,6 +132,11 @@ class Network:
         """Number of inputs of the first layer."""
         return len(self.levels) * self.embedding_size
 
+    @property
+    def sparse(self) -> bool:
+        """Whether every level holds some vertices only."""
+        return all(isinstance(table, SparseSource) for table in self.tables)
+
     @cached_property
     def matrices(self) -> tuple[Floats, ...]:
         """Layers as matrices (out + 1, in + 1) that include the biases.

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.levels import Resolution
-from fhash_codec.paper.network import Floats, Network, SparseSource
+from fhash_codec.paper.network import Floats, Network
 from fhash_codec.paper.tables.ranked import RankedBits, SparseFrame, row_bits
 
 __all__ = ["Patch", "PointTables", "SparsePatch", "locate"]
@@ -123,7 +123,7 @@ class PointTables:
         Levels that hold some vertices only stay so.
         """
         high = [size - 1 for size in network.box_size]
-        if not all(isinstance(table, SparseSource) for table in network.tables):
+        if not network.sparse:
             return cls.read(network, (key_index, 0, 0, 0), (key_index, *high))
         sizes = (network.key_frames, *network.box_size)
         patches = []

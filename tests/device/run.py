@@ -6,7 +6,8 @@ with its error, and makes the exit code 1. Pictures and selftest need zarr and i
 are left out, with the reason, where they are missing; wheels in a folder on PYTHONPATH will do.
 
 Parts: oracle (gradients and values of fused and slab against the naive engine in float64), speed
-(steps one after another, without waiting for each), bench (`fhash bench train`), curve (PSNR
+(steps one after another, without waiting for each), points (places in a network by fused kernels
+and by torch: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
 against seconds of training), pictures (adaptive ray marching through the network), selftest.
 
 `--device cpu --quick` tries the script itself without a GPU; its figures mean nothing.
@@ -32,7 +33,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "formats"), str(ROOT / "cli")]
+sys.path[:0] = [str(ROOT), str(ROOT / "formats"), str(ROOT / "cli"), str(Path(__file__).parent)]
 NEEDED = ("zarr", "numcodecs", "google_crc32c")
 """Packages without which no file can be written."""
 FHASH = "import sys; from fhash_cli.main import main; sys.argv[0] = 'fhash'; sys.exit(main())"
@@ -51,6 +52,7 @@ class Sizes:
         self.curve_seconds = 0.5 if quick else 15.0
         self.pixels = 32 if quick else 1024
         self.epochs = 1 if quick else 20
+        self.side = 16 if quick else 160
 
 
 def main() -> int:
@@ -69,6 +71,7 @@ def main() -> int:
     parts: dict[str, Callable[..., Any]] = {
         "oracle": oracle,
         "speed": speed,
+        "points": points,
         "bench": bench,
         "curve": curve,
         "pictures": pictures,
@@ -254,6 +257,13 @@ def speed(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str
                     }
                 )
     return results
+
+
+def points(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str, Any]]:
+    """Measure places in networks, in the order of rays and at random; compare the kernels."""
+    from network_points import measured_points
+
+    return measured_points(device, sizes.shape, sizes.side, sizes.seconds / 8)
 
 
 def bench(device: str, sizes: Sizes, folder: Path, left: float) -> Any:

@@ -24,7 +24,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def test_parts_that_need_no_files_run_without_zarr(tmp_path) -> None:
     words = [str(SCRIPT), str(tmp_path), "--device", "cpu", "--quick"]
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_ZARR, *words, "--parts", "speed,pictures,selftest"],
+        [sys.executable, "-c", WITHOUT_ZARR, *words, "--parts", "speed,points,pictures,selftest"],
         capture_output=True,
         text=True,
         check=False,
@@ -35,6 +35,8 @@ def test_parts_that_need_no_files_run_without_zarr(tmp_path) -> None:
     models = [result["model"] for result in figures["speed"]["figures"]]
     assert models == ["64x1", "64x2"]
     assert all(result["train_msamples_s"] > 0 for result in figures["speed"]["figures"])
+    assert len(figures["points"]["figures"]) == 6
+    assert all(result["torch_slopes_mpoints_s"] > 0 for result in figures["points"]["figures"])
     for name in ("pictures", "selftest"):
         assert "zarr" in figures[name]["figures"]["left_out"]
 

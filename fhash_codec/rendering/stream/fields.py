@@ -11,7 +11,7 @@ import numpy as np
 
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.stream.inference import DenseInference, Inference, PatchInference
+from fhash_codec.rendering.stream.inference import inference_in
 from fhash_codec.rendering.task.arrays import NUMPY, Array, Arrays
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.palette import Palette
@@ -256,11 +256,7 @@ class NetworkField:
         network = model.network
         with arrays.guarded():
             self._in_coreset = arrays.array(in_coreset)
-            self._inference: Inference = (
-                PatchInference(network, key)
-                if arrays is NUMPY
-                else DenseInference(network, key, arrays)
-            )
+            self._inference = inference_in(arrays, network, key)
         self._jumps = (1, in_coreset.shape[2], in_coreset.shape[1] * in_coreset.shape[2])
         self.bricks = self._possible(in_coreset)
 

@@ -3,11 +3,14 @@
 On the host the value of a place has the same bits whatever other places are evaluated with it
 (fhash_codec/paper/points.py).
 
-On a device it has not: a library of matrix products chooses its kernels by the number of samples.
-There two evaluations of a place differ by at most twice the rounding error of the layers' sums. A
-sum of k products is off by at most k u / (1 - k u) times the sum of their magnitudes, u = 2**-24,
-and each layer hands on the error of the layer before it. Slopes at a place within that distance of
-a kink of a ReLU may be those of either side.
+On a device it has the same bits as well where fused kernels evaluate it
+(fhash_codec/paper/engines/fused/points.py).
+
+By the operations of torch it has not: a library of matrix products chooses its kernels by the
+number of samples. There two evaluations of a place differ by at most twice the rounding error of
+the layers' sums. A sum of k products is off by at most k u / (1 - k u) times the sum of their
+magnitudes, u = 2**-24, and each layer hands on the error of the layer before it. Slopes at a place
+within that distance of a kink of a ReLU may be those of either side.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from fhash_codec.paper.points import PointSampler, interpolate
 from fhash_codec.rendering.task.arrays import Array, Arrays
 from fhash_formats.support.threads import usable_threads
 
-__all__ = ["DenseInference", "Inference", "PatchInference"]
+__all__ = ["DenseInference", "Inference", "PatchInference", "inference_in"]
 
 
 class Inference(Protocol):
@@ -35,6 +38,16 @@ class Inference(Protocol):
     def slopes(self, places: Array) -> Array:
         """Derivatives by x, y and z per vertex, float32 (n, 3), as `sample_points` has them."""
         ...
+
+
+def inference_in(arrays: Arrays, network: Network, key: float) -> Inference:
+    """Inference for places in arrays: on a device by fused kernels, or by torch, with a warning."""
+    if arrays.device is None:
+        return PatchInference(network, key)
+    # Only tensors have a device, so torch is here.
+    from fhash_codec.paper.engines.fused.start import start_points
+
+    return start_points(network, key, arrays.device) or DenseInference(network, key, arrays)
 
 
 class PatchInference:
@@ -64,7 +77,7 @@ class PatchInference:
 
 
 class DenseInference:
-    """Inference on a device, which holds the whole table of every level.
+    """Inference by an array library on a device, which holds the whole table of every level.
 
     The two time nodes of a table are blended once, since a picture has one key index.
     """

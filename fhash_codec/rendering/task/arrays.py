@@ -30,12 +30,14 @@ class Arrays:
 
     Attributes:
         xp: the library.
+        device: the device of torch that holds tensors; None for arrays of numpy.
         batch: elements to work on at a time, so few that they stay in a processor's cache.
         leaps: leaps over invisible bricks after which the rays that arrived are left out.
         turns: turns of a search for roots after which those that are found are left out.
     """
 
     xp: Any = np
+    device: Any = None
     batch = 1 << 15
     leaps = 1
     turns = 1

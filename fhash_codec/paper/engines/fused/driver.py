@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from fhash_codec.paper.engines.fused.nvrtc import find_nvrtc
-from fhash_codec.paper.engines.fused.source import DeviceLimits, KernelSizes, Unavailable
+from fhash_codec.paper.engines.fused.source import DeviceLimits, Sizes, Unavailable
 from fhash_formats.errors import FhashError
 from fhash_formats.support.atomic import replacing
 
@@ -147,7 +147,7 @@ class CudaDevice:
             shared_per_multiprocessor=of(index, SHARED_PER_MULTIPROCESSOR),
         )
 
-    def load(self, sizes: KernelSizes) -> CudaProgram:
+    def load(self, sizes: Sizes) -> CudaProgram:
         """Compile the kernels for some sizes, or find them in the cache."""
         text, folder = sizes.text(), cache_folder()
         cubin, file = compiled(text, self._architecture, folder)

@@ -23,7 +23,7 @@ from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.fused.axes import missed_step_tables
 from fhash_codec.paper.engines.fused.source import (
     DeviceLimits,
-    KernelSizes,
+    Sizes,
     Unavailable,
     kernel_sizes,
 )
@@ -65,7 +65,7 @@ class Device(Protocol):
 
     limits: DeviceLimits
 
-    def load(self, sizes: KernelSizes) -> Program:
+    def load(self, sizes: Sizes) -> Program:
         """Compile the kernels for some sizes, or find them compiled; Unavailable if neither."""
 
 

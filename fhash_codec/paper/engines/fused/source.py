@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
 from pathlib import Path
+from typing import TypeVar
 
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
@@ -52,34 +54,18 @@ class DeviceLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class KernelSizes:
-    """The sizes that the kernels are compiled for.
+class Sizes(ABC):
+    """The sizes that kernels are compiled for: those of the layers on a tile.
 
     Attributes:
         architecture: the sizes of the model.
-        brick_shape: vertices of a brick (z, y, x).
-        corners: corners (t, z, y, x) of a brick's sub-lattice of each coarse level.
-        columns: vertices of a tile at most, a multiple of 4.
+        columns: vertices or points of a tile at most, a multiple of 4.
         threads: threads of a block.
-        sums_in_shared: whether the gradient by the layers is summed in shared memory.
     """
 
     architecture: Architecture
-    brick_shape: tuple[int, int, int]
-    corners: tuple[tuple[int, int, int, int], ...]
     columns: int
     threads: int
-    sums_in_shared: bool
-
-    @property
-    def tile_rows(self) -> int:
-        """Rows of vertices along x in a tile."""
-        return self.columns // self.brick_shape[2]
-
-    @property
-    def tiles(self) -> int:
-        """Tiles of a brick."""
-        return -(-self.brick_shape[0] * self.brick_shape[1] // self.tile_rows)
 
     @property
     def stride(self) -> int:
@@ -91,6 +77,86 @@ class KernelSizes:
         """Numbers of the matrices of all layers."""
         *hidden, (_, last) = self.architecture.layer_shapes
         return sum((inputs + 1) * self.stride for _, inputs in hidden) + last + 1
+
+    @property
+    def layer_arrays(self) -> dict[str, int]:
+        """Numbers of the arrays in shared memory that the layers need, by name."""
+        model, pitch = self.architecture, self.columns + 4
+        hidden = (model.width + 1) * pitch
+        return {
+            "INPUTS": (model.inputs + 1) * pitch,
+            "HIDDEN_1": hidden if model.hidden_layers > 0 else 0,
+            "HIDDEN_2": hidden if model.hidden_layers > 1 else 0,
+            "MATRICES": self.matrices,
+            "PARTS": 4 * self.threads,
+        }
+
+    @property
+    def arrays(self) -> dict[str, int]:
+        """Numbers of all arrays in shared memory, by name."""
+        return self.layer_arrays
+
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Places in shared memory, in numbers of 4 bytes, and their END."""
+        places, end = {}, 0
+        for name, size in self.arrays.items():
+            places[name] = end
+            end += -(-size // 4) * 4
+        return places | {"END": end}
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes of shared memory that a block needs."""
+        return 4 * self.places["END"]
+
+    def layer_constants(self) -> Iterator[str]:
+        """Yield the lines that define the constants of the layers and the places."""
+        model = self.architecture
+        numbers = {
+            "LEVELS": len(model.levels),
+            "SIZE": model.embedding_size,
+            "WIDTH": model.width,
+            "LAYERS": model.hidden_layers,
+            "THREADS": self.threads,
+            "COLUMNS": self.columns,
+            "PITCH": self.columns + 4,
+            "STRIDE": self.stride,
+            "MATRICES": self.matrices,
+        } | {f"AT_{name}": place for name, place in self.places.items()}
+        yield from (f"constexpr int {name} = {number};" for name, number in numbers.items())
+
+    @abstractmethod
+    def text(self) -> str:
+        """Return the whole text of the kernels."""
+
+
+SomeSizes = TypeVar("SomeSizes", bound=Sizes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KernelSizes(Sizes):
+    """The sizes that the kernels of training are compiled for.
+
+    Attributes:
+        brick_shape: vertices of a brick (z, y, x).
+        corners: corners (t, z, y, x) of a brick's sub-lattice of each coarse level.
+        sums_in_shared: whether the gradient by the layers is summed in shared memory.
+    """
+
+    brick_shape: tuple[int, int, int]
+    corners: tuple[tuple[int, int, int, int], ...]
+    sums_in_shared: bool
+
+    @property
+    def tile_rows(self) -> int:
+        """Rows of vertices along x in a tile."""
+        return self.columns // self.brick_shape[2]
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of a brick."""
+        return -(-self.brick_shape[0] * self.brick_shape[1] // self.tile_rows)
 
     @cached_property
     def lattice_sizes(self) -> list[int]:
@@ -107,19 +173,12 @@ class KernelSizes:
         """Numbers of a row that is interpolated along z and y, for each coarse level."""
         return [corners[3] * self.architecture.embedding_size for corners in self.corners]
 
-    @cached_property
-    def places(self) -> dict[str, int]:
-        """Places in shared memory, in numbers of 4 bytes, and their END."""
-        model, coarse = self.architecture, len(self.corners)
-        pitch = self.columns + 4
-        hidden = (model.width + 1) * pitch
-        sizes = {
-            "INPUTS": (model.inputs + 1) * pitch,
-            "HIDDEN_1": hidden if model.hidden_layers > 0 else 0,
-            "HIDDEN_2": hidden if model.hidden_layers > 1 else 0,
-            "MATRICES": self.matrices,
+    @property
+    def arrays(self) -> dict[str, int]:
+        """Numbers of all arrays in shared memory, by name."""
+        coarse = len(self.corners)
+        return self.layer_arrays | {
             "SUMS": self.matrices if self.sums_in_shared else 0,
-            "PARTS": 4 * self.threads,
             "RESIDUAL": self.columns,
             "LATTICE": self.lattice,
             "SLOPES": self.lattice,
@@ -129,43 +188,24 @@ class KernelSizes:
             "START": 4 * coarse,
             "SAMPLES": -(-prod(self.brick_shape) // 8) + 1,
         }
-        places, end = {}, 0
-        for name, size in sizes.items():
-            places[name] = end
-            end += -(-size // 4) * 4
-        return places | {"END": end}
-
-    @property
-    def shared_bytes(self) -> int:
-        """Bytes of shared memory that a block needs."""
-        return 4 * self.places["END"]
 
     def text(self) -> str:
         """Return the whole text of the kernels."""
-        files = ((KERNELS / name).read_text(encoding="utf-8") for name in FILES)
-        return "\n".join([*self._constants(), *files])
+        return with_files(self._constants(), FILES)
 
     def _constants(self) -> Iterator[str]:
         """Yield the lines that define the constants."""
         model, levels = self.architecture, self.architecture.levels
         z, y, x = self.brick_shape
+        yield from self.layer_constants()
         numbers = {
-            "LEVELS": len(levels),
             "COARSE": len(levels) - 1,
-            "SIZE": model.embedding_size,
             "BRICK_Z": z,
             "BRICK_Y": y,
             "BRICK_X": x,
-            "WIDTH": model.width,
-            "LAYERS": model.hidden_layers,
-            "THREADS": self.threads,
-            "COLUMNS": self.columns,
-            "PITCH": self.columns + 4,
-            "STRIDE": self.stride,
-            "MATRICES": self.matrices,
             "LATTICE": self.lattice,
             "ROW": sum(self.row_sizes),
-        } | {f"AT_{name}": place for name, place in self.places.items()}
+        }
         yield from (f"constexpr int {name} = {number};" for name, number in numbers.items())
         yield f"constexpr bool SUMS_IN_SHARED = {str(self.sums_in_shared).lower()};"
         tables = [prod(level) * model.embedding_size for level in levels[1:]]
@@ -182,21 +222,10 @@ def kernel_sizes(
 ) -> tuple[KernelSizes, list[AxisTables]]:
     """Return the sizes that suit a model and a device, and the tables of the axes (t, z, y, x).
 
-    Two blocks on a multiprocessor hide each other's waiting, so the largest tile that allows two is
-    taken, and else the largest that fits at all.
-
     Raises:
         Unavailable: the kernels cannot do this model on this device.
     """
-    if architecture.width > MAX_WIDTH or architecture.hidden_layers > MAX_LAYERS:
-        raise Unavailable(
-            f"the network has {architecture.hidden_layers} hidden layers of {architecture.width};"
-            f" the kernels do {MAX_LAYERS} of {MAX_WIDTH} at most"
-        )
-    if architecture.inputs > MAX_INPUTS:
-        raise Unavailable(
-            f"the network has {architecture.inputs} inputs; the kernels do {MAX_INPUTS} at most"
-        )
+    check_layers(architecture)
     axes = axis_tables(architecture, coreset)
     corners = tuple(zip(*(axis.corners for axis in axes), strict=True))
     fitting = [
@@ -222,9 +251,37 @@ def kernel_sizes(
             f"a brick of {z} x {y} x {x} vertices and this network need more shared memory than the"
             f" {limits.shared_per_block} bytes of a block here"
         )
+    return best_of(fitting, limits), axes
+
+
+def check_layers(architecture: Architecture) -> None:
+    """Raise Unavailable for layers that the kernels cannot do."""
+    if architecture.width > MAX_WIDTH or architecture.hidden_layers > MAX_LAYERS:
+        raise Unavailable(
+            f"the network has {architecture.hidden_layers} hidden layers of {architecture.width};"
+            f" the kernels do {MAX_LAYERS} of {MAX_WIDTH} at most"
+        )
+    if architecture.inputs > MAX_INPUTS:
+        raise Unavailable(
+            f"the network has {architecture.inputs} inputs; the kernels do {MAX_INPUTS} at most"
+        )
+
+
+def best_of(fitting: Sequence[SomeSizes], limits: DeviceLimits) -> SomeSizes:
+    """Return the best of some sizes that fit on a device, the preferred ones first.
+
+    Two blocks on a multiprocessor hide each other's waiting, so the first that allow two are taken,
+    and else the first of all.
+    """
     # The driver keeps a kilobyte of each block's shared memory.
     half = limits.shared_per_multiprocessor // 2 - 1024
-    return next((sizes for sizes in fitting if sizes.shared_bytes <= half), fitting[0]), axes
+    return next((sizes for sizes in fitting if sizes.shared_bytes <= half), fitting[0])
+
+
+def with_files(constants: Iterable[str], files: Iterable[str]) -> str:
+    """Return the text of some lines with constants, followed by files of kernels."""
+    texts = ((KERNELS / name).read_text(encoding="utf-8") for name in files)
+    return "\n".join([*constants, *texts])
 
 
 def _starts(sizes: Sequence[int]) -> list[int]:

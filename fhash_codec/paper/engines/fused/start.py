@@ -1,8 +1,9 @@
-"""The start of the fused engine on a device: it is made, or the reason why not is said."""
+"""The start of fused kernels on a device: they are had, or the reason why not is said."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -11,8 +12,10 @@ import torch
 
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines.fused.engine import FusedEngine
+from fhash_codec.paper.engines.fused.engine import Device, FusedEngine
+from fhash_codec.paper.engines.fused.points import FusedPoints, PointKernels
 from fhash_codec.paper.engines.fused.source import Unavailable
+from fhash_codec.paper.network import Network
 from fhash_formats.errors import FhashWarning, InputError
 
 
@@ -52,15 +55,40 @@ def start_fused(
     except Unavailable as error:
         if required:
             raise InputError(f"engine 'fused' cannot be had: {error}; use --engine auto") from error
-        _warn_once(str(error))
+        _warn_once(f"training takes the engine slab, since the faster one cannot be had: {error}")
+        return None
+
+
+def start_points(network: Network, key: float, device: torch.device) -> FusedPoints | None:
+    """Return a network at one time on a device, or None, with one FhashWarning for each reason.
+
+    There is no warning on a processor or where torch is not built for CUDA.
+
+    Args:
+        network, key, device: as in `FusedPoints`.
+
+    Raises:
+        DamagedFileError: numbers of a table are not finite.
+    """
+    if device.type != "cuda" or torch.version.cuda is None:
+        return None
+    from fhash_codec.paper.engines.fused.driver import CudaDevice
+
+    try:
+        kernels = _point_kernels(CudaDevice, device)
+        return FusedPoints(network, key, device=device, kernels=kernels)
+    except Unavailable as error:
+        _warn_once(f"rays march by torch, since the faster kernels cannot be had: {error}")
         return None
 
 
 @cache
-def _warn_once(reason: str) -> None:
-    """Warn that training is slower than it could be."""
-    warnings.warn(
-        f"training takes the engine slab, since the faster one cannot be had: {reason}",
-        FhashWarning,
-        stacklevel=4,
-    )
+def _point_kernels(make: Callable[[torch.device], Device], device: torch.device) -> PointKernels:
+    """Return the kernels of points on a device, for all networks and key indices."""
+    return PointKernels(make(device))
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Warn that something is slower than it could be."""
+    warnings.warn(message, FhashWarning, stacklevel=4)

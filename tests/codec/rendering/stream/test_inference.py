@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fhash_codec.paper.engines.fused import start
 from fhash_codec.paper.network import ArrayTable, Network
-from fhash_codec.rendering.stream.inference import DenseInference, PatchInference
+from fhash_codec.rendering.stream.inference import DenseInference, PatchInference, inference_in
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 
 Floats = npt.NDArray[np.float64]
@@ -78,6 +79,22 @@ def test_on_a_device_the_pass_of_a_sample_changes_its_rounding_alone(
         chosen = random.permutation(len(places))[:count]
         alone = tensors.host(inference.values(tensors.array(places[chosen])))
         assert np.abs(alone - values[chosen]).max() <= bound
+
+
+def test_fused_kernels_are_taken_where_they_can_be_had(
+    network: Network, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, fused = [], object()
+
+    def started(*given: object) -> object:
+        asked.append(given)
+        return fused if len(asked) == 1 else None
+
+    monkeypatch.setattr(start, "start_points", started)
+    assert inference_in(tensors, network, 0.6) is fused
+    assert isinstance(inference_in(tensors, network, 0.6), DenseInference)
+    assert isinstance(inference_in(NUMPY, network, 0.6), PatchInference)
+    assert asked == 2 * [(network, 0.6, tensors.device)]
 
 
 def rounding_of_values(network: Network) -> float:

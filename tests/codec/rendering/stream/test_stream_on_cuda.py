@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pretended_cuda import MixedDevices, pretended_cuda
+import torch
+from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
 from fhash_codec import Volume
+from fhash_codec.paper.engines.fused import driver
+from fhash_codec.paper.engines.fused.points import FusedPoints
 from fhash_codec.rendering.stream import canvas, fields
 from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.stream.stream import stream
@@ -21,6 +25,8 @@ from fhash_codec.rendering.task.task import Task
 
 Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
 
+EMULATOR = Path(__file__).parents[2] / "paper" / "engines" / "fused"
+"""The folder of the module `emulator`."""
 OF_A_PICTURE = 8
 """Waits of a picture besides those of its passes: the rays at the start, counters, and results."""
 WAITS = 8
@@ -44,6 +50,13 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 """Scenes of a decoded frame."""
+NETWORKS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "shaded": {"step": 0.7, "effects": {"shading": True, "buffers": ["depth", "normal"]}},
+    "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
+    "surfaces": {"effects": {"isosurfaces": [{"value": 5, "opacity": 0.5}, {"value": 7}]}},
+}
+"""Scenes of a network for the fused kernels."""
 
 
 def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, Any]) -> None:
@@ -74,6 +87,42 @@ def test_a_pass_through_a_network_waits_little(
     planned: Planned, files: dict[str, Path], network_scene: dict[str, Any]
 ) -> None:
     assert_a_pass_waits_little(planned, files["paper"], network_scene)
+
+
+@pytest.fixture(scope="module")
+def kernels_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the compiled kernels; the test is skipped without g++."""
+    if shutil.which("g++") is None:
+        pytest.skip("g++ compiles the emulated kernels, and is not here")
+    return tmp_path_factory.mktemp("kernels")
+
+
+@pytest.mark.parametrize("scene", NETWORKS)
+def test_a_pass_through_fused_kernels_waits_little(
+    planned: Planned,
+    files: dict[str, Path],
+    kernels_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    scene: str,
+) -> None:
+    """The kernels are emulated on the tensors of the pretended device."""
+    monkeypatch.syspath_prepend(str(EMULATOR))
+    from emulator import EmulatedDevice
+
+    device, used = EmulatedDevice(kernels_folder), set()
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(driver, "CudaDevice", lambda _: device)
+    for name in ("values", "slopes"):
+        plain = getattr(FusedPoints, name)
+
+        def watched(self: Any, places: Any, plain: Any = plain, name: str = name) -> Any:
+            assert places.device == CUDA
+            used.add(name)
+            return plain(self, places)
+
+        monkeypatch.setattr(FusedPoints, name, watched)
+    assert_a_pass_waits_little(planned, files["paper"], NETWORKS[scene])
+    assert used == {"values", "slopes"}
 
 
 @pytest.mark.parametrize(

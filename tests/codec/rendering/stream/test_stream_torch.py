@@ -12,7 +12,7 @@ import pytest
 import fhash_codec
 from fhash_codec import Volume
 from fhash_codec.paper.network import Network
-from fhash_codec.rendering.stream import fields
+from fhash_codec.rendering.stream import inference
 from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.stream.inference import PatchInference
 from fhash_codec.rendering.stream.stream import stream
@@ -117,7 +117,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # Other values would turn decisions: where a ray ends, and on which side of a kink it is lit.
-    monkeypatch.setattr(fields, "DenseInference", HostInference)
+    monkeypatch.setattr(inference, "DenseInference", HostInference)
     with fhash_codec.open(files["paper"]) as network:
         here, there = (
             stream(*planned(network, network_scene, arrays), adaptive=True)

@@ -9,16 +9,11 @@
 // hidden neurons. A matrix of a layer has a row for each input, the row of the bias last, and its
 // outputs are padded to STRIDE numbers.
 
-#ifndef FHASH_SHARED
-#define FHASH_SHARED(name) extern __shared__ float4 name[]
-#endif
-
 constexpr int VERTICES = BRICK_Z * BRICK_Y * BRICK_X;
 constexpr int BRICK_ROWS = BRICK_Z * BRICK_Y;
 constexpr int TILE_ROWS = COLUMNS / BRICK_X;
 constexpr int TILES = (BRICK_ROWS + TILE_ROWS - 1) / TILE_ROWS;
 constexpr int MASK_BYTES = (VERTICES + 7) / 8;
-constexpr int INPUTS = LEVELS * SIZE;
 
 // Adam's decays, 0.9 and 0.999. Computed in float32, 1 - 0.999f would be off by 1e-5.
 constexpr float REST1 = 0.1f;

@@ -3,6 +3,11 @@
 // The threads form GROUPS groups; a group covers all columns, four in each thread. A row of a
 // matrix of activations has PITCH numbers, four more than columns: rows begin in different banks.
 
+#ifndef FHASH_SHARED
+#define FHASH_SHARED(name) extern __shared__ float4 name[]
+#endif
+
+constexpr int INPUTS = LEVELS * SIZE;
 constexpr int COLUMN_GROUP = COLUMNS / 4;
 constexpr int GROUPS = THREADS / COLUMN_GROUP;
 constexpr int LAST_ROWS = (LAYERS ? WIDTH : INPUTS) + 1;  // inputs of the last layer and its bias
@@ -81,6 +86,7 @@ __device__ inline void load_weights(float (&weights)[COUNT], const float* at) {
 }
 
 // Writes a hidden layer: out = max(0, matrix^T in), WIDTH rows of INNER + 1 inputs with the ones.
+// What is not a number stays.
 template <int INNER>
 __device__ inline void forward(const float* matrix, const float* in, float* out) {
     constexpr int ROWS = rows_for(WIDTH);
@@ -100,7 +106,7 @@ __device__ inline void forward(const float* matrix, const float* in, float* out)
             if (first + r < WIDTH) {
                 float* at = out + (first + r) * PITCH + column;
 #pragma unroll
-                for (int c = 0; c < 4; c++) at[c] = fmaxf(sum[r][c], 0.f);
+                for (int c = 0; c < 4; c++) at[c] = sum[r][c] < 0.f ? 0.f : sum[r][c];
             }
         }
     }

@@ -1,7 +1,7 @@
-"""A program: some steps of emulated kernels under AddressSanitizer; a planted fault if asked.
+"""A program: emulated kernels under AddressSanitizer; a planted fault if asked.
 
-Arguments: the folder of the libraries, the number of hidden layers, and a text of the kernels with
-what replaces it, or nothing.
+Arguments: the folder of the libraries, `bricks` for some steps of training or `points`, the number
+of hidden layers, and a text of the kernels with what replaces it, or nothing.
 """
 
 from __future__ import annotations
@@ -11,29 +11,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from emulator import EmulatedDevice
+from emulator import EmulatedDevice, HeldTable
 
 from fhash_codec.coreset.bricks import build_coreset
 from fhash_codec.coreset.features import Interval
 from fhash_codec.coreset.scan import scan
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.fused.engine import FusedEngine
+from fhash_codec.paper.engines.fused.points import FusedPoints, PointKernels
+from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 
 
-def main(folder: str, layers: str, old: str = "", new: str = "") -> None:
+def bricks(device: EmulatedDevice, layers: int) -> None:
+    """Train and evaluate, with atomics and in a fixed order."""
     series = ArraySeries(np.random.default_rng(3).random((2, 5, 9, 13), dtype=np.float32))
     coreset = build_coreset(series, scan(series, silent), range(2), [Interval(0.3, 1.0)], 0, silent)
-    architecture = Architecture.for_box(coreset.box.shape, 2, width=12, hidden_layers=int(layers))
-
-    def change(text: str) -> str:
-        assert not old or old in text
-        return text.replace(old, new) if old else text
-
-    device = EmulatedDevice(
-        Path(folder), change=change, flags=("-fsanitize=address", "-g1"), order=3
-    )
+    architecture = Architecture.for_box(coreset.box.shape, 2, width=12, hidden_layers=layers)
     engine = FusedEngine(
         architecture, coreset, np.full(9, 0.01), seed=7, device=torch.device("cpu"), kernels=device
     )
@@ -43,6 +38,40 @@ def main(folder: str, layers: str, old: str = "", new: str = "") -> None:
         engine.train(every[int(deterministic) :])
     engine.infer(every)
     engine.settle()
+
+
+def points(device: EmulatedDevice, layers: int) -> None:
+    """Evaluate places of the whole box, its far corner too, by tables with and without bitmaps."""
+    random, box = np.random.default_rng(3), (5, 9, 13)
+    architecture = Architecture.for_box(box, 2, width=12, hidden_layers=layers)
+    last = np.array(box[::-1]) - 1.0
+    places = np.concatenate([random.uniform(0, last, (90, 3)), [0 * last, last]])
+    for table in (ArrayTable, HeldTable):
+        network = Network(
+            levels=architecture.levels,
+            embedding_size=2,
+            tables=[table(random.random((*level, 2))) for level in architecture.levels],
+            layers=tuple(
+                (random.random(shape, np.float32), random.random(shape[0], np.float32))
+                for shape in architecture.layer_shapes
+            ),
+            box_size=box,
+            key_frames=2,
+        )
+        fused = FusedPoints(network, 0.4, device=torch.device("cpu"), kernels=PointKernels(device))
+        fused.values(torch.from_numpy(places))
+        fused.slopes(torch.from_numpy(places))
+
+
+def main(folder: str, kernels: str, layers: str, old: str = "", new: str = "") -> None:
+    def change(text: str) -> str:
+        assert not old or old in text
+        return text.replace(old, new) if old else text
+
+    device = EmulatedDevice(
+        Path(folder), change=change, flags=("-fsanitize=address", "-g1"), order=3
+    )
+    {"bricks": bricks, "points": points}[kernels](device, int(layers))
     print("done")
 
 

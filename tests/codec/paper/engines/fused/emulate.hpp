@@ -152,6 +152,7 @@ std::function<void()> bound(void (*kernel)(A...), void** arguments) {
 }  // namespace emulated
 
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
+inline int __popcll(unsigned long long bits) { return __builtin_popcountll(bits); }
 
 inline float atomicAdd(float* to, float number) {
     const float old = *to;

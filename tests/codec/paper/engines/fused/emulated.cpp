@@ -1,5 +1,5 @@
 // A library of the kernels in the file KERNELS, with a function that launches them, and one that
-// leaves out the barrier of a line.
+// leaves out the barrier of a line. FHASH_KERNELS lists them as FHASH_KERNEL(name), ...
 #include "emulate.hpp"
 #include KERNELS
 
@@ -9,9 +9,7 @@
 extern "C" int launch(
     const char* name, unsigned blocks, std::size_t bytes, int order, void** arguments) {
     using Bind = std::function<void()> (*)(void**);
-    static const std::pair<const char*, Bind> kernels[] = {
-        FHASH_KERNEL(train_bricks), FHASH_KERNEL(infer_bricks), FHASH_KERNEL(move_flat),
-        FHASH_KERNEL(sum_entries), FHASH_KERNEL(settle_bricks)};
+    static const std::pair<const char*, Bind> kernels[] = {FHASH_KERNELS};
     for (const auto& [known, bind] : kernels)
         if (!std::strcmp(known, name))
             return emulated::launch(blocks, THREADS, bytes, order, bind(arguments));

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.paper.engines.fused.source import DeviceLimits, KernelSizes, Unavailable
+from fhash_codec.paper.engines.fused.source import DeviceLimits, Sizes, Unavailable
+from fhash_codec.paper.network import ArrayTable
+from fhash_codec.paper.tables.ranked import SparseFrame
 
 HERE = Path(__file__).parent
 LIMITS = DeviceLimits(
@@ -76,11 +79,19 @@ class EmulatedDevice:
         self.limits, self.order, self.new = replace(LIMITS, **limits), order, new
         self._folder, self._change, self._flags = folder, change, flags
 
-    def load(self, sizes: KernelSizes) -> EmulatedProgram:
+    def load(self, sizes: Sizes) -> EmulatedProgram:
         text = self._change(sizes.text())
         program = EmulatedProgram(compiled(text, self._folder, self._flags), self.order)
         program.new = self.new
         return program
+
+
+class HeldTable(ArrayTable):
+    """A table in memory that holds the vertices whose embeddings are not 0, at each time others."""
+
+    def frame(self, node: int) -> SparseFrame:
+        held = self.values[node].any(axis=-1)
+        return SparseFrame.of(held, self.values[node][held])
 
 
 def compiled(text: str, folder: Path, flags: Sequence[str] = ()) -> Path:
@@ -90,6 +101,7 @@ def compiled(text: str, folder: Path, flags: Sequence[str] = ()) -> Path:
     if not library.exists():
         source = folder / f"{name}.cu"
         source.write_text(text)
+        kernels = re.findall(r'extern "C" __global__.*?(\w+)\(\n', text)
         subprocess.run(
             [
                 "g++",
@@ -103,6 +115,7 @@ def compiled(text: str, folder: Path, flags: Sequence[str] = ()) -> Path:
                 "-Wno-unused-variable",
                 "-U_FORTIFY_SOURCE",
                 f'-DKERNELS="{source}"',
+                f"-DFHASH_KERNELS={','.join(f'FHASH_KERNEL({name})' for name in kernels)}",
                 *flags,
                 str(HERE / "emulated.cpp"),
                 "-o",

@@ -40,20 +40,32 @@ def trial(library_folder):
     return run
 
 
-def test_kernels_stay_within_their_arrays(trial) -> None:
-    done = trial("2")
+@pytest.mark.parametrize("kernels", ["bricks", "points"])
+def test_kernels_stay_within_their_arrays(trial, kernels) -> None:
+    done = trial(kernels, "2")
     assert done.stdout.strip() == "done", done.stderr[-3000:]
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
+    ("kernels", "old", "new"),
     [
-        ("model.fine[place] = number", "model.fine[place + SIZE * VERTICES] = number"),
-        ("at.slopes[LATTICE_AT[level] + i] += sum", "at.slopes[AT_END - AT_SLOPES + i % 4] += sum"),
+        ("bricks", "model.fine[place] = number", "model.fine[place + SIZE * VERTICES] = number"),
+        (
+            "bricks",
+            "at.slopes[LATTICE_AT[level] + i] += sum",
+            "at.slopes[AT_END - AT_SLOPES + i % 4] += sum",
+        ),
+        ("points", "level.scale[a] - 1. : 0.", "level.scale[a] : 0."),
+        ("points", "level.words[bit >> 6]", "level.words[(bit >> 6) + 1]"),
+        (
+            "points",
+            "tile.parts[(share * 3 + a) * COLUMNS + own]",
+            "tile.parts[AT_END - AT_PARTS + a]",
+        ),
     ],
-    ids=["the device's memory", "shared memory"],
+    ids=["the device's memory", "shared memory", "a table", "a bitmap", "shared memory of points"],
 )
-def test_an_access_beyond_an_array_is_seen(trial, old, new) -> None:
-    done = trial("1", old, new)
+def test_an_access_beyond_an_array_is_seen(trial, kernels, old, new) -> None:
+    done = trial(kernels, "1", old, new)
     assert done.returncode != 0
     assert "AddressSanitizer: heap-buffer-overflow" in done.stderr

@@ -9,6 +9,7 @@ import pytest
 
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.fused.nvrtc import Nvrtc, find_nvrtc
+from fhash_codec.paper.engines.fused.points import point_sizes
 from fhash_codec.paper.engines.fused.source import DeviceLimits, Unavailable, kernel_sizes
 
 MAX_REGISTERS = 128
@@ -59,21 +60,42 @@ def test_kernels_need_few_registers_and_no_local_memory(
     nvrtc, sizes_of, architecture, width, layers, size
 ) -> None:
     sizes = sizes_of(architecture, width=width, hidden_layers=layers, embedding_size=size)
-    cubin, log = nvrtc.compile(sizes.text(), architecture)
-    assert cubin.startswith(b"\x7fELF")
-    kernels = {match["name"]: match for match in KERNEL.finditer(log)}
-    assert set(kernels) == {
+    assert assert_few_resources(nvrtc, sizes, architecture) == {
         "train_bricks",
         "infer_bricks",
         "move_flat",
         "sum_entries",
         "settle_bricks",
     }
+
+
+@pytest.mark.parametrize("architecture", DEVICES)
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize(
+    ("width", "layers", "size"),
+    [(64, 0, 2), (16, 1, 1), (64, 1, 2), (64, 2, 2), (64, 2, 8), (128, 2, 4)],
+)
+def test_kernels_of_points_need_few_registers_and_no_local_memory(
+    nvrtc, architecture, sparse, width, layers, size
+) -> None:
+    model = Architecture.for_box(
+        (21, 48, 60), 4, width=width, hidden_layers=layers, embedding_size=size
+    )
+    sizes = point_sizes(model, sparse, DEVICES[architecture])
+    assert assert_few_resources(nvrtc, sizes, architecture) == {"values_at", "slopes_at"}
+
+
+def assert_few_resources(nvrtc, sizes, architecture) -> set[str]:
+    """Compile the kernels for some sizes; return their names."""
+    cubin, log = nvrtc.compile(sizes.text(), architecture)
+    assert cubin.startswith(b"\x7fELF")
+    kernels = {match["name"]: match for match in KERNEL.finditer(log)}
     for match in kernels.values():
         assert int(match["registers"]) <= MAX_REGISTERS
         # A frame on the stack, spilled registers or local memory would be named where not 0.
         used = re.findall(r"(\d+) bytes (stack frame|spill \w+|lmem|cumulative stack)", match[0])
         assert not [number for number, _ in used if int(number)], match[0]
+    return set(kernels)
 
 
 def test_a_kernel_with_local_memory_is_seen(nvrtc) -> None:

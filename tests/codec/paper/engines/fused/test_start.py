@@ -11,8 +11,9 @@ import torch
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.fused import driver
 from fhash_codec.paper.engines.fused.engine import FusedEngine
+from fhash_codec.paper.engines.fused.points import FusedPoints
 from fhash_codec.paper.engines.fused.source import Unavailable
-from fhash_codec.paper.engines.fused.start import start_fused
+from fhash_codec.paper.engines.fused.start import start_fused, start_points
 from fhash_formats.errors import FhashWarning, InputError
 
 
@@ -76,3 +77,45 @@ def test_the_engine_is_started_on_the_device(start, monkeypatch, emulated) -> No
     engine = start(Cuda(), required=True)
     assert isinstance(engine, FusedEngine)
     assert float(engine.train(np.array([0]))) > 0
+
+
+def test_points_are_left_to_torch_without_cuda(networks, monkeypatch) -> None:
+    network = networks.random((5, 6, 7), 2, 2, 2, 1)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert start_points(network, 0.5, torch.device("cpu")) is None
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert start_points(network, 0.5, Cuda()) is None
+
+
+def test_points_that_the_kernels_cannot_do_are_left_to_torch_with_one_warning(
+    networks, monkeypatch, emulated
+) -> None:
+    network, device = networks.random((5, 6, 7), 2, 2, 2, 3), Cuda()
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(driver, "CudaDevice", lambda device: emulated())
+    with pytest.warns(
+        FhashWarning, match="rays march by torch, since .*: the network has 3 hidden"
+    ):
+        assert start_points(network, 0.5, device) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert start_points(network, 0.5, device) is None
+
+
+def test_points_are_started_on_a_device_that_is_looked_at_once(
+    networks, monkeypatch, emulated
+) -> None:
+    looked, device = [], Cuda()
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(driver, "CudaDevice", lambda device: looked.append(device) or emulated())
+    original = FusedPoints.__init__
+
+    def on_cpu(self, *arguments, device, **settings):
+        original(self, *arguments, device=torch.device("cpu"), **settings)
+
+    monkeypatch.setattr(FusedPoints, "__init__", on_cpu)
+    for key in (0.0, 0.5):
+        points = start_points(networks.random((5, 6, 7), 2, 2, 2, 1), key, device)
+        assert isinstance(points, FusedPoints)
+        assert points.values(torch.ones(3, 3, dtype=torch.float64)).isfinite().all()
+    assert looked == [device]
