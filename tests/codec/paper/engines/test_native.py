@@ -241,16 +241,13 @@ def test_other_learning_rates_count_from_the_next_step_on(model_of) -> None:
         assert len(errors) == 1
 
 
-def test_embeddings_that_no_sample_moved_are_stored_as_zero(in_coreset, model_of) -> None:
+def test_training_holds_the_finest_embeddings_of_samples_alone(model_of) -> None:
     coreset, architecture = model_of(((3, 9, 20, 35), {"hidden_layers": 1}))
     engine = NativeEngine(architecture, coreset, RATES, seed=7)
     engine.train(np.arange(len(coreset.bricks)))
-    fine = engine.parameters().fine.numpy()
-    mask = in_coreset(coreset)
-    outside = np.moveaxis(fine, 1, -1)[~mask]
-    assert not outside.any()
-    assert not np.signbit(outside).any()
-    assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
+    for numbers in (engine.fine, engine.fine_mean, engine.fine_square, engine.parameters().fine):
+        assert numbers.shape == (2, len(coreset.values))
+        assert (numbers != 0).all()
 
 
 def test_a_state_of_another_model_is_refused(model_of) -> None:

@@ -24,7 +24,7 @@ def architecture(coreset) -> Architecture:
 
 def test_a_model_is_numbers_of_every_level_and_layer(coreset, architecture, tmp_path) -> None:
     trained = train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
-    assert trained.fine.shape == (len(coreset.bricks), 2, prod(coreset.brick_shape))
+    assert trained.fine.shape == (2, len(coreset.values))
     assert [table.shape for table in trained.tables] == [
         (prod(level), 2) for level in architecture.levels[1:]
     ]
@@ -53,3 +53,24 @@ def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_pat
     save_checkpoint(path, {"step": np.array(3)}, TrainingProgress(epoch=0, batch=1))
     with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
+
+
+@pytest.mark.parametrize("engine", ["native", "slab"])
+def test_a_checkpoint_of_whole_bricks_is_refused(
+    coreset, architecture, tmp_path, engine, monkeypatch
+) -> None:
+    """The finest embeddings were once stored for all vertices of the bricks."""
+    if engine == "slab":
+        monkeypatch.setenv("FHASH_NATIVE", "0")
+    config = replace(CONFIG, engine="auto")
+    new = make_engine(
+        "auto", architecture, coreset, np.zeros(2), seed=0, device=torch.device("cpu")
+    )
+    state = new.state()
+    bricks = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)
+    for name in ("fine", "fine_mean", "fine_square"):
+        state[name] = bricks
+    path = checkpoint_path(tmp_path / "a.fhz", coreset, config)
+    save_checkpoint(path, state, TrainingProgress(epoch=0, batch=1))
+    with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
+        train_model(coreset, architecture, config, tmp_path / "a.fhz")

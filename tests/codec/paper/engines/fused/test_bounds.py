@@ -48,7 +48,7 @@ def test_kernels_stay_within_their_arrays(trial) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("model.fine[place] = number", "model.fine[place + SIZE * VERTICES] = number"),
+        ("model.fine_square[place] = square", "model.fine_square[place + 2] = square"),
         ("at.slopes[LATTICE_AT[level] + i] += sum", "at.slopes[AT_END - AT_SLOPES + i % 4] += sum"),
     ],
     ids=["the device's memory", "shared memory"],
