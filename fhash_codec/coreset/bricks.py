@@ -83,8 +83,9 @@ class Coreset:
         """Places (n,) in `values` of the samples of some bricks, in their order."""
         first = self.offsets[chosen]
         counts = self.offsets[chosen + 1] - first
-        ends = np.cumsum(counts)
-        return np.arange(counts.sum()) + np.repeat(first - ends + counts, counts)
+        starts = np.cumsum(counts) - counts
+        places: npt.NDArray[np.int64] = np.arange(counts.sum()) + np.repeat(first - starts, counts)
+        return places
 
 
 def build_coreset(

@@ -357,9 +357,7 @@ class _GapTables:
         }
         self.structure = Gaps(**{name: a.ctypes.data for name, a in self._tables.items()})
 
-    def settle(
-        self, arrays: list[Floats], visited: npt.NDArray[np.int64], step: int
-    ) -> None:
+    def settle(self, arrays: list[Floats], visited: npt.NDArray[np.int64], step: int) -> None:
         """Let numbers and their moments catch up, in place.
 
         Args:

@@ -7,8 +7,8 @@ batch is a random set of bricks. The same code runs on a CPU and on CUDA; there 
 for a step, sends it one message (sending.py), and launches it as one graph (graphs.py).
 
 The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the bricks
-of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on its missing
-steps, whose gradient is zero, in closed form before it is used (`training.adam.catch_up`).
+of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on its
+missing steps, whose gradient is zero, in closed form before it is used (`training.adam.catch_up`).
 """
 
 from __future__ import annotations

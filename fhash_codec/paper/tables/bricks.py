@@ -65,12 +65,12 @@ class Bricks:
         window = self._window(key, box)
         in_coreset = self._in_coreset(window.numbers)
         places = self._coreset.places(window.numbers)
-        result = np.empty((*box.shape, len(fine)), np.float32)
-        for component, numbers in enumerate(fine):
+        regions = []
+        for numbers in fine:
             contents = np.zeros(in_coreset.shape, np.float32)
             contents[in_coreset] = numbers[places]
-            result[..., component] = self._region(contents, window, box)
-        return result
+            regions.append(self._region(contents, window, box))
+        return np.stack(regions, axis=-1)
 
     def _place(self, key: Integers, z: Integers, y: Integers, x: Integers) -> Integers:
         """Return the place of bricks in the grids of all key frames, in C order."""

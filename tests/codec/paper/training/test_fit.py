@@ -6,9 +6,11 @@ from math import prod
 
 import numpy as np
 import pytest
+import torch
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.checkpoint import checkpoint_path, save_checkpoint
 from fhash_codec.paper.training.fit import train_model
 from fhash_codec.paper.training.train import LOWER, MAX_RESTARTS, TrainingProgress
@@ -55,22 +57,17 @@ def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_pat
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
 
 
-@pytest.mark.parametrize("engine", ["native", "slab"])
+@pytest.mark.parametrize("native", ["0", "1"])
 def test_a_checkpoint_of_whole_bricks_is_refused(
-    coreset, architecture, tmp_path, engine, monkeypatch
+    coreset, architecture, tmp_path, native, monkeypatch
 ) -> None:
     """The finest embeddings were once stored for all vertices of the bricks."""
-    if engine == "slab":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    config = replace(CONFIG, engine="auto")
-    new = make_engine(
-        "auto", architecture, coreset, np.zeros(2), seed=0, device=torch.device("cpu")
-    )
-    state = new.state()
-    bricks = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)
-    for name in ("fine", "fine_mean", "fine_square"):
-        state[name] = bricks
-    path = checkpoint_path(tmp_path / "a.fhz", coreset, config)
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    device = torch.device("cpu")
+    engine = make_engine("auto", architecture, coreset, np.zeros(2), seed=0, device=device)
+    whole = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)
+    state = engine.state() | dict.fromkeys(("fine", "fine_mean", "fine_square"), whole)
+    path = checkpoint_path(tmp_path / "a.fhz", coreset, CONFIG)
     save_checkpoint(path, state, TrainingProgress(epoch=0, batch=1))
     with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
-        train_model(coreset, architecture, config, tmp_path / "a.fhz")
+        train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
