@@ -188,8 +188,9 @@ class NativeEngine:
             part = slice(ends[0], ends[-1])
             self._gap_tables().settle(
                 [array[:, part] for array in (self.fine, self.fine_mean, self.fine_square)],
-                np.repeat(visited, np.diff(ends)),
+                visited,
                 self.step,
+                np.diff(ends),
             )
         self.visited[self.visited > 0] = self.step
 
@@ -317,8 +318,8 @@ class NativeEngine:
         if self._current is None or self._current[0] != self.step:
             self._catch_up_gaps()
             arrays = [_padded(array) for array in (self.flat, self.flat_mean, self.flat_square)]
-            visited = np.repeat(self.blocks, BLOCK)[: self.lazy]
-            self._gap_tables().settle([a[: self.lazy] for a in arrays], visited, self.step)
+            behind = [array[: self.lazy] for array in arrays]
+            self._gap_tables().settle(behind, self.blocks, self.step, BLOCK)
             self._current = (self.step, arrays)
         return self._current[1]
 
@@ -357,21 +358,35 @@ class _GapTables:
         }
         self.structure = Gaps(**{name: a.ctypes.data for name, a in self._tables.items()})
 
-    def settle(self, arrays: list[Floats], visited: npt.NDArray[np.int64], step: int) -> None:
+    def settle(
+        self,
+        arrays: list[Floats],
+        visited: npt.NDArray[np.int64],
+        step: int,
+        lengths: npt.NDArray[np.int64] | int,
+    ) -> None:
         """Let numbers and their moments catch up, in place.
 
         Args:
             arrays: numbers (..., n), and the two moments of each.
-            visited: last step with a gradient of each number (n,), 0 for none.
+            visited: last step with a gradient of each run of numbers (runs,), 0 for none.
             step: step up to which they catch up.
+            lengths: numbers of each run; those of the last one may be fewer.
         """
         numbers, mean, square = arrays
         missed = np.where(visited > 0, step - visited, 0)
         at = np.where(missed > 0, visited, 0)
-        factor = np.where(missed > 0, self._tables["factor"][at], np.float32(0))
-        epsilon = self._tables["epsilon"][at]
-        # Where nothing was missed nothing changes, and the root of 0 divides nothing.
-        root = np.sqrt(square) + np.where(epsilon > 0, epsilon, np.float32(1))
-        numbers -= factor * mean / root
-        mean *= self._tables["mean_decay"][missed]
-        square *= self._tables["square_decay"][missed]
+        of_gap = self._tables["epsilon"][at]
+        columns = (
+            np.where(missed > 0, self._tables["factor"][at], np.float32(0)),
+            # Where nothing was missed nothing changes, and the root of 0 divides nothing.
+            np.where(of_gap > 0, of_gap, np.float32(1)),
+            self._tables["mean_decay"][missed],
+            self._tables["square_decay"][missed],
+        )
+        factor, epsilon, mean_decay, square_decay = (
+            np.repeat(column, lengths)[: numbers.shape[-1]] for column in columns
+        )
+        numbers -= factor * mean / (np.sqrt(square) + epsilon)
+        mean *= mean_decay
+        square *= square_decay
