@@ -137,8 +137,8 @@ inline std::int64_t fine_at(const FhashBricks& b, std::int64_t brick, std::int64
     return e * b.samples + b.offsets[brick];
 }
 
-// Write the inputs at the samples of a brick, and return their rows: those of all vertices where all
-// are samples. `flat` holds the coarse tables, caught up.
+// Write the inputs at the samples of a brick, and return their rows: those of all vertices where
+// all are samples. `flat` holds the coarse tables, caught up.
 template <class P>
 FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
                               const float* flat, std::int64_t samples, std::int64_t* run_count) {
@@ -156,14 +156,14 @@ FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap&
         fill_vector<P>(to, samples);
     }
     const std::int32_t* place = b.bricks + 4 * brick;
-    std::int64_t* rows_of_corners = t.w.rows;
+    std::int64_t* corner_rows = t.w.rows;
     for (std::int64_t l = 0; l < b.levels; l++) {
         const FhashLevel& level = b.level[l];
-        std::int64_t* row_of_corners = rows_of_corners;
+        std::int64_t* row_of_corners = corner_rows;
         for_rows(b, level, place, [&](std::int64_t at) { *row_of_corners++ = at; });
-        interpolate<P>(Place(b, level, place, rows_of_corners), flat, t.w.planes,
+        interpolate<P>(Place(b, level, place, corner_rows), flat, t.w.planes,
                        t.w.inputs + (l + 1) * b.embedding * row, row);
-        rows_of_corners += level.corners[0] * level.corners[1] * level.corners[2];
+        corner_rows += level.corners[0] * level.corners[1] * level.corners[2];
     }
     if (whole) return rows;
     *run_count = runs_of(t, brick);
