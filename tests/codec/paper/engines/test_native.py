@@ -250,6 +250,21 @@ def test_training_holds_the_finest_embeddings_of_samples_alone(model_of) -> None
         assert (numbers != 0).all()
 
 
+def test_a_step_writes_the_samples_of_its_bricks_alone(model_of, path) -> None:
+    """Rows of samples begin and end anywhere: a vector must not reach into a neighbour's."""
+    coreset, architecture = model_of(((2, 9, 20, 35), {"hidden_layers": 1, "low": 0.7}))
+    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    for chosen in (np.arange(0, len(coreset.bricks), 2), np.array([2])):
+        before = [numbers.copy() for numbers in (engine.fine, engine.fine_mean, engine.fine_square)]
+        engine.train(chosen)
+        own = np.zeros(len(coreset.values), bool)
+        own[coreset.places(chosen)] = True
+        after = (engine.fine, engine.fine_mean, engine.fine_square)
+        for old, new in zip(before, after, strict=True):
+            np.testing.assert_array_equal(old[:, ~own], new[:, ~own])
+            assert (old[:, own] != new[:, own]).all()
+
+
 def test_a_state_of_another_model_is_refused(model_of) -> None:
     coreset, architecture = model_of("plain")
     engine = NativeEngine(architecture, coreset, RATES, seed=7)
