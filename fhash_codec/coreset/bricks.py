@@ -81,8 +81,11 @@ class Coreset:
 
     def places(self, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Places (n,) in `values` of the samples of some bricks, in their order."""
-        spans = zip(self.offsets[chosen].tolist(), self.offsets[chosen + 1].tolist(), strict=True)
-        return np.concatenate([np.arange(first, end) for first, end in spans])
+        first = self.offsets[chosen]
+        counts = self.offsets[chosen + 1] - first
+        starts = np.cumsum(counts) - counts
+        places: npt.NDArray[np.int64] = np.arange(counts.sum()) + np.repeat(first - starts, counts)
+        return places
 
 
 def build_coreset(

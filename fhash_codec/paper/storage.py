@@ -129,8 +129,8 @@ def write_tables(
     Args:
         writer: the container that is being written.
         architecture: the sizes of the tables.
-        coreset: the coreset, whose bricks the finest embeddings belong to.
-        fine: embeddings of the finest level (bricks, E, vertices of a brick).
+        coreset: the coreset, whose samples the finest embeddings belong to.
+        fine: embeddings of the finest level (E, samples), in the order of `Coreset.values`.
         tables: embeddings of the coarser levels, each (buckets, E).
         kind: name of the number type in the file.
         sparse: whether the file gets the embeddings of needed vertices alone.
@@ -172,13 +172,20 @@ def write_tables(
 
 
 def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
-    """Return the finest table (z, y, x, E) of one key frame from its bricks; 0 outside of them."""
-    size = fine.shape[1]
+    """Return the finest table (z, y, x, E) of one key frame, 0 at vertices that are no samples.
+
+    `fine` has the embeddings (E, samples) of all key frames.
+    """
+    size = len(fine)
     grid, shape = coreset.brick_grid, coreset.brick_shape
     blocks = np.zeros((*grid, *shape, size), dtype=np.float32)
-    chosen = np.flatnonzero(coreset.bricks[:, 0] == key)
-    z, y, x = coreset.bricks[chosen, 1:].T
-    blocks[z, y, x] = np.moveaxis(fine[chosen].reshape(-1, size, *shape), 1, -1)
+    # The coreset has its bricks in ascending order, the key frame first.
+    first, end = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
+    z, y, x = coreset.bricks[first:end, 1:].T
+    bits = np.unpackbits(coreset.mask_bits[first:end], axis=1, count=prod(shape))
+    embeddings = np.zeros((*bits.shape, size), dtype=np.float32)
+    embeddings[bits != 0] = fine[:, coreset.offsets[first] : coreset.offsets[end]].T
+    blocks[z, y, x] = embeddings.reshape(-1, *shape, size)
     padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(
         *(g * s for g, s in zip(grid, shape, strict=True)), size
     )

@@ -133,3 +133,16 @@ def catch_up(visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.fl
         mean_decay=(BETA1 ** missed.astype(np.float64)).astype(np.float32),
         square_decay=(BETA2 ** missed.astype(np.float64)).astype(np.float32),
     )
+
+
+def catch_up_numbers(numbers: Tensor, effect: Tensor) -> None:
+    """Let parameters and their moments catch up on missed steps, in place.
+
+    Args:
+        numbers: the parameters, their mean and their mean square, (3, E, n).
+        effect: the columns of a `CatchUp`, (4, n).
+    """
+    parameter, mean, square = numbers
+    factor, epsilon = effect[:2]
+    parameter.addcdiv_(mean * factor, square.sqrt().add_(epsilon), value=-1.0)
+    numbers[1:].mul_(effect[2:].unsqueeze(1))

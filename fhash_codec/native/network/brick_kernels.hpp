@@ -18,7 +18,7 @@ namespace {
 struct Work {
     std::int64_t row;      // numbers from one row of inputs to the next
     float* inputs;         // (inputs + 1, row): at all vertices; the last row is 1
-    float* picked;         // the same of the samples alone
+    float* picked;         // the same of the samples alone, where not all vertices are
     Planes planes;
     float* mlp;
     std::int32_t* runs;    // (vertices + 1,): first vertex and end of each run of samples
@@ -99,9 +99,14 @@ template <class P> FHASH_INLINE std::int64_t runs_of(const Thread<P>& t, std::in
     return edges / 2;
 }
 
+// Write zeros behind some numbers to the end of a vector.
+template <class P> FHASH_INLINE void fill_vector(float* row, std::int64_t count) {
+    for (; count % P::N; count++) row[count] = 0;
+}
+
 // Copy runs of the numbers of a row side by side, and zeros behind them to the end of a vector.
 template <class P> FHASH_INLINE void pick(const Thread<P>& t, std::int64_t runs, const float* from,
-                                          float* to, std::int64_t samples) {
+                                          float* to) {
     std::int64_t at = 0;
     for (std::int64_t n = 0; n < runs; n++) {
         const std::int64_t first = t.w.runs[2 * n], length = t.w.runs[2 * n + 1] - first;
@@ -109,7 +114,7 @@ template <class P> FHASH_INLINE void pick(const Thread<P>& t, std::int64_t runs,
             store<P>(to + at + i, loaded<P>(from + first + i));
         at += length;
     }
-    for (; at < (samples + P::N - 1) / P::N * P::N; at++) to[at] = 0;
+    fill_vector<P>(to, at);
 }
 
 // Copy them back, with zeros between them. What a vector writes too much is written again.
@@ -127,37 +132,44 @@ template <class P> FHASH_INLINE void put_back(const Thread<P>& t, std::int64_t r
     }
 }
 
-// Write the inputs at all vertices of a brick, and return the rows of its samples: those of all
-// vertices where all are samples. `flat` holds the coarse tables, caught up.
+// Where the finest embeddings of a brick's samples begin, for number e of an embedding.
+inline std::int64_t fine_at(const FhashBricks& b, std::int64_t brick, std::int64_t e) {
+    return e * b.samples + b.offsets[brick];
+}
+
+// Write the inputs at the samples of a brick, and return their rows: those of all vertices where
+// all are samples. `flat` holds the coarse tables, caught up.
 template <class P>
 FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap& gap,
                               const float* flat, std::int64_t samples, std::int64_t* run_count) {
     const FhashBricks& b = t.b;
-    const std::int64_t row = t.w.row, numbers = b.embedding * t.vertices;
+    const std::int64_t row = t.w.row;
+    const bool whole = samples == t.vertices;
+    float* const rows = whole ? t.w.inputs : t.w.picked;
     for (std::int64_t e = 0; e < b.embedding; e++) {
-        const std::int64_t at = brick * numbers + e * t.vertices;
+        const std::int64_t at = fine_at(b, brick, e);
+        float* const to = rows + e * row;
         if (gap.factor != 0)
-            catch_up<P>(t.w.inputs + e * row, b.fine + at, b.fine_mean + at, b.fine_square + at,
-                        t.vertices, gap);
+            catch_up<P>(to, b.fine + at, b.fine_mean + at, b.fine_square + at, samples, gap);
         else
-            std::memcpy(t.w.inputs + e * row, b.fine + at, t.vertices * sizeof(float));
+            std::memcpy(to, b.fine + at, samples * sizeof(float));
+        fill_vector<P>(to, samples);
     }
     const std::int32_t* place = b.bricks + 4 * brick;
-    std::int64_t* rows = t.w.rows;
+    std::int64_t* corner_rows = t.w.rows;
     for (std::int64_t l = 0; l < b.levels; l++) {
         const FhashLevel& level = b.level[l];
-        std::int64_t* row_of_corners = rows;
+        std::int64_t* row_of_corners = corner_rows;
         for_rows(b, level, place, [&](std::int64_t at) { *row_of_corners++ = at; });
-        interpolate<P>(Place(b, level, place, rows), flat, t.w.planes,
+        interpolate<P>(Place(b, level, place, corner_rows), flat, t.w.planes,
                        t.w.inputs + (l + 1) * b.embedding * row, row);
-        rows += level.corners[0] * level.corners[1] * level.corners[2];
+        corner_rows += level.corners[0] * level.corners[1] * level.corners[2];
     }
-    if (samples == t.vertices) return t.w.inputs;
-    const std::int64_t runs = runs_of(t, brick);
-    for (std::int64_t n = 0; n < t.inputs; n++)
-        pick(t, runs, t.w.inputs + n * row, t.w.picked + n * row, samples);
-    *run_count = runs;
-    return t.w.picked;
+    if (whole) return rows;
+    *run_count = runs_of(t, brick);
+    for (std::int64_t n = b.embedding; n < t.inputs; n++)
+        pick(t, *run_count, t.w.inputs + n * row, rows + n * row);
+    return rows;
 }
 
 // Chunks of nearly equal length: some vectors of samples each.
@@ -211,14 +223,13 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
         const Gap gap(b.gaps, b.visited[brick], b.step - 1);
         std::int64_t runs = 0;
         float* rows = inputs_of(t, brick, gap, b.flat, samples, &runs);
-        float* const fine = b.fine + brick * b.embedding * t.vertices;
         if (gap.factor != 0)
             for (std::int64_t e = 0; e < b.embedding; e++)
-                std::memcpy(fine + e * t.vertices, t.w.inputs + e * row,
-                            t.vertices * sizeof(float));
+                std::memcpy(b.fine + fine_at(b, brick, e), rows + e * row,
+                            samples * sizeof(float));
         error += backpropagate(t, rows, b.values + b.offsets[brick], samples);
         if (rows == t.w.picked)
-            for (std::int64_t k = 0; k < t.inputs; k++)
+            for (std::int64_t k = b.embedding; k < t.inputs; k++)
                 put_back(t, runs, t.w.picked + k * row, t.w.inputs + k * row);
         const std::int64_t* level_rows = t.w.rows;
         for (std::int64_t l = 0; l < b.levels; l++) {
@@ -228,9 +239,9 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
             level_rows += level.corners[0] * level.corners[1] * level.corners[2];
         }
         for (std::int64_t e = 0; e < b.embedding; e++) {
-            const std::int64_t at = (brick * b.embedding + e) * t.vertices;
-            adam<P>(b.fine + at, b.fine_mean + at, b.fine_square + at, t.w.inputs + e * row,
-                    t.vertices, gap, step);
+            const std::int64_t at = fine_at(b, brick, e);
+            adam<P>(b.fine + at, b.fine_mean + at, b.fine_square + at, rows + e * row, samples,
+                    gap, step);
         }
         b.visited[brick] = b.step;
     }

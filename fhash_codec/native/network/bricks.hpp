@@ -1,9 +1,9 @@
 // The task of the brick engine: a model in training on a coreset. Mirrored field by field in
 // fhash_codec/paper/engines/native_task.py, which also says what the arrays hold.
 //
-// A brick is a box of vertices of one key frame. Its inputs of the MLP are rows over its vertices:
-// first the finest embeddings, which it stores itself, then those of each coarse level,
-// interpolated from a small sub-lattice of that level's table.
+// A brick is a box of vertices of one key frame. Its inputs of the MLP are rows over its samples:
+// first the finest embeddings, which are stored for the samples alone, then those of each coarse
+// level, interpolated at all vertices from a small sub-lattice of that level's table.
 #pragma once
 
 #include "vector.hpp"
@@ -54,7 +54,8 @@ extern "C" struct FhashBricks {
     const float* values;          // (samples,)
     const std::int64_t* offsets;  // (bricks + 1,)
     // The model and its moments.
-    float* fine;                  // (bricks, embedding, vertices)
+    std::int64_t samples;         // of all bricks
+    float* fine;                  // (embedding, samples): those of a brick from its offset on
     float* fine_mean;
     float* fine_square;
     std::int64_t* visited;        // (bricks,): last step with a gradient

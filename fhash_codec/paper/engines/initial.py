@@ -16,6 +16,8 @@ from fhash_codec.paper.architecture import Architecture
 
 SPREAD = 1e-4
 """Bound of the initial embeddings, uniform in -SPREAD .. SPREAD (Müller et al. 2022, section 4)."""
+BRICKS_AT_A_TIME = 1024
+"""Bricks whose vertices draw their embeddings at a time."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,8 @@ class Parameters:
     """The trained numbers of a model.
 
     Attributes:
-        fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that
-            hold coreset vertices.
+        fine: embeddings of the finest level (E, samples), those of the samples alone, in the order
+            of `Coreset.values`. At all other vertices they are 0.
         coarse: the coarser tables, each (buckets, E), level by level in one vector.
         network: the layers, each a matrix (out, in + 1) whose last column is the bias, in one
             vector.
@@ -66,8 +68,7 @@ def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) 
     uniform in +-1/sqrt(inputs), as torch.nn.Linear starts them.
     """
     random = torch.Generator().manual_seed(seed)
-    fine = torch.empty(len(coreset.bricks), architecture.embedding_size, prod(coreset.brick_shape))
-    fine.uniform_(-SPREAD, SPREAD, generator=random)
+    fine = _initial_fine(architecture.embedding_size, coreset, random)
     coarse_numbers = (
         sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
     )
@@ -77,6 +78,24 @@ def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) 
         bound = inputs**-0.5
         layers.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
     return Parameters(fine=fine, coarse=coarse, network=torch.cat(layers))
+
+
+def _initial_fine(size: int, coreset: Coreset, random: torch.Generator) -> Tensor:
+    """Return the finest embeddings (E, samples) at the start.
+
+    All vertices of a brick draw a number, samples or not: where a vertex starts depends on its
+    brick alone.
+    """
+    fine = torch.empty(size, len(coreset.values))
+    vertices = prod(coreset.brick_shape)
+    for first in range(0, len(coreset.bricks), BRICKS_AT_A_TIME):
+        bits = coreset.mask_bits[first : first + BRICKS_AT_A_TIME]
+        drawn = torch.empty(len(bits), size, vertices)
+        drawn.uniform_(-SPREAD, SPREAD, generator=random)
+        in_coreset = torch.from_numpy(np.unpackbits(bits, axis=1, count=vertices)).bool()
+        span = slice(*coreset.offsets[[first, first + len(bits)]].tolist())
+        fine[:, span] = drawn.transpose(0, 1)[:, in_coreset]
+    return fine
 
 
 def check_state(

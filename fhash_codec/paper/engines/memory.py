@@ -24,11 +24,12 @@ def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> 
         batches: batches of an epoch.
     """
     bricks, vertices = len(coreset.bricks), prod(coreset.brick_shape)
+    samples = len(coreset.values) + 1
     size = architecture.embedding_size
     coarse = size * sum(prod(level) for level in architecture.levels[1:])
     network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
     # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
-    held = 12 * bricks * size * vertices + 4 * len(coreset.values) + coreset.mask_bits.nbytes
+    held = 12 * size * samples + 4 * samples + coreset.mask_bits.nbytes
     held += bricks * (8 + 4 * 8)
     # Four vectors of the numbers in use, their places, rank, mask, and the initial tables.
     held += coarse * (4 * 4 + 8 + 4 + 1 + 4) + 16 * network
@@ -42,8 +43,8 @@ def _bytes_a_vertex(architecture: Architecture) -> int:
     hidden = sum(outputs + 1 for outputs, _ in architecture.layer_shapes[:-1])
     # Inputs and their gradients, each also for samples alone; activations and their gradients.
     numbers = 4 * (inputs + 1) + 2 * hidden
-    # Rows of the finest level and what Adam makes of them, products of the interpolation, target,
-    # residual and its square.
-    numbers += 7 * architecture.embedding_size + 3 * architecture.embedding_size + 4
-    # Mask, its bits, ranks and places of the samples.
-    return 4 * numbers + 2 + 3 * 8
+    # Rows of the finest level, what Adam makes of them and the effect of missed steps, products of
+    # the interpolation, target, residual and its square.
+    numbers += 7 * architecture.embedding_size + 4 + 3 * architecture.embedding_size + 4
+    # Mask, its bits and sums, ranks, places of the samples and their bricks.
+    return 4 * numbers + 2 + 5 * 8

@@ -74,8 +74,8 @@ class NaiveEngine:
 
     def parameters(self) -> Parameters:
         """Return the trained numbers, float32 on the CPU; embeddings outside the coreset are 0."""
-        fine = self.model.tables[0].detach().cpu()[self.buckets].transpose(1, 2)
-        fine = fine * torch.from_numpy(self.in_coreset).unsqueeze(1)
+        buckets = self.buckets[torch.from_numpy(self.in_coreset)]
+        fine = self.model.tables[0].detach().cpu()[buckets].T
         coarse = [table.detach().flatten() for table in list(self.model.tables)[1:]]
         layers = zip(self.model.weights, self.model.biases, strict=True)
         network = [
@@ -158,7 +158,7 @@ def _model(
 ) -> FHash:
     """Return a dense model of initial parameters; finest embeddings outside the coreset are 0."""
     finest = torch.zeros(prod(architecture.levels[0]), architecture.embedding_size)
-    finest[buckets[in_coreset]] = start.fine.transpose(1, 2)[in_coreset]
+    finest[buckets[in_coreset]] = start.fine.T
     tables, layers = start.dense(architecture)
     copies = [(weight.to(dtype).clone(), bias.to(dtype).clone()) for weight, bias in layers]
     return FHash(architecture, [finest.to(dtype), *(table.to(dtype) for table in tables)], copies)

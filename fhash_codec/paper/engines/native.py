@@ -26,7 +26,7 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.native.network import PATHS, library, machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import Parameters, initial_parameters
+from fhash_codec.paper.engines.initial import Parameters, check_state, initial_parameters
 from fhash_codec.paper.engines.native_task import (
     ADAM,
     BLOCK,
@@ -127,7 +127,7 @@ class NativeEngine:
         start = initial_parameters(architecture, coreset, seed)
         self.fine = start.fine.numpy()
         self.fine_mean, self.fine_square = np.zeros_like(self.fine), np.zeros_like(self.fine)
-        self.visited = np.zeros(len(self.fine), np.int64)
+        self.visited = np.zeros(len(coreset.bricks), np.int64)
         self.step = 0
         self.coarse = len(self._used)
         self.flat = _padded(
@@ -181,12 +181,16 @@ class NativeEngine:
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
         self._catch_up_gaps()
-        for first in range(0, len(self.fine), FLUSH):
-            part = slice(first, first + FLUSH)
+        offsets = self.coreset.offsets
+        for first in range(0, len(self.visited), FLUSH):
+            visited = self.visited[first : first + FLUSH]
+            ends = offsets[first : first + len(visited) + 1]
+            part = slice(ends[0], ends[-1])
             self._gap_tables().settle(
-                (self.fine[part], self.fine_mean[part], self.fine_square[part]),
-                self.visited[part],
+                [array[:, part] for array in (self.fine, self.fine_mean, self.fine_square)],
+                visited,
                 self.step,
+                np.diff(ends),
             )
         self.visited[self.visited > 0] = self.step
 
@@ -196,11 +200,6 @@ class NativeEngine:
         The finest embeddings are the engine's own memory, not a copy.
         """
         self.settle()
-        vertices = self.fine.shape[2]
-        for first in range(0, len(self.fine), FLUSH):
-            part = slice(first, first + FLUSH)
-            bits = np.unpackbits(self.coreset.mask_bits[part], axis=1, count=vertices)
-            self.fine[part].swapaxes(1, 2)[bits == 0] = 0
         flat, mean, square = self._settled_flat()
         moved = (mean != 0) | (square != 0)
         used = (np.where(moved, flat, np.float32(0)) if self.step else flat)[: self.coarse]
@@ -233,12 +232,10 @@ class NativeEngine:
 
         Raises KeyError or ValueError for one of another model.
         """
+        check_state(state, {name: getattr(self, name).shape for name in STATE})
         self.step, self._current, self._gaps = int(state["step"]), None, None
-        arrays = {name: state[name] for name in STATE}
-        for name, array in arrays.items():
-            if array.shape != getattr(self, name).shape:
-                raise ValueError(f"{name} has the shape {array.shape}")
-            getattr(self, name)[...] = array
+        for name in STATE:
+            getattr(self, name)[...] = state[name]
         self._stamps[:] = 0
         self.blocks[:] = state.get("blocks", np.array(self.step))
         if "behind" in state:
@@ -258,6 +255,7 @@ class NativeEngine:
             shape=coreset.brick_shape,
             threads=1,
             mask_bytes=coreset.mask_bits.shape[1],
+            samples=len(coreset.values),
             coarse=self.coarse,
             numbers=len(self.flat),
             lazy=self.lazy,
@@ -320,8 +318,8 @@ class NativeEngine:
         if self._current is None or self._current[0] != self.step:
             self._catch_up_gaps()
             arrays = [_padded(array) for array in (self.flat, self.flat_mean, self.flat_square)]
-            visited = np.repeat(self.blocks, BLOCK)[: self.lazy]
-            self._gap_tables().settle([a[: self.lazy] for a in arrays], visited, self.step)
+            behind = [array[: self.lazy] for array in arrays]
+            self._gap_tables().settle(behind, self.blocks, self.step, BLOCK)
             self._current = (self.step, arrays)
         return self._current[1]
 
@@ -361,29 +359,34 @@ class _GapTables:
         self.structure = Gaps(**{name: a.ctypes.data for name, a in self._tables.items()})
 
     def settle(
-        self, arrays: tuple[Floats, ...] | list[Floats], visited: npt.NDArray[np.int64], step: int
+        self,
+        arrays: list[Floats],
+        visited: npt.NDArray[np.int64],
+        step: int,
+        lengths: npt.NDArray[np.int64] | int,
     ) -> None:
         """Let numbers and their moments catch up, in place.
 
         Args:
-            arrays: numbers (n, ...), and the two moments of each.
-            visited: last step with a gradient of each number (n,), 0 for none.
+            arrays: numbers (..., n), and the two moments of each.
+            visited: last step with a gradient of each run of numbers (runs,), 0 for none.
             step: step up to which they catch up.
+            lengths: numbers of each run; those of the last one may be fewer.
         """
         numbers, mean, square = arrays
         missed = np.where(visited > 0, step - visited, 0)
         at = np.where(missed > 0, visited, 0)
-        columns = {
-            "factor": np.where(missed > 0, self._tables["factor"][at], np.float32(0)),
-            "epsilon": self._tables["epsilon"][at],
-            "mean_decay": self._tables["mean_decay"][missed],
-            "square_decay": self._tables["square_decay"][missed],
-        }
-        factor, epsilon, mean_decay, square_decay = (
-            column.reshape(-1, *(1,) * (numbers.ndim - 1)) for column in columns.values()
+        of_gap = self._tables["epsilon"][at]
+        columns = (
+            np.where(missed > 0, self._tables["factor"][at], np.float32(0)),
+            # Where nothing was missed nothing changes, and the root of 0 divides nothing.
+            np.where(of_gap > 0, of_gap, np.float32(1)),
+            self._tables["mean_decay"][missed],
+            self._tables["square_decay"][missed],
         )
-        # Where nothing was missed nothing changes, and the root of 0 divides nothing.
-        root = np.sqrt(square) + np.where(epsilon > 0, epsilon, np.float32(1))
-        numbers -= factor * mean / root
+        factor, epsilon, mean_decay, square_decay = (
+            np.repeat(column, lengths)[: numbers.shape[-1]] for column in columns
+        )
+        numbers -= factor * mean / (np.sqrt(square) + epsilon)
         mean *= mean_decay
         square *= square_decay

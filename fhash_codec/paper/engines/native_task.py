@@ -81,6 +81,7 @@ class Bricks(ctypes.Structure):
         ("mask_bytes", _INTEGER),
         ("values", _POINTER),
         ("offsets", _POINTER),
+        ("samples", _INTEGER),
         ("fine", _POINTER),
         ("fine_mean", _POINTER),
         ("fine_square", _POINTER),

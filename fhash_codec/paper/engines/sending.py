@@ -25,7 +25,7 @@ class Sent:
 
     Attributes:
         ids: numbers of the bricks, int64 (bricks,).
-        caught_up: the columns of `adam.CatchUp`, float32 (4, bricks, 1, 1).
+        caught_up: the columns of `adam.CatchUp`, float32 (4, bricks).
         correction: `adam.corrections`' factor of the root, float32 ().
         pace: `adam.corrections`' pace, float32 ().
         scale: factor of the gradients, float32 ().
@@ -66,7 +66,7 @@ class Sender:
         correction, pace, scale = numbers[4 * count :].unbind()
         return Sent(
             ids=received[: 8 * count].view(torch.int64),
-            caught_up=numbers[: 4 * count].view(4, count, 1, 1),
+            caught_up=numbers[: 4 * count].view(4, count),
             correction=correction,
             pace=pace,
             scale=scale,

@@ -6,10 +6,9 @@ corners are looked up per sample. The unit of work is a brick of vertices of one
 batch is a random set of bricks. The same code runs on a CPU and on CUDA; there the host never waits
 for a step, sends it one message (sending.py), and launches it as one graph (graphs.py).
 
-The finest embeddings are stored brick by brick, only for bricks that hold coreset vertices. Adam
-visits just the bricks of a batch, yet gives what a dense Adam gives: a brick that was passed over
-catches up on its missing steps, whose gradient is zero, in closed form before it is used
-(`training.adam.catch_up`).
+The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the bricks
+of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on its
+missing steps, whose gradient is zero, in closed form before it is used (`training.adam.catch_up`).
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from torch import Tensor
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
+from fhash_codec.paper.engines.columns import Columns, columns_of
 from fhash_codec.paper.engines.graphs import StepGraphs
 from fhash_codec.paper.engines.initial import (
     Parameters,
@@ -34,7 +34,13 @@ from fhash_codec.paper.engines.initial import (
 )
 from fhash_codec.paper.engines.sending import Sender, Sent
 from fhash_codec.paper.engines.upsampling import Lattices, Upsampling
-from fhash_codec.training.adam import adam_step, adam_step_on_device, catch_up, corrections
+from fhash_codec.training.adam import (
+    adam_step,
+    adam_step_on_device,
+    catch_up,
+    catch_up_numbers,
+    corrections,
+)
 from fhash_codec.training.positions import true_positions
 
 CHUNK = 1 << 13
@@ -59,8 +65,8 @@ class SlabEngine:
     """An `Engine` that trains on bricks.
 
     Attributes:
-        fine: finest embeddings (bricks, E, vertices of a brick); `fine_mean` and `fine_square` are
-            their moments of Adam.
+        fine: finest embeddings (E, samples) in the order of `Coreset.values`; `fine_mean` and
+            `fine_square` are their moments of Adam.
         visited: number of the last training step that used each brick, 0 for none, int64 (bricks,)
             on the host.
         flat: the used numbers of the coarse tables, followed by the layers of the MLP, in one
@@ -92,7 +98,9 @@ class SlabEngine:
         self.vertices, self.counts = prod(coreset.brick_shape), np.diff(coreset.offsets)
         self.bricks = torch.from_numpy(coreset.bricks.astype(np.int64)).to(device)
         self.mask_bits = torch.from_numpy(coreset.mask_bits).to(device)
-        self.values = torch.from_numpy(coreset.values).to(device)
+        # A sample more, which stands for every vertex that is none.
+        self.values = torch.zeros(len(coreset.values) + 1, device=device)
+        self.values[:-1] = torch.from_numpy(coreset.values)
         self.offsets = torch.from_numpy(coreset.offsets).to(device)
         self._bits = torch.arange(7, -1, -1, device=device, dtype=torch.uint8)
         self._scratch_memory: dict[str, Tensor] = {}
@@ -100,8 +108,10 @@ class SlabEngine:
         self.upsampling = Upsampling(architecture, coreset, device)
 
         start = initial_parameters(architecture, coreset, seed)
-        self.fine = start.fine.to(device)
-        self.fine_mean, self.fine_square = torch.zeros_like(self.fine), torch.zeros_like(self.fine)
+        # Embeddings and both moments. They stay 0 for the sample that stands for no sample.
+        self._numbers = torch.zeros(3, len(start.fine), len(self.values), device=device)
+        self.fine, self.fine_mean, self.fine_square = self._numbers[..., :-1].unbind()
+        self.fine.copy_(start.fine)
         self.visited = np.zeros(len(self.bricks), dtype=np.int64)
         self.step = self.settled = 0
         self.coarse = len(self.upsampling.used)
@@ -139,47 +149,49 @@ class SlabEngine:
             sent: the batch.
             samples: samples of the batch.
         """
-        mean, square, fine = self._caught_up(sent)
-        target, in_coreset = self._targets(sent.ids)
+        columns = self._columns(sent.ids, samples)
+        numbers = self._caught_up(sent, columns)
         lattices = self.upsampling.lattices(self.bricks[sent.ids])
-        inputs = self._inputs(lattices, fine)
+        inputs = self._inputs(lattices, numbers[0], columns)
         self.gradient.zero_()
-        error, input_gradient = self._backpropagate_samples(
-            inputs, target, in_coreset, samples, sent.scale
-        )
-        level_gradients = input_gradient.view(
-            -1, self.architecture.embedding_size, len(fine), *self.coreset.brick_shape
-        )
-        lattices.add_transposed(self.gradient, level_gradients[1:])
+        error, input_gradient = self._backpropagate(inputs, columns, sent.scale)
+        size = len(self.fine)
+        level_gradients = self._at_all_vertices(input_gradient[size:], columns)
+        lattices.add_transposed(self.gradient, self._by_level(level_gradients))
 
-        fine_gradient = level_gradients[0].flatten(2).transpose(0, 1)
-        self._move((fine, fine_gradient, mean, square), sent)
+        fine, mean, square = numbers
+        self._move((fine, input_gradient[:size], mean, square), sent)
         vectors = (self.flat, self.gradient, self.flat_mean, self.flat_square)
         for part in self._parts(len(self.flat), ADAM_PART):
             self._move(tuple(vector[part] for vector in vectors), sent)
-        self._store(sent.ids, mean, square, fine)
+        self._numbers.index_copy_(2, columns.ranks, numbers)
         return error
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
         """Return the values (n,) at the samples of some bricks."""
-        sent = self._sent(chosen)
-        fine = self.fine[sent.ids] if self.settled == self.step else self._caught_up(sent)[2]
+        sent, count = self._sent(chosen), int(self.counts[chosen].sum())
+        columns = self._columns(sent.ids, count)
+        if self.settled == self.step:
+            fine = self._numbers[0].index_select(1, columns.ranks)
+        else:
+            fine = self._caught_up(sent, columns)[0]
         lattices = self.upsampling.lattices(self.bricks[sent.ids])
-        inputs = self._inputs(lattices, fine)
-        in_coreset, count = self._in_coreset(sent.ids).reshape(-1), int(self.counts[chosen].sum())
-        samples = true_positions(in_coreset, count)
-        if not self._is_sparse(count, len(chosen)):
-            return self._value(inputs)[samples]
-        # Only samples go through the MLP where the bricks are sparse.
-        return self._value(self._picked(inputs, samples))
+        values = self._value(self._inputs(lattices, fine, columns))
+        if columns.in_coreset is None:
+            return values
+        return values[true_positions(columns.in_coreset, count)]
 
     @torch.no_grad()
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
         for first in range(0, len(self.bricks), FLUSH):
-            sent = self._sent(np.arange(first, min(first + FLUSH, len(self.bricks))))
-            self._store(sent.ids, *self._caught_up(sent))
+            end = min(first + FLUSH, len(self.bricks))
+            span = slice(*self.coreset.offsets[[first, end]].tolist())
+            effect = self._sent(np.arange(first, end)).caught_up.repeat_interleave(
+                self.offsets[first : end + 1].diff(), dim=1, output_size=span.stop - span.start
+            )
+            catch_up_numbers(self._numbers[..., span], effect)
         self.visited[self.visited > 0] = self.step
         self.settled = self.step
 
@@ -190,9 +202,6 @@ class SlabEngine:
         On a CPU the finest embeddings are the engine's own memory, not a copy.
         """
         self.settle()
-        for first in range(0, len(self.fine), FLUSH):
-            part = slice(first, first + FLUSH)
-            self.fine[part].masked_fill_(self._in_coreset(part).unsqueeze(1) == 0, 0.0)
         coarse = torch.zeros(
             sum(prod(level) for level in self.architecture.levels[1:])
             * self.architecture.embedding_size
@@ -221,68 +230,70 @@ class SlabEngine:
         for name in STATE:
             getattr(self, name).copy_(torch.from_numpy(state[name]))
 
-    def _store(self, ids: Tensor, mean: Tensor, square: Tensor, fine: Tensor) -> None:
-        """Write the finest embeddings of bricks, and their moments, back into the full arrays."""
-        for array, rows in ((self.fine_mean, mean), (self.fine_square, square), (self.fine, fine)):
-            array.index_copy_(0, ids, rows)
-
     def _sent(self, chosen: Chosen) -> Sent:
         """Return bricks on the device, with what they missed up to the present step."""
         return self._sender.send(chosen, catch_up(self.visited[chosen], self.step, self.rates))
 
-    def _caught_up(self, sent: Sent) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what a dense Adam has for bricks that missed steps: mean, square, embeddings."""
-        mean, square, fine = (
-            array[sent.ids] for array in (self.fine_mean, self.fine_square, self.fine)
-        )
-        factor, epsilon, mean_decay, square_decay = sent.caught_up.unbind()
-        fine.addcdiv_(mean * factor, square.sqrt().add_(epsilon), value=-1.0)
-        return mean.mul_(mean_decay), square.mul_(square_decay), fine
+    def _columns(self, ids: Tensor, samples: int) -> Columns:
+        """Return the columns of the MLP's inputs for bricks that have so many samples."""
+        alone = samples if self._is_sparse(samples, len(ids)) else None
+        return columns_of(self._in_coreset(ids), self.offsets[ids], len(self.values) - 1, alone)
+
+    def _caught_up(self, sent: Sent, columns: Columns) -> Tensor:
+        """Return what a dense Adam has for columns of bricks that missed steps.
+
+        The numbers (3, E, columns) are the finest embeddings, their mean and their square.
+        """
+        numbers = self._numbers.index_select(2, columns.ranks)
+        if columns.vertices is None:
+            effect = sent.caught_up.unsqueeze(2).expand(-1, -1, self.vertices).reshape(4, -1)
+        else:
+            effect = sent.caught_up[:, columns.vertices // self.vertices]
+        catch_up_numbers(numbers, effect)
+        return numbers
 
     def _is_sparse(self, samples: int, bricks: int) -> bool:
         """Return whether a batch has so few samples that the MLP takes them alone."""
         return samples <= FULL * bricks * self.vertices
 
-    def _targets(self, ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the samples of bricks, and the vertices that are samples, (bricks, vertices).
-
-        The samples are normalised values, arbitrary outside the coreset. The mask is 0 or 1, uint8.
-        """
-        in_coreset = self._in_coreset(ids)
-        rank = (
-            in_coreset.cumsum(1, dtype=torch.int64)
-            .add_(self.offsets[ids].unsqueeze(1) - 1)
-            .clamp_(0)
-        )
-        return self.values[rank], in_coreset
-
-    def _in_coreset(self, ids: Tensor | slice) -> Tensor:
+    def _in_coreset(self, ids: Tensor) -> Tensor:
         """Return which vertices (bricks, vertices) are in the coreset, as 0 and 1, uint8."""
         return (self.mask_bits[ids].unsqueeze(-1) >> self._bits & 1).flatten(1)[:, : self.vertices]
 
-    def _inputs(self, lattices: Lattices, fine: Tensor) -> Tensor:
-        """Return the inputs of the MLP (levels E + 1, samples) at the vertices of bricks.
+    def _inputs(self, lattices: Lattices, fine: Tensor, columns: Columns) -> Tensor:
+        """Return the inputs of the MLP (levels E + 1, columns).
 
         The last row is 1: the layers' biases are one more column of their matrices. The next call
         overwrites the result.
 
         Args:
             lattices: the sub-lattices of the bricks.
-            fine: finest embeddings of the bricks (bricks, E, vertices).
+            fine: finest embeddings (E, columns).
+            columns: the columns.
         """
-        size, shape = self.architecture.embedding_size, self.coreset.brick_shape
-        inputs = self._scratch("inputs", self.architecture.inputs + 1, len(fine) * self.vertices)
-        inputs[-1] = 1.0
-        levels = inputs[:-1].view(-1, size, len(fine), *shape)
-        levels[0].copy_(fine.view(len(fine), size, *shape).transpose(0, 1))
-        lattices.interpolate(self.flat, levels[1:])
+        inputs = self._scratch("inputs", self.architecture.inputs + 1, fine.shape[1])
+        inputs[: len(fine)], inputs[-1] = fine, 1.0
+        coarse = inputs[len(fine) : -1]
+        if columns.vertices is None:
+            lattices.interpolate(self.flat, self._by_level(coarse))
+        else:
+            whole = self._scratch("coarse inputs", len(coarse), columns.bricks * self.vertices)
+            lattices.interpolate(self.flat, self._by_level(whole))
+            torch.index_select(whole, 1, columns.vertices, out=coarse)
         return inputs
 
-    def _picked(self, inputs: Tensor, samples: Tensor) -> Tensor:
-        """Return the columns of some samples; the next call overwrites them."""
-        picked = self._scratch("picked inputs", len(inputs), len(samples))
-        torch.index_select(inputs, 1, samples, out=picked)
-        return picked
+    def _at_all_vertices(self, rows: Tensor, columns: Columns) -> Tensor:
+        """Return rows (n, columns) as rows over all vertices of the bricks, with 0 between them."""
+        if columns.vertices is None:
+            return rows
+        whole = self._scratch("whole gradient", len(rows), columns.bricks * self.vertices)
+        return whole.zero_().index_copy_(1, columns.vertices, rows)
+
+    def _by_level(self, rows: Tensor) -> Tensor:
+        """Return rows (coarse levels * E, vertices) as (coarse levels, E, bricks, z, y, x)."""
+        levels, size = len(self.architecture.levels) - 1, self.architecture.embedding_size
+        bricks = rows.shape[1] // self.vertices
+        return rows.view(levels, size, bricks, *self.coreset.brick_shape)
 
     def _value(self, inputs: Tensor) -> Tensor:
         """Return the output of the MLP (samples,)."""
@@ -323,42 +334,26 @@ class SlabEngine:
                 activations.append(hidden)
         return activations
 
-    def _backpropagate_samples(
-        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, count: int, scale: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Do what `_backpropagate` does, through the `count` samples of sparse bricks alone.
-
-        Around a feature most vertices of many bricks are no samples.
-        """
-        if not self._is_sparse(count, len(in_coreset)):
-            return self._backpropagate(inputs, target, in_coreset, scale)
-        flat_mask = in_coreset.reshape(-1)
-        samples = true_positions(flat_mask, count)
-        error, gradient = self._backpropagate(
-            self._picked(inputs, samples), target.reshape(-1)[samples], flat_mask[samples], scale
-        )
-        whole = self._scratch("whole gradient", len(gradient), inputs.shape[1]).zero_()
-        return error, whole.index_copy_(1, samples, gradient)
-
     def _backpropagate(
-        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: Tensor
+        self, inputs: Tensor, columns: Columns, scale: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the sum of squared errors, and the gradient of scale/2 times it by the inputs.
 
         The gradients of the layers are added to `layer_gradients`.
 
         Args:
-            inputs: inputs of the MLP (levels E + 1, samples).
-            target: normalised values, as many as there are columns, of any shape.
-            in_coreset: which of them are samples, of the same shape, 0 or 1.
+            inputs: inputs of the MLP (levels E + 1, columns).
+            columns: the columns.
             scale: factor of the gradients, of no axis.
         """
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
-        flat_target, flat_mask = target.reshape(-1), in_coreset.reshape(-1)
+        target = self.values[columns.ranks]
         for part in self._parts(inputs.shape[1], CHUNK):
             activations = self._forward(inputs[:, part])
-            residual = (activations[-1][0] - flat_target[part]).mul_(flat_mask[part])
+            residual = activations[-1][0] - target[part]
+            if columns.in_coreset is not None:
+                residual.mul_(columns.in_coreset[part])
             error += residual.square().sum(dtype=torch.float64)
             back = residual.mul_(scale).unsqueeze(0)
             for number in range(len(self.layers) - 1, -1, -1):

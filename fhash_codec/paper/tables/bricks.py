@@ -52,34 +52,25 @@ class Bricks:
 
     def samples(self, key: int, box: Box) -> Floats:
         """Return the normalised values (z, y, x) of a region at a key frame."""
-        window = self._window(key, box)
-        first = self._coreset.offsets[window.numbers]
-        end = self._coreset.offsets[window.numbers + 1]
-        values = np.zeros((len(window.numbers), prod(self._coreset.brick_shape)), np.float32)
-        samples = [
-            self._coreset.values[low:high]
-            for low, high in zip(first.tolist(), end.tolist(), strict=True)
-        ]
-        if samples:
-            values[self._in_coreset(window.numbers)] = np.concatenate(samples)
-        return self._region(values, window, box)
+        return self.embeddings(self._coreset.values[None], key, box)[..., 0]
 
     def embeddings(self, fine: Floats, key: int, box: Box) -> Floats:
         """Return the finest embeddings (z, y, x, E) of a region at a key frame.
 
         Args:
-            fine: embeddings of all bricks (bricks, E, vertices of a brick).
+            fine: embeddings of all samples (E, samples), in the order of `Coreset.values`.
             key: index of the key frame.
             box: the region.
         """
         window = self._window(key, box)
-        return np.stack(
-            [
-                self._region(fine[window.numbers, component], window, box)
-                for component in range(fine.shape[1])
-            ],
-            axis=-1,
-        )
+        in_coreset = self._in_coreset(window.numbers)
+        places = self._coreset.places(window.numbers)
+        regions = []
+        for numbers in fine:
+            contents = np.zeros(in_coreset.shape, np.float32)
+            contents[in_coreset] = numbers[places]
+            regions.append(self._region(contents, window, box))
+        return np.stack(regions, axis=-1)
 
     def _place(self, key: Integers, z: Integers, y: Integers, x: Integers) -> Integers:
         """Return the place of bricks in the grids of all key frames, in C order."""

@@ -100,7 +100,7 @@ def code_tables(
     Args:
         architecture: the sizes of the tables.
         coreset: the training samples.
-        fine: finest embeddings (bricks, E, vertices of a brick).
+        fine: finest embeddings (E, samples), in the order of `Coreset.values`.
         tables: the coarser tables, each (buckets, E).
         layers: weight and bias of each layer.
         psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it

@@ -39,15 +39,15 @@ class TrainedTable(Protocol):
 
 
 class FinestTable:
-    """A `TrainedTable` of the finest level, out of its bricks."""
+    """A `TrainedTable` of the finest level, out of its samples."""
 
     def __init__(self, coreset: Coreset, bricks: Bricks, fine: Floats) -> None:
-        """Take the embeddings of all bricks, (bricks, E, vertices of a brick)."""
+        """Take the embeddings (E, samples), in the order of `Coreset.values`."""
         self._bricks, self._fine = bricks, fine
         self.shape: tuple[int, ...] = (
             len(coreset.key_frames),
             *coreset.box.shape,
-            fine.shape[1],
+            len(fine),
         )
 
     def read(self, region: Region) -> Floats:
@@ -89,7 +89,7 @@ def trained_tables(
         architecture: the sizes of the tables.
         coreset: the training samples.
         bricks: the bricks of the coreset.
-        fine: finest embeddings (bricks, E, vertices of a brick).
+        fine: finest embeddings (E, samples), in the order of `Coreset.values`.
         tables: the coarser tables, each (buckets, E).
     """
     size, levels = architecture.embedding_size, architecture.levels

@@ -46,7 +46,7 @@ class TrainedModel:
     """The numbers of a trained model, and how the training went.
 
     Attributes:
-        fine: finest embeddings (bricks, E, vertices of a brick).
+        fine: finest embeddings (E, samples), in the order of `Coreset.values`.
         tables: coarser tables, each (buckets, E).
         layers: weight (out, in) and bias (out,) of each layer.
         epochs: epochs of the training.

@@ -255,6 +255,7 @@ def test_samples_of_the_fringe_are_told_and_not_counted() -> None:
         np.add.reduceat(~fringed.fringe[places], np.cumsum([0, *np.diff(fringed.offsets)[[3, 0]]])),
         fringed.counts[chosen],
     )
+    assert not fringed.places(chosen[:0]).size
 
 
 def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:

@@ -43,7 +43,7 @@ class Stored:
 def written(coreset: Coreset, kind: str, values: list[float]) -> np.ndarray:
     """The coarsest table as it is read back, of a model with `values` first in every level."""
     architecture = Architecture.for_box(coreset.box.shape, 2, embedding_size=1)
-    fine = np.zeros((len(coreset.bricks), 1, prod(coreset.brick_shape)), np.float32)
+    fine = np.zeros((1, len(coreset.values)), np.float32)
     tables = [np.zeros((prod(level), 1), np.float32) for level in architecture.levels[1:]]
     for table in (fine, *tables):
         table.reshape(-1)[: len(values)] = values

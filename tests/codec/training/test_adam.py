@@ -13,6 +13,7 @@ from fhash_codec.training.adam import (
     adam_step,
     adam_step_on_device,
     catch_up,
+    catch_up_numbers,
     corrections,
 )
 
@@ -70,3 +71,19 @@ def test_catching_up_equals_stepping_without_gradient() -> None:
             )
             assert effect.mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
             assert effect.square_decay[number] == pytest.approx(square / v, rel=1e-5)
+
+
+def test_numbers_that_catch_up_move_by_the_effect_and_their_moments_decay() -> None:
+    random = torch.Generator().manual_seed(2)
+    numbers = torch.rand(3, 2, 4, generator=random)
+    effect = catch_up(np.array([0, 3, 5, 9]), 9, np.full(10, 0.01))
+    factor, epsilon, mean_decay, square_decay = map(torch.from_numpy, effect)
+    parameter, mean, square = numbers.clone()
+    catch_up_numbers(numbers, torch.from_numpy(np.stack(effect)))
+    moved = parameter - factor * mean / (square.sqrt() + epsilon)
+    torch.testing.assert_close(numbers[0], moved)
+    torch.testing.assert_close(numbers[1], mean * mean_decay)
+    torch.testing.assert_close(numbers[2], square * square_decay)
+    # Without steps, or without a gradient before them, nothing changes.
+    assert torch.equal(numbers[0][:, [0, 3]], parameter[:, [0, 3]])
+    assert not torch.equal(numbers[0][:, 1], parameter[:, 1])

@@ -111,16 +111,14 @@ class LatticeModel:
         """Embeddings that a gradient ever moved."""
         fine = self.engine.fine_square != 0
         coarse = self.engine.flat_square[: self.engine.coarse] != 0
-        return int(fine.any(1).sum()) + int(coarse.view(-1, EMBEDDING_SIZE).any(1).sum())
+        return int(fine.any(0).sum()) + int(coarse.view(-1, EMBEDDING_SIZE).any(1).sum())
 
     def arrays(self) -> list[npt.NDArray[np.float32]]:
         """The tables (buckets, E), 0 where no gradient moved them, then weights and biases."""
         numbers = self.engine.parameters()
         tables, layers = numbers.dense(self.engine.architecture)
         finest = torch.zeros(self.levels[0].size, EMBEDDING_SIZE)
-        vertices = prod(self.coreset.brick_shape)
-        mask = np.unpackbits(self.coreset.mask_bits, axis=1, count=vertices).astype(bool)
         buckets = bucket_index(self.places.long(), self.levels[0].resolution)
-        finest[buckets] = numbers.fine.transpose(1, 2)[torch.from_numpy(mask)]
+        finest[buckets] = numbers.fine.T
         rest = [number for layer in layers for number in layer]
         return [number.numpy().copy() for number in (finest, *tables, *rest)]

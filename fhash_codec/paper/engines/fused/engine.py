@@ -78,6 +78,7 @@ class ModelRecord(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("powers", "weights")),
         *((name, ctypes.c_void_p) for name in ("fine", "fine_mean", "fine_square", "visited")),
         *((name, ctypes.c_void_p) for name in ("flat", "flat_mean", "flat_square", "gradient")),
+        ("fine_row", ctypes.c_longlong),
         ("coarse", ctypes.c_longlong),
         ("steps", ctypes.c_int),
     )
@@ -259,7 +260,8 @@ class FusedEngine(SlabEngine):
         batches = [batch for batch in (bricks, bricks[1:], bricks) if len(batch)][
             : len(self.rates) - 1
         ]
-        start = [tensor.clone() for tensor in (self.fine[: len(bricks)], self.flat)]
+        samples = int(self.coreset.offsets[len(bricks)])
+        start = [tensor.clone() for tensor in (self.fine[:, :samples], self.flat)]
         results = []
         for engine in (FusedEngine, SlabEngine):
             steps = [float(engine.train(self, batch)) for batch in batches]
@@ -276,11 +278,12 @@ class FusedEngine(SlabEngine):
             )
 
     def _start_again(self, fine: Tensor, flat: Tensor) -> None:
-        """Return to the start after a trial on the first bricks, given the initial numbers."""
-        self.fine[: len(fine)], self.flat[:] = fine, flat
+        """Return to the start after a trial on the first samples, given the initial numbers."""
+        samples = fine.shape[1]
+        self.fine[:, :samples], self.flat[:] = fine, flat
         for tensor in (
-            self.fine_mean[: len(fine)],
-            self.fine_square[: len(fine)],
+            self.fine_mean[:, :samples],
+            self.fine_square[:, :samples],
             self._visited,
             self.flat_mean,
             self.flat_square,
@@ -320,6 +323,7 @@ class FusedEngine(SlabEngine):
             start=start,
             before=before,
             after=after,
+            fine_row=self.fine.stride(0),
             coarse=self.coarse,
             steps=len(self.rates),
             **{name: _pointer(array) for name, array in arrays.items()},

@@ -37,3 +37,17 @@ def test_parameters_are_within_their_bounds_and_split_by_level_and_layer(noise_c
     for (weight, bias), (outputs, inputs) in zip(layers, architecture.layer_shapes, strict=True):
         assert (weight.shape, bias.shape) == ((outputs, inputs), (outputs,))
         assert max(float(weight.abs().max()), float(bias.abs().max())) <= inputs**-0.5
+
+
+def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
+    noise_coreset, in_coreset, monkeypatch
+) -> None:
+    coreset = noise_coreset((2, 9, 10, 20), 0.7)
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    shape = (len(coreset.bricks), 2, prod(coreset.brick_shape))
+    random = torch.Generator().manual_seed(3)
+    whole = torch.empty(shape).uniform_(-SPREAD, SPREAD, generator=random)
+    expected = whole.transpose(0, 1)[:, torch.from_numpy(in_coreset(coreset))]
+    for bricks in (1, 3, 1024):
+        monkeypatch.setattr("fhash_codec.paper.engines.initial.BRICKS_AT_A_TIME", bricks)
+        assert torch.equal(initial_parameters(architecture, coreset, 3).fine, expected)

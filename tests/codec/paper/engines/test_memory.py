@@ -49,10 +49,10 @@ def test_a_training_needs_what_is_said(
     bricks = len(coreset.bricks)
     needed = needed_bytes(architecture, coreset, 8) - LIBRARIES
     engine = SlabEngine(architecture, coreset, np.full(3, 0.01), seed=0, device=torch.device("cpu"))
-    held = sum(each.nbytes for each in vars(engine).values() if isinstance(each, torch.Tensor))
-    held += sum(
-        each.nbytes for each in vars(engine.upsampling).values() if isinstance(each, torch.Tensor)
-    )
+    every = tensors([*vars(engine).values(), *vars(engine.upsampling).values()])
+    # Some are views of the same memory.
+    storages = {each.data_ptr(): each for each in (t.untyped_storage() for t in every)}
+    held = sum(each.nbytes() for each in storages.values())
     batch = np.arange(min(UNEVEN * -(-bricks // 8), bricks))
     with Made() as made:
         engine.train(batch)

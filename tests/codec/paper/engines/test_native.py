@@ -241,16 +241,28 @@ def test_other_learning_rates_count_from_the_next_step_on(model_of) -> None:
         assert len(errors) == 1
 
 
-def test_embeddings_that_no_sample_moved_are_stored_as_zero(in_coreset, model_of) -> None:
+def test_training_holds_the_finest_embeddings_of_samples_alone(model_of) -> None:
     coreset, architecture = model_of(((3, 9, 20, 35), {"hidden_layers": 1}))
     engine = NativeEngine(architecture, coreset, RATES, seed=7)
     engine.train(np.arange(len(coreset.bricks)))
-    fine = engine.parameters().fine.numpy()
-    mask = in_coreset(coreset)
-    outside = np.moveaxis(fine, 1, -1)[~mask]
-    assert not outside.any()
-    assert not np.signbit(outside).any()
-    assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
+    for numbers in (engine.fine, engine.fine_mean, engine.fine_square, engine.parameters().fine):
+        assert numbers.shape == (2, len(coreset.values))
+        assert (numbers != 0).all()
+
+
+def test_a_step_writes_the_samples_of_its_bricks_alone(model_of, path) -> None:
+    """Rows of samples begin and end anywhere: a vector must not reach into a neighbour's."""
+    coreset, architecture = model_of(((2, 9, 20, 35), {"hidden_layers": 1, "low": 0.7}))
+    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    for chosen in (np.arange(0, len(coreset.bricks), 2), np.array([2])):
+        before = [numbers.copy() for numbers in (engine.fine, engine.fine_mean, engine.fine_square)]
+        engine.train(chosen)
+        own = np.zeros(len(coreset.values), bool)
+        own[coreset.places(chosen)] = True
+        after = (engine.fine, engine.fine_mean, engine.fine_square)
+        for old, new in zip(before, after, strict=True):
+            np.testing.assert_array_equal(old[:, ~own], new[:, ~own])
+            assert (old[:, own] != new[:, own]).all()
 
 
 def test_a_state_of_another_model_is_refused(model_of) -> None:

@@ -23,11 +23,11 @@ def sent(sender: Sender, count: int) -> tuple[Sent, list[np.ndarray]]:
 
 def received(numbers: Sent) -> list[np.ndarray]:
     columns = numbers.caught_up.cpu().numpy()
-    assert columns.shape == (4, len(numbers.ids), 1, 1)
+    assert columns.shape == (4, len(numbers.ids))
     scalars = (numbers.correction, numbers.pace, numbers.scale)
     return [
         numbers.ids.cpu().numpy(),
-        *columns[:, :, 0, 0],
+        *columns,
         *(scalar.cpu().numpy() for scalar in scalars),
     ]
 

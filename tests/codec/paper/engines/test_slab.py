@@ -78,16 +78,14 @@ def test_gradients_equal_those_of_autograd_in_float64(engines_of) -> None:
     assert_gradient_of_autograd(slab.gradient, slab.upsampling.used, oracle)
 
 
-def test_embeddings_that_no_sample_moved_are_stored_as_zero(in_coreset, engines_of) -> None:
+def test_training_holds_the_finest_embeddings_of_samples_alone(engines_of) -> None:
     coreset, slab, _ = engines_of((3, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 1})
+    start = slab.parameters().fine.clone()
     slab.train(np.arange(len(coreset.bricks)))
-    fine = slab.parameters().fine.numpy()
-    mask = in_coreset(coreset)
-    outside = np.moveaxis(fine, 1, -1)[~mask]
-    # A negative zero would cost bytes.
-    assert not outside.any()
-    assert not np.signbit(outside).any()
-    assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
+    for numbers in (slab.fine, slab.fine_mean, slab.fine_square, slab.parameters().fine):
+        assert numbers.shape == (2, len(coreset.values))
+        assert (numbers != 0).all()
+    assert (slab.parameters().fine != start).all()
 
 
 def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(engines_of) -> None:
@@ -101,14 +99,19 @@ def test_samples_alone_give_the_same_gradients_as_all_vertices_of_sparse_bricks(
     engines_of, monkeypatch
 ) -> None:
     shape, settings = (3, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 2, "low": 0.8}
-    gradients, errors = [], []
+    gradients, errors, moments = [], [], []
     for full in (1.0, -1.0):
         monkeypatch.setattr("fhash_codec.paper.engines.slab.FULL", full)
         coreset, slab, _ = engines_of(shape, settings)
         errors.append(float(slab.train(np.arange(len(coreset.bricks)))))
         gradients.append(slab.gradient.clone())
+        moments.append(slab.fine_mean.clone())
+        # What stands for vertices that are no samples never moves.
+        assert not slab._numbers[..., -1].any()
     assert errors[0] == pytest.approx(errors[1], rel=1e-6)
     apart = (gradients[0] - gradients[1]).abs() / gradients[1].abs().max()
+    assert float(apart.max()) < 1e-5
+    apart = (moments[0] - moments[1]).abs() / moments[1].abs().max()
     assert float(apart.max()) < 1e-5
 
 

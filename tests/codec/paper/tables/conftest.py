@@ -103,7 +103,7 @@ def random_model() -> RandomModel:
     architecture, coreset = selection.architecture, selection.coreset
     random = np.random.default_rng(0)
     size = architecture.embedding_size
-    fine = random.random((len(coreset.bricks), size, prod(coreset.brick_shape)), dtype=np.float32)
+    fine = random.random((size, len(coreset.values)), dtype=np.float32)
     tables = [random.random((prod(level), size), np.float32) for level in architecture.levels[1:]]
     layers = tuple(
         (

@@ -6,9 +6,11 @@ from math import prod
 
 import numpy as np
 import pytest
+import torch
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.checkpoint import checkpoint_path, save_checkpoint
 from fhash_codec.paper.training.fit import train_model
 from fhash_codec.paper.training.train import LOWER, MAX_RESTARTS, TrainingProgress
@@ -24,7 +26,7 @@ def architecture(coreset) -> Architecture:
 
 def test_a_model_is_numbers_of_every_level_and_layer(coreset, architecture, tmp_path) -> None:
     trained = train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
-    assert trained.fine.shape == (len(coreset.bricks), 2, prod(coreset.brick_shape))
+    assert trained.fine.shape == (2, len(coreset.values))
     assert [table.shape for table in trained.tables] == [
         (prod(level), 2) for level in architecture.levels[1:]
     ]
@@ -51,5 +53,21 @@ def test_a_training_that_diverges_at_every_rate_is_an_error(
 def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_path) -> None:
     path = checkpoint_path(tmp_path / "a.fhz", coreset, CONFIG)
     save_checkpoint(path, {"step": np.array(3)}, TrainingProgress(epoch=0, batch=1))
+    with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
+        train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_a_checkpoint_of_whole_bricks_is_refused(
+    coreset, architecture, tmp_path, native, monkeypatch
+) -> None:
+    """The finest embeddings were once stored for all vertices of the bricks."""
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    device = torch.device("cpu")
+    engine = make_engine("auto", architecture, coreset, np.zeros(2), seed=0, device=device)
+    whole = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)
+    state = engine.state() | dict.fromkeys(("fine", "fine_mean", "fine_square"), whole)
+    path = checkpoint_path(tmp_path / "a.fhz", coreset, CONFIG)
+    save_checkpoint(path, state, TrainingProgress(epoch=0, batch=1))
     with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")

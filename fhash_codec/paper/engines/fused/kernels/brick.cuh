@@ -69,6 +69,12 @@ __device__ inline int samples_before(
     return bit ? count + __popc(mask_byte(model, brick.id, vertex / 8) >> (8 - bit)) : count;
 }
 
+// Place of the finest embedding of a vertex that is a sample, for number e of an embedding.
+__device__ inline long long fine_place(
+    const Model& model, const Brick& brick, const int* samples, int vertex, int e) {
+    return e * model.fine_row + brick.offset + samples_before(model, brick, samples, vertex);
+}
+
 // Counts the samples before each byte of the mask. `scratch` holds THREADS numbers.
 __device__ inline void count_samples(const Model& model, long long id, int* samples, int* scratch) {
     constexpr int PART = (MASK_BYTES + THREADS - 1) / THREADS;
@@ -173,7 +179,8 @@ __device__ inline void interpolate_rows(const Shared& at, int first_row) {
     }
 }
 
-// Writes the inputs of the layers at the vertices of a tile; 0 in columns without a vertex.
+// Writes the inputs of the layers at the vertices of a tile; 0 in columns without a vertex, and in
+// place of finest embeddings of a vertex that is no sample.
 __device__ inline void load_inputs(
     const Model& model, const Brick& brick, const Shared& at, int first_row, int columns) {
     for (int i = threadIdx.x; i < COLUMNS * (LEVELS + 1); i += THREADS) {
@@ -184,9 +191,13 @@ __device__ inline void load_inputs(
         } else if (column >= columns) {
             for (int e = 0; e < SIZE; e++) to[e * PITCH] = 0.f;
         } else if (level == 0) {
+            const int vertex = first_row * BRICK_X + column;
+            if (!is_sample(model, brick, vertex)) {
+                for (int e = 0; e < SIZE; e++) to[e * PITCH] = 0.f;
+                continue;
+            }
             for (int e = 0; e < SIZE; e++) {
-                const long long place =
-                    (brick.id * SIZE + e) * VERTICES + first_row * BRICK_X + column;
+                const long long place = fine_place(model, brick, at.samples, vertex, e);
                 to[e * PITCH] = caught_up(
                     brick.effect, model.fine[place], model.fine_mean[place],
                     model.fine_square[place]);

@@ -40,18 +40,20 @@ __device__ inline void write_ones(const Shared& at) {
             at.hidden[layer][WIDTH * PITCH + i] = 1.f;
 }
 
-// Moves the finest embeddings of a tile by a step of Adam.
+// Moves the finest embeddings of a tile's samples by a step of Adam.
 __device__ inline void move_fine(
     const Model& model, const Brick& brick, const Shared& at, int first_row, int columns,
-    bool with_gradient, const Rate& rate) {
+    const Rate& rate) {
     for (int i = threadIdx.x; i < SIZE * columns; i += THREADS) {
         const int e = i / columns, column = i % columns;
-        const long long place = (brick.id * SIZE + e) * VERTICES + first_row * BRICK_X + column;
+        const int vertex = first_row * BRICK_X + column;
+        if (!is_sample(model, brick, vertex)) continue;
+        const long long place = fine_place(model, brick, at.samples, vertex, e);
         float mean = model.fine_mean[place], square = model.fine_square[place];
         float number = caught_up(brick.effect, model.fine[place], mean, square);
         mean *= brick.effect.mean_decay;
         square *= brick.effect.square_decay;
-        adam(number, with_gradient ? at.inputs[e * PITCH + column] : 0.f, mean, square, rate);
+        adam(number, at.inputs[e * PITCH + column], mean, square, rate);
         model.fine[place] = number;
         model.fine_mean[place] = mean;
         model.fine_square[place] = square;
@@ -103,10 +105,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 512 / THREADS) train_brick
             const int first = first_row * BRICK_X;
             const int samples = samples_before(model, brick, at.samples, first + columns) -
                                 samples_before(model, brick, at.samples, first);
-            if (samples == 0) {  // the same in all threads
-                move_fine(model, brick, at, first_row, columns, false, rate);
-                continue;
-            }
+            if (samples == 0) continue;  // the same in all threads
             interpolate_rows(at, first_row);
             __syncthreads();
             load_inputs(model, brick, at, first_row, columns);
@@ -125,7 +124,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 512 / THREADS) train_brick
             __syncthreads();
             run_back(at, sums, last_sums);
             transpose_rows(at, columns);
-            move_fine(model, brick, at, first_row, columns, true, rate);
+            move_fine(model, brick, at, first_row, columns, rate);
             __syncthreads();
             add_transposed_rows(at, first_row, columns);
             __syncthreads();
@@ -218,8 +217,10 @@ extern "C" __global__ void __launch_bounds__(THREADS) settle_bricks(
         const long long id = first + item, visited = model.visited[id];
         const CatchUp effect = catch_up(model, visited, step, reinterpret_cast<float*>(memory));
         if (visited > 0 && visited < step) {  // the same in all threads
-            for (int i = threadIdx.x; i < SIZE * VERTICES; i += THREADS) {
-                const long long place = id * SIZE * VERTICES + i;
+            const long long first_sample = model.offsets[id];
+            const int samples = static_cast<int>(model.offsets[id + 1] - first_sample);
+            for (int i = threadIdx.x; i < SIZE * samples; i += THREADS) {
+                const long long place = i / samples * model.fine_row + first_sample + i % samples;
                 const float mean = model.fine_mean[place], square = model.fine_square[place];
                 model.fine[place] = caught_up(effect, model.fine[place], mean, square);
                 model.fine_mean[place] = mean * effect.mean_decay;

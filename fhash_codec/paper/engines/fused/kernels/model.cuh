@@ -38,7 +38,7 @@ struct Model {
     const float* after[4];            // (coordinates, COARSE, vertices)
     const float* powers;              // (WINDOW + 1, 2), of the decays of a step without gradient
     const float* weights;             // (steps, 2), see `catch_up`
-    float* fine;                      // (bricks, SIZE, VERTICES)
+    float* fine;                      // (SIZE, fine_row): at the samples, brick by brick
     float* fine_mean;
     float* fine_square;
     long long* visited;               // (bricks,)
@@ -46,7 +46,8 @@ struct Model {
     float* flat_mean;
     float* flat_square;
     float* gradient;                  // of the coarse numbers
-    long long coarse;                 // number of them
+    long long fine_row;               // numbers from one row of `fine` to the next
+    long long coarse;                 // number of coarse numbers
     int steps;                        // length of `weights`
 };
 

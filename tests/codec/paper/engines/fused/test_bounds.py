@@ -49,7 +49,7 @@ def test_kernels_stay_within_their_arrays(trial, kernels) -> None:
 @pytest.mark.parametrize(
     ("kernels", "old", "new"),
     [
-        ("bricks", "model.fine[place] = number", "model.fine[place + SIZE * VERTICES] = number"),
+        ("bricks", "model.fine_square[place] = square", "model.fine_square[place + 2] = square"),
         (
             "bricks",
             "at.slopes[LATTICE_AT[level] + i] += sum",

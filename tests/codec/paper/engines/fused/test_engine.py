@@ -108,11 +108,24 @@ def test_the_order_of_the_threads_changes_nothing(engines_of) -> None:
             np.testing.assert_array_equal(ours, theirs)
 
 
+def within_the_rows(text: str) -> str:
+    """The kernels with places of finest embeddings that stay in their rows.
+
+    A missing barrier makes them wrong, and wrong ones would destroy other memory.
+    """
+    place = "e * model.fine_row + brick.offset + samples_before(model, brick, samples, vertex)"
+    within = place.replace("brick.offset + ", "(brick.offset + (unsigned)") + ") % model.fine_row"
+    assert place in text
+    return text.replace(place, within)
+
+
 def test_every_barrier_is_needed_and_its_absence_is_found(engines_of) -> None:
     """Without a barrier, some order of the threads gives other numbers, or none at all."""
 
     def run(order, barrier):
-        coreset, fused, _, _ = engines_of((2, 9, 9, 13), {"hidden_layers": 2}, order=order)
+        coreset, fused, _, _ = engines_of(
+            (2, 9, 9, 13), {"hidden_layers": 2}, order=order, change=within_the_rows
+        )
         fused._program.library.skip_barrier(barrier)
         try:
             return fused._sizes.text(), trained(fused, coreset)
@@ -188,7 +201,6 @@ def test_new_kernels_are_tried_first(engines_of, faulty) -> None:
 
 
 def test_tiles_without_samples_are_passed_over(engines_of) -> None:
-    """Their vertices move as Adam moves numbers without a gradient."""
     coreset, fused, slab, _ = engines_of((2, 8, 8, 16), {"hidden_layers": 1, "low": 0.99})
     rows = fused._sizes.tile_rows * coreset.brick_shape[2]
     masks = np.unpackbits(coreset.mask_bits, axis=1)[:, : fused.vertices]
