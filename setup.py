@@ -30,10 +30,10 @@ GNU_FLAGS = [
     "-fvisibility=hidden",
     "-g0",
 ]
-GNU_LINK_FLAGS = ["-Wl,-s"] if sys.platform == "linux" else []
+GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if sys.platform == "linux" else []
 """Debug records and symbol tables would make the libraries five times as large."""
-NETWORK_FLAGS = ("-ffp-contract=fast",)
-"""Fused multiply-adds for the network alone: no stream depends on its bits."""
+NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
+"""Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 

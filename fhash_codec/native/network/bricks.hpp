@@ -142,7 +142,7 @@ FHASH_INLINE void for_rows(const FhashBricks& b, const FhashLevel& l, const std:
 
 }  // namespace
 
-// The parts of a step, and an evaluation.
+// The parts of a step, in their order, and an evaluation.
 enum FhashPart { CATCH_UP, TRAIN, ADAM, INFER };
 
 // The kernels of a path: the share of a thread in a part, and the numbers of its memory.

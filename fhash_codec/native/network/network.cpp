@@ -11,7 +11,7 @@
 
 // Raise it whenever an exported signature or its meaning changes; __init__.py holds the same
 // number.
-constexpr std::int64_t FHASH_NETWORK_ABI = 2;
+constexpr std::int64_t FHASH_NETWORK_ABI = 3;
 
 FHASH_EXPORT std::int64_t fhash_network_abi_version() { return FHASH_NETWORK_ABI; }
 

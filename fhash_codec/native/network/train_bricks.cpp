@@ -1,6 +1,12 @@
 // Training and evaluation of the paper's network by bricks: the functions that Python calls. The
 // kernels are those of brick_kernels.hpp, compiled for each path in a file of its own.
 #include "bricks.hpp"
+
+#include <atomic>
+#include <exception>
+#include <thread>
+#include <vector>
+
 #include "gaps.hpp"
 
 namespace {
@@ -9,6 +15,40 @@ bool is_sound(const FhashBricks& b) {
     return b.embedding > 0 && b.levels >= 0 && b.hidden >= 0 && b.hidden <= 2 && b.threads > 0 &&
            (!b.hidden || (b.width > 0 && b.width <= FHASH_WIDEST)) && vertices_of(b) > 0;
 }
+
+// Do the share of a thread in a part.
+int64_t share(const FhashBricks& b, int64_t part, int64_t thread) {
+#if defined(FHASH_THREE_PATHS)
+    if (b.path == FHASH_PATH_V4) return fhash_bricks_run_v4(b, part, thread);
+    if (b.path == FHASH_PATH_V3) return fhash_bricks_run_v3(b, part, thread);
+#endif
+#if defined(FHASH_VECTORS)
+    return fhash_bricks_run_v1(b, part, thread);
+#else
+    return FHASH_NO_PATH;
+#endif
+}
+
+// A place where threads wait for each other between two parts.
+class Meeting {
+    static constexpr int SPINS = 20000;  // before a thread that waits gives its processor away
+    std::atomic<int64_t> guests{INT64_MAX}, here{0}, over{0};
+
+ public:
+    // Say how many threads meet. The one that says so comes after it to each meeting.
+    void invite(int64_t count) { guests = count; }
+
+    // Return when all threads have come. There may be fewer processors than threads.
+    void wait() {
+        const int64_t number = over;
+        if (++here == guests) {
+            here = 0;
+            over = number + 1;
+        }
+        for (int spin = 0; over == number; spin++)
+            if (spin > SPINS) std::this_thread::yield();
+    }
+};
 
 }  // namespace
 
@@ -52,15 +92,30 @@ FHASH_EXPORT int64_t fhash_bricks_touch(const FhashBricks* task) {
     return touches;
 }
 
-// Do the share of one thread in a part. All threads finish a part before the next one begins.
-FHASH_EXPORT int64_t fhash_bricks_run(const FhashBricks* task, int64_t part, int64_t thread) {
-#if defined(FHASH_THREE_PATHS)
-    if (task->path == FHASH_PATH_V4) return fhash_bricks_run_v4(*task, part, thread);
-    if (task->path == FHASH_PATH_V3) return fhash_bricks_run_v3(*task, part, thread);
-#endif
-#if defined(FHASH_VECTORS)
-    return fhash_bricks_run_v1(*task, part, thread);
-#else
-    return FHASH_NO_PATH;
-#endif
+// Do the parts first .. last, one after the other, by all threads of the task.
+//
+// The threads live for this call alone: to make one takes some 20 microseconds, where a step takes
+// milliseconds. Shares of threads that cannot be made are done by the caller, with the same bits.
+FHASH_EXPORT int64_t fhash_bricks_run(const FhashBricks* task, int64_t first, int64_t last) {
+    const FhashBricks& b = *task;
+    std::atomic<int64_t> result{0};
+    Meeting meeting;
+    const auto work = [&](int64_t begin, int64_t end) {
+        for (int64_t part = first; part <= last; part++) {
+            if (part > first) meeting.wait();
+            for (int64_t thread = begin; thread < end; thread++)
+                if (const int64_t failed = share(b, part, thread)) result = failed;
+        }
+    };
+    std::vector<std::thread> others;
+    try {
+        others.reserve(b.threads);
+        while ((int64_t)others.size() + 1 < b.threads)
+            others.emplace_back(work, (int64_t)others.size(), (int64_t)others.size() + 1);
+    } catch (const std::exception&) {
+    }
+    meeting.invite((int64_t)others.size() + 1);
+    work((int64_t)others.size(), b.threads);
+    for (std::thread& other : others) other.join();
+    return result;
 }

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from math import prod
 from typing import Any
 
@@ -33,7 +32,6 @@ from fhash_codec.paper.engines.native_task import (
     CATCH_UP,
     INFER,
     MOST_HIDDEN,
-    TRAIN,
     WIDEST,
     Bricks,
     Gaps,
@@ -140,7 +138,6 @@ class NativeEngine:
         self._stamps, self._touched = np.zeros_like(self.blocks), np.zeros_like(self.blocks)
         self._gaps: _GapTables | None = None
         self._current: tuple[int, list[Floats]] | None = None
-        self._pool: ThreadPoolExecutor | None = None
         self._memory: dict[str, npt.NDArray[Any]] = {}
         self._task = self._new_task()
 
@@ -160,8 +157,7 @@ class NativeEngine:
         task.error = errors.ctypes.data
         assert self._native is not None
         task.touches = self._native.fhash_bricks_touch(ctypes.byref(task))
-        for part in (CATCH_UP, TRAIN, ADAM):
-            self._run(part, threads)
+        self._run(CATCH_UP, ADAM)
         return torch.tensor(errors.sum())
 
     def infer(self, chosen: Chosen) -> Tensor:
@@ -175,7 +171,7 @@ class NativeEngine:
         task.chosen, task.count = chosen.ctypes.data, len(chosen)
         task.out, task.places = values.ctypes.data, places.ctypes.data
         task.current = self._settled_flat()[0].ctypes.data
-        self._run(INFER, threads)
+        self._run(INFER, INFER)
         return torch.from_numpy(values)
 
     def settle(self) -> None:
@@ -284,19 +280,11 @@ class NativeEngine:
             self._task.work = -(-work.ctypes.data // 64) * 64
         return threads
 
-    def _run(self, part: int, threads: int) -> None:
-        """Let all threads do their shares in a part of the task."""
+    def _run(self, first: int, last: int) -> None:
+        """Let all threads do their shares in the parts `first` to `last` of the task."""
         assert self._native is not None
-        run, task = self._native.fhash_bricks_run, ctypes.byref(self._task)
-        if threads > 1 and (self._pool is None or self._pool._max_workers < threads - 1):
-            self._pool = ThreadPoolExecutor(threads - 1)
-        others = [
-            self._pool.submit(run, task, part, thread)
-            for thread in range(1, threads)
-            if self._pool is not None
-        ]
-        results = [run(task, part, 0), *(other.result() for other in others)]
-        assert not any(results), f"part {part} of the native engine returned {results}"
+        result = self._native.fhash_bricks_run(ctypes.byref(self._task), first, last)
+        assert not result, f"parts {first} to {last} of the native engine returned {result}"
 
     def _gap_tables(self) -> _GapTables:
         """Return the closed form of missed steps at the present learning rates."""
