@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import resource
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -159,6 +163,48 @@ def test_threads_change_no_more_than_the_last_digits(model_of, threads) -> None:
             engine.train(np.arange(len(coreset.bricks)))
         ends.append(engine.infer(np.arange(len(coreset.bricks))[::-1].copy()).numpy())
     np.testing.assert_allclose(*ends, atol=1e-5)
+
+
+WITHOUT_THREADS = """
+import pickle, resource, sys, threading
+import numpy as np, torch
+from fhash_codec.paper.engines.native import NativeEngine
+with open(sys.argv[1], "rb") as file:
+    architecture, coreset = pickle.load(file)
+torch.set_num_threads(3)
+engine = NativeEngine(architecture, coreset, np.full(9, 0.01), seed=3)
+if sys.argv[2] == "none":
+    with open("/proc/self/statm") as pages:
+        taken = int(pages.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (taken + (512 << 20), resource.RLIM_INFINITY))
+    try:
+        threading.Thread(target=print).start()
+        sys.exit("a thread could be made")
+    except RuntimeError:
+        pass
+for _ in range(3):
+    engine.train(np.arange(len(coreset.bricks)))
+values = engine.infer(np.arange(len(coreset.bricks)))
+sys.stdout.buffer.write(engine.state()["flat"].tobytes() + values.numpy().tobytes())
+"""
+"""A program that prints trained numbers. It may make no thread, of whose stack it lacks the GiB."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are those of Linux")
+def test_threads_that_cannot_be_made_change_nothing(model_of, tmp_path) -> None:
+    coreset, architecture = model_of("plain")
+    (tmp_path / "model").write_bytes(pickle.dumps((architecture, coreset)))
+    (tmp_path / "program.py").write_text(WITHOUT_THREADS)
+    most = resource.getrlimit(resource.RLIMIT_STACK)[1]
+    if 0 <= most < 1 << 30:
+        pytest.skip("no thread may have a stack of a GiB here")
+    files = [str(tmp_path / name) for name in ("program.py", "model")]
+    command = ["sh", "-c", 'ulimit -s 1048576; exec "$0" "$@"', sys.executable, *files]
+    results = [
+        subprocess.run([*command, threads], check=True, capture_output=True).stdout
+        for threads in ("some", "none")
+    ]
+    assert results[0] == results[1] != b""
 
 
 @pytest.mark.parametrize("case", ["plain", "a few vertices far apart", "no coarse levels"])
