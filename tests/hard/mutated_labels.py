@@ -154,7 +154,7 @@ def _packed(palette: Any, flags: int) -> bytes:
     if not flags & MANY:
         return zlib.compress(palette.tobytes())
     steps = np.diff(palette, prepend=palette.dtype.type(0))
-    return zlib.compress(steps.view(np.uint8).reshape(palette.size, -1).T.tobytes())
+    return zlib.compress(steps.view(np.uint8).reshape(-1, steps.itemsize).T.tobytes())
 
 
 def _palette(chance: random.Random, bits: Any, dtype: np.dtype[Any]) -> Any:

@@ -19,15 +19,18 @@ from containers import Parts, with_crc
 from documents import DOCUMENT
 from numcodecs.zstd import compress, decompress
 
+from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.sharding import Sharding, pack_index, parse_index
 from fhash_formats.errors import FhashError
+from fhash_formats.transform.apart import without_names
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.entropy.coder import decode_integers
 from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels
 from fhash_formats.transform.entropy.mask import decode_mask
 from fhash_formats.transform.entropy.predict import decode_predicted
 from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.apart import join_mask, split_mask
 from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
 from fhash_formats.transform.tile.sections import (
     MISSING,
@@ -246,9 +249,15 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     _, document, member, data = chosen(chance, parts, True)
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    settings, shape = TileSettings.from_dict(configuration_of(document)), sharding.chunk_shape
+    whole, apart = without_names(configuration_of(document))
+    settings, shape = TileSettings.from_dict(whole), sharding.chunk_shape
     dtype = np.dtype(document["data_type"])
-    chunks[at] = with_crc(_restreamed(chance, chunks[at][:-4], settings, shape, dtype))
+    stream = chunks[at][:-4]
+    if MASK_ARRAY in apart:
+        stream = split_mask(_restreamed(chance, join_mask(stream, b""), settings, shape, dtype))[0]
+    else:
+        stream = _restreamed(chance, stream, settings, shape, dtype)
+    chunks[at] = with_crc(stream)
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
@@ -282,15 +291,16 @@ def _restreamed(
         if parts.predicted and settings.predictor is not None:
             integers = decode_predicted(sections[first], shape, settings.predictor)
         else:
+            table = band_table(settings.transform, shape)
             integers = decode_integers(
-                sections[first], shape, band_table(settings.transform, shape)
+                sections[first], shape, table, coder=settings.coder, trellis=settings.trellis
             )
         digest = zlib.crc32(little_endian(integers))
         if flags & RESIDUAL:
-            digest = zlib.crc32(
-                little_endian(decode_integers(sections[first + 1], shape, single_band(shape))),
-                digest,
+            residual = decode_integers(
+                sections[first + 1], shape, single_band(shape), coder=settings.residual_coder
             )
+            digest = zlib.crc32(little_endian(residual), digest)
         if parts.masked and settings.mask is not None and sections[-1]:
             sections[-1] = _mask_section(
                 sections[-1][2:], integers, settings, shape, parts.predicted

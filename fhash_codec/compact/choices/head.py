@@ -45,6 +45,10 @@ TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 NEAR_GAIN = 0.2
 """Gain in dB below which a head may be trained on the decoded values of its trial."""
+UNUSUAL = 0.5
+"""dB by which tiles may lose more or less than a head gains, before another step is looked for."""
+FARTHEST = 2.0
+"""Power of the usual factor of the step that is taken at most where tiles lose less."""
 POINTLESS = 0.005
 """Share of the bytes that a head must cost before the step is searched: then it is left out."""
 CLOSE = 0.004
@@ -112,10 +116,14 @@ def choose_head(
         gained = f"its trial gained {trial.gain_db:.2f} dB"
         skip("head", f"{gained}: no head would save what it takes itself")
         return settings, outcome, []
-    # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
-    coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
     why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
     with stage("head", why):
+        # A head is trained on what it will meet: coarser data, which it lifts to the quality asked
+        # for.
+        coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
+        if aim is not None:
+            lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
+            coarser = _coarsened(settings, coarser, lost, trial.gain_db)
         if trial.gain_db > NEAR_GAIN or not sample.complete:
             pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
 
@@ -131,6 +139,21 @@ def choose_head(
     if without.extra_bytes(best) < 0:
         return best.settings, best.outcome, history
     return settings, outcome, history
+
+
+def _coarsened(
+    settings: TileSettings, coarser: TileSettings, lost: float, gain: float
+) -> TileSettings:
+    """Return settings of a step at which tiles lose about the dB that a head gains.
+
+    Where most vertices lie on a plateau, tiles lose them much faster than usual.
+
+    coarser: settings of a step at which they lose `lost` dB.
+    """
+    if abs(lost - gain) < UNUSUAL:
+        return coarser
+    share = gain / max(lost, gain / FARTHEST)
+    return replace(settings, step=settings.step * (coarser.step / settings.step) ** share)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,10 +16,11 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.choices.head import MIN_BYTES, _side_by_side, choose_head
+from fhash_codec.compact.choices.head import MIN_BYTES, _coarsened, _side_by_side, choose_head
 from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort, Shape
+from fhash_codec.compact.choices.search import step_after_gain
 from fhash_codec.compact.choices.transform import usual_transform
-from fhash_codec.compact.tiles.coding import Coding, Outcome
+from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
 from fhash_formats.transform.tile.settings import TileSettings
@@ -122,3 +125,24 @@ def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
     else:
         with pytest.raises(AskedFor):
             choose()
+
+
+@pytest.mark.parametrize(
+    ("lost", "share"), [(2.2, 1.0), (4.0, 0.5), (24.0, 1 / 12), (1.25, 1.6), (0.0, 2.0)]
+)
+def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> None:
+    """By what they lost at the usual step, in dB, and by slopes that are believed."""
+    fine = TileSettings(
+        transform=usual_transform((2, 4, 4, 4)),
+        step=0.5,
+        center=0.0,
+        low=0.0,
+        high=1.0,
+        offsets=OFFSETS,
+        double=False,
+    )
+    usual = replace(fine, step=step_after_gain(fine.step, 2.0))
+    found = _coarsened(fine, usual, lost, 2.0)
+    assert math.log(found.step / fine.step) == pytest.approx(
+        share * math.log(usual.step / 0.5), 0.01
+    )
