@@ -45,7 +45,7 @@ TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 NEAR_GAIN = 0.2
 """Gain in dB below which a head may be trained on the decoded values of its trial."""
-UNUSUAL = 0.5
+UNUSUAL = 1.0
 """dB by which tiles may lose more or less than a head gains, before another step is looked for."""
 FARTHEST = 2.0
 """Power of the usual factor of the step that is taken at most where tiles lose less."""
