@@ -282,6 +282,10 @@ ONCE_WRONG: dict[str, dict[str, Any]] = {
         }
     },
     "rays without an end": {"scale": [8e29, 2.4e29, 1e-30], "camera": {"view": "yz"}},
+    "a colour bar below a picture of one pixel": {
+        "size": [1, 1],
+        "effects": {"colour_bar": True},
+    },
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes with which the test below has failed once."""
