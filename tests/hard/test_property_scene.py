@@ -128,7 +128,7 @@ def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
 
 
 def toml(values: dict[str, Any]) -> str:
-    """Return the values as TOML with inline tables."""
+    """Return the values as TOML with inline tables; it has no null, and says false instead."""
 
     def text(value: Any) -> str:
         if isinstance(value, dict):
@@ -139,6 +139,8 @@ def toml(values: dict[str, Any]) -> str:
             )
         if isinstance(value, list):
             return "[" + ", ".join(map(text, value)) + "]"
+        if value is None:
+            return "false"
         return repr(value) if isinstance(value, float) else json.dumps(value)
 
     return "\n".join(f"{json.dumps(key)} = {text(value)}" for key, value in values.items())
