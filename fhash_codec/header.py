@@ -307,7 +307,8 @@ def _figure(name: str, value: float | None, digits: int) -> float | None:
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, digits)
+    # numpy rounds by a product, which overflows; Python's numbers do not
+    return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
 def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -> dict[str, Any]:

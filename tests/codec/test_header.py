@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
@@ -72,6 +73,12 @@ def test_history_in_a_file_is_brief() -> None:
         == history_points([{"epoch": 1, "psnr": 2.5}, {"epoch": 2, "psnr": 3}])
         == expected
     )
+
+
+def test_a_history_with_the_largest_numbers_is_rounded() -> None:
+    largest = np.finfo(np.float64).max
+    point = {"seconds": largest, "epoch": 1, "psnr": -largest}
+    assert brief_history([point], timings=True) == [point]
 
 
 def test_exact_values_have_no_psnr_in_the_history() -> None:

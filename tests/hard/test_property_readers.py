@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from properties import INTEGERS, NUMBERS, Draw, arrays, chunks, looking, same
 
 from fhash_formats import RawLayout, Region, open_series, save_region
+from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 
 ORDERS = st.permutations(AXES)
@@ -221,10 +222,17 @@ def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, dat
 @looking(10)
 @given(values=arrays(INTEGERS), data=st.data())
 def test_any_split_into_files_is_one_series(values: np.ndarray, data: Draw) -> None:
+    """Whoever names no axes is asked where the last one may hold the components of a vector."""
     with folder() as place:
         start = number = 0
         while start < values.shape[0]:
             stop = start + data.draw(st.integers(1, values.shape[0] - start))
             np.save(place / f"part_{number}.npy", values[start:stop])
             start, number = stop, number + 1
-        assert same(read(place / "part_*.npy"), values)
+        assert same(read(place / "part_*.npy", axes="t,z,y,x"), values)
+        _, z, y, x = values.shape
+        if 2 <= x <= 9 and x < min(y, z):
+            with pytest.raises(InputError, match=f"field of {x} components"):
+                read(place / "part_*.npy")
+        else:
+            assert same(read(place / "part_*.npy"), values)

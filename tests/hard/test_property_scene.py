@@ -128,7 +128,7 @@ def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
 
 
 def toml(values: dict[str, Any]) -> str:
-    """Return the values as TOML with inline tables."""
+    """Return the values as TOML with inline tables; it has no null, and says false instead."""
 
     def text(value: Any) -> str:
         if isinstance(value, dict):
@@ -139,6 +139,8 @@ def toml(values: dict[str, Any]) -> str:
             )
         if isinstance(value, list):
             return "[" + ", ".join(map(text, value)) + "]"
+        if value is None:
+            return "false"
         return repr(value) if isinstance(value, float) else json.dumps(value)
 
     return "\n".join(f"{json.dumps(key)} = {text(value)}" for key, value in values.items())
@@ -282,6 +284,10 @@ ONCE_WRONG: dict[str, dict[str, Any]] = {
         }
     },
     "rays without an end": {"scale": [8e29, 2.4e29, 1e-30], "camera": {"view": "yz"}},
+    "a colour bar below a picture of one pixel": {
+        "size": [1, 1],
+        "effects": {"colour_bar": True},
+    },
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes with which the test below has failed once."""

@@ -193,7 +193,8 @@ class _Canvas:
         """
         left, top, right, bottom = rectangle
         height, width = self.opacity.shape
-        first, last = max(top, 0), max(min(bottom, height), 0)
+        first = max(top, 0)
+        last = max(min(bottom, height), first)  # a rectangle below the canvas has no row on it
         area = slice(first, last), slice(max(left, 0), max(min(right, width), 0))
         self.colours[area] = colour[first - top : last - top] if colour.ndim == 3 else colour
         self.opacity[area] = opacity

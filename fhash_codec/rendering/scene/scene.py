@@ -226,13 +226,13 @@ class Clip(Record):
     """
 
     x: Ends | None = limits(
-        None, "first and last x, null for an end that is not cut", low=-1e100, high=1e100
+        None, "first and last x, null (TOML: false) where it is not cut", low=-1e100, high=1e100
     )
     y: Ends | None = limits(
-        None, "first and last y, null for an end that is not cut", low=-1e100, high=1e100
+        None, "first and last y, null (TOML: false) where it is not cut", low=-1e100, high=1e100
     )
     z: Ends | None = limits(
-        None, "first and last z, null for an end that is not cut", low=-1e100, high=1e100
+        None, "first and last z, null (TOML: false) where it is not cut", low=-1e100, high=1e100
     )
     planes: tuple[ClipPlane, ...] = ()
 

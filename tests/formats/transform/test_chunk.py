@@ -77,6 +77,15 @@ def test_the_bound_holds_at_the_ends_of_the_types(dtype: str, scale: float) -> N
         check(values, fraction * span, max_error_rel=fraction)
 
 
+@pytest.mark.parametrize(("dtype", "peak"), [("f2", 6e4), ("f4", 2.7e38), ("f4", 3.4e38)])
+def test_a_residual_beyond_the_type_is_clipped_where_it_decodes(dtype: str, peak: float) -> None:
+    """A quantum of nearly the range takes the peak beyond the largest number of the type."""
+    values = np.zeros((5, 5, 2, 2), dtype)
+    values.flat[0] = peak
+    for fraction in (0.3, 0.45, 0.5):
+        check(values, fraction * float(values.max()), max_error_rel=fraction)
+
+
 @pytest.mark.parametrize("dtype", INTEGERS)
 def test_the_ends_of_whole_numbers(dtype: str) -> None:
     limits = np.iinfo(dtype)

@@ -228,8 +228,9 @@ def _decode_transformed(
     # The mask is decoded by now, so that the head may overwrite what it corrects.
     base = linear if settings.head is None else settings.head.apply(linear, in_place=True)
     values = corrected(base, residual, settings.quantum, kind)
-    # Without a residual the values are within the range, and finite.
-    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
+    # Without a residual the values are within the range, and finite; clipped ones are in the end.
+    may_exceed = not settings.clip and settings.quantum * 2.0**31 > largest / 2
+    if residual is not None and may_exceed and np.isinf(values).any():
         raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
     return within_range(values, settings), mask
 

@@ -7,7 +7,7 @@ import pytest
 
 from fhash_codec.rendering.camera.box import Edge
 from fhash_codec.rendering.colour.colours import named_map
-from fhash_codec.rendering.picture.layout import strips
+from fhash_codec.rendering.picture.layout import Bar, strips
 from fhash_codec.rendering.picture.lettering import Label
 from fhash_codec.rendering.picture.pen import DARK, LIGHT, Pen
 from fhash_codec.rendering.scene.scene import Effects, LegendEntry
@@ -65,6 +65,15 @@ def test_a_time_label_stays_in_its_strip(text: str) -> None:
     rows, columns = np.nonzero(pen.written()[0][1])
     assert columns.max() < 129
     assert rows.max() <= 20
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 9])
+def test_a_colour_bar_is_cut_at_the_edges_of_a_tiny_picture(side: int) -> None:
+    bar = Bar(box=(1, 2, 10, 18), marks=(), title=(), size=8)
+    part = Pen(side, side, "white").colour_bar(bar, named_map("viridis"))
+    whole = Pen(20, 20, "white").colour_bar(bar, named_map("viridis"))
+    for layer, of_whole in zip(part, whole, strict=True):
+        np.testing.assert_array_equal(layer, of_whole[:side, :side])
 
 
 def test_a_colour_bar_and_a_legend_are_drawn_in_their_colours() -> None:

@@ -98,6 +98,8 @@ def test_a_clip_and_projections_are_read_and_written() -> None:
     assert Scene.from_dict(scene.to_dict()) == scene
     assert json.loads(json.dumps(scene.to_dict())) == json.loads(json.dumps(values))
     assert Scene.from_dict({"effects": {"clip": False}}) == Scene()
+    toml = {"x": [False, 3.5], "z": [0, False], "planes": planes}  # TOML has no null
+    assert Scene.from_dict({**values, "effects": {"clip": toml}}) == scene
     both = Scene.from_dict(
         {"effects": {"average_intensity": True, "attenuated_maximum_intensity": True}}
     )

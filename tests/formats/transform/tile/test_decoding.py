@@ -94,6 +94,24 @@ def test_numbers_that_end_in_infinities_are_damage(
 
 
 @pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize(("quantum", "dtype"), [(1e300, "float32"), (1e308, "float64")])
+def test_clipped_values_end_in_the_range_whatever_their_residual(
+    quantum: float, dtype: str, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    settings = TileSettings(
+        transform=PLAIN, step=1.0, center=0.0, low=-9.0, high=9.0, quantum=quantum, clip=True
+    )
+    coefficients = np.zeros(SHAPE, np.int32)
+    residual = np.full(SHAPE, 100, np.int32)
+    residual[0] *= -1
+    coded = encode_integers(coefficients, single_band(SHAPE)).data
+    data = build_stream(None, b"", coded, coefficients, residual, None)
+    decoded = decode_tile(data, SHAPE, dtype, settings)
+    np.testing.assert_array_equal(decoded, np.where(residual < 0, -9.0, 9.0))
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
 def test_a_transform_that_overflows_gives_no_warning(
     native: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
