@@ -43,14 +43,15 @@ def header(sources: Iterable[Path]) -> str:
 def _expanded(text: str) -> str:
     """Return a source without comments, in which its own macros around exports are expanded."""
     text = re.sub(r"//.*", "", text).replace("\\\n", " ")
-    macros = {name: (given, body) for name, given, body in _MACRO.findall(text)}
+    macros = _MACRO.findall(text)
     text = _MACRO.sub("", text)
-    for name, (given, body) in macros.items():
+    for name, given, body in macros:
+        if given and "FHASH_EXPORT" in body:
+            call = re.compile(rf"^{name}\(([^)]*)\)", re.MULTILINE)
+            text = call.sub(lambda at, of=given, to=body: _filled(to, of, at[1]), text)
+    for name, given, body in macros:
         if not given:
             text = re.sub(rf"\b{name}\b", lambda _, to=body: to, text)
-        elif "FHASH_EXPORT" in body:
-            call = re.compile(rf"^{name}\(([^)]*)\)$", re.MULTILINE)
-            text = call.sub(lambda at, of=given, to=body: _filled(to, of, at[1]), text)
     return text
 
 
