@@ -131,7 +131,8 @@ std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vect
     std::vector<std::uint8_t> bucket(vertices_of(with));
     std::vector<int64_t> counts(2 * buckets * rates);
     std::vector<std::int32_t> costs = repeated<std::int32_t>(in, 2 * buckets * rates);
-    for (std::int32_t& cost : costs) cost = static_cast<std::int32_t>((cost & 0xfffff) % (most + 1));
+    for (std::int32_t& cost : costs)
+        cost = static_cast<std::int32_t>((cost & 0xfffff) % (most + 1));
     const int64_t *const shape = with.shape.data(), bands = bands_of(with);
     const std::int32_t* const table = with.table.data();
     std::vector<std::int32_t> levels(scaled.size(), 0);

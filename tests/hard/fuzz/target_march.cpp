@@ -185,7 +185,8 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
     m.grading = arrays.grading.data();
     m.grade_scale = std::fabs(number_of(in));
     m.unlit = in.within(0, 1);
-    if (in.byte() & 1) arrays.smooth = repeated<float>(in, static_cast<int64_t>(arrays.values.size()));
+    const int64_t vertices = static_cast<int64_t>(arrays.values.size());
+    if (in.byte() & 1) arrays.smooth = repeated<float>(in, vertices);
     m.smooth = arrays.smooth.empty() ? nullptr : arrays.smooth.data();
     arrays.out.resize(static_cast<std::size_t>(4 * m.width * m.height));
     arrays.depth.assign(arrays.out.size() / 4, std::numeric_limits<float>::infinity());

@@ -199,7 +199,8 @@ void values(Reader& in) {
     const std::vector<std::uint8_t> counts = repeated<std::uint8_t>(in, n);
     const std::uint8_t* const chosen = which & 64 ? counts.data() : nullptr;
     std::vector<double> shifts;  // in steps, as settings have them
-    for (int i = 0; i < 6; i++) shifts.push_back(static_cast<double>(in.within(0, 255) - 128) / 128);
+    for (int i = 0; i < 6; i++)
+        shifts.push_back(static_cast<double>(in.within(0, 255) - 128) / 128);
     switch (which % 12) {
         case 0:
             fhash_clip_f32(one.data(), n, a, std::min(b, c), std::max(b, c));
