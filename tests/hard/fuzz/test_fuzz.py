@@ -75,7 +75,7 @@ def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
 
 
 def test_declarations_are_of_all_that_python_calls() -> None:
-    """What stands behind a macro is declared, too, and with as many parameters."""
+    """Functions behind a macro are declared, too, and with as many parameters."""
     declared = declarations.exported(run.native_sources())
     for prototypes in (formats.PROTOTYPES, codec.PROTOTYPES, network.PROTOTYPES):
         for name, arguments in prototypes.items():
