@@ -20,7 +20,7 @@ there is nothing to show (exit code 2).""",
     "the native code under sanitizers": """\
 Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers:
 decoders, encoders (whose output must decode to the input), transforms, heads and their training,
-figures of quality, the marcher and its light.""",
+figures of quality, points of networks, the marcher, its light and its shading.""",
     "kill -9 at an operation": """\
 The process is killed before each of its file operations. The older output stays complete, and the
 next run removes temporary files.""",

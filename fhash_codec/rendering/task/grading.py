@@ -22,6 +22,9 @@ __all__ = ["factors_at_vertices", "grading_of"]
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
+LEAST_TOP = 1e-300
+"""Least gradient of the last factor in marched units, so that there are numbers to divide by it."""
+
 
 def grading_of(
     spec: TransferFunctionSpec, volume: Volume, units: Units, grid: Grid
@@ -49,7 +52,7 @@ def grading_of(
     ends = units.to([low, high] if low < high else about(low))
     return Grading(
         factors=np.interp(np.linspace(0.0, top, GRADES + 1), points[:, 0], points[:, 1]),
-        top=top * float(ends[1] - ends[0]) / grid.vertex_spacing,
+        top=max(top * float(ends[1] - ends[0]) / grid.vertex_spacing, LEAST_TOP),
     )
 
 
@@ -64,11 +67,14 @@ def factors_at_vertices(values: Single, grading: Grading, spacing: Floats) -> Si
         grading: factors by the size of the gradient.
         spacing: (3,), x, y, z, distance of two vertices of the frame, in the coordinates.
     """
-    scale = np.asarray(GRADES / grading.top / np.abs(spacing), dtype=np.float64)
+    # A finite scale: a gradient of 0 stays one.
+    with np.errstate(over="ignore"):
+        scale = np.minimum(GRADES / grading.top / np.abs(spacing), np.finfo(np.float64).max)
     library = native.library()
     if library is None:
-        slopes = [_slopes(values, axis) * scale[2 - axis] for axis in range(3)]
-        size = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + slopes[2] ** 2)
+        with np.errstate(over="ignore"):
+            slopes = [_slopes(values, axis) * scale[2 - axis] for axis in range(3)]
+            size = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + slopes[2] ** 2)
         found = np.interp(size, np.arange(GRADES + 1), grading.factors)
         return np.where(np.isnan(values), 0, found).astype(np.float32)
     table = np.append(grading.factors, grading.factors[-1]).astype(np.float32)

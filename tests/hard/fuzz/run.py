@@ -30,6 +30,8 @@ NATIVE = HERE.parents[2] / "formats" / "fhash_formats" / "native"
 """Sources of the file format's library."""
 CODEC = HERE.parents[2] / "fhash_codec" / "native"
 """Sources of the codec's library, which include headers of the other one."""
+NETWORK = CODEC / "network"
+"""Sources of the network's library, likewise."""
 TARGETS = tuple(
     HERE / f"{name}.cpp"
     for name in (
@@ -38,13 +40,21 @@ TARGETS = tuple(
         "target_figures",
         "target_labels",
         "target_light",
+        "target_points",
+        "target_samples",
+        "target_slopes",
         "target_train",
     )
 )
-SOURCES = ("coder", "mask", "predict", "labels", "lifting", "head", "quantise", "values")
+SOURCES = (
+    *("coder", "trellis", "mask", "predict", "labels"),
+    *("lifting", "head", "quantise", "values"),
+)
 """Files of NATIVE that are always fuzzed."""
-CODEC_SOURCES = ("march_light", "quality", "train_head")
+CODEC_SOURCES = ("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head")
 """Files of CODEC that are always fuzzed."""
+NETWORK_SOURCES = ("peak", "points")
+"""Files of NETWORK that are always fuzzed."""
 MARCH = ("march", "march_bricks", "march_effects")
 """Files of CODEC that are fuzzed on request, without optimisation.
 
@@ -100,6 +110,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     _require_sanitizers(compiler, folder)
     tracing, headers = ("-fsanitize-coverage=trace-pc",), f"-I{NATIVE}"
+    declared = f"-I{_declare(folder)}"
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
         # Unused lanes of vectors may hold NaN, so float-cast-overflow would report them.
@@ -110,11 +121,13 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
             )
             for name in MARCH
         ]
-        jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}"))]
+        jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}", declared))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
     jobs += [(CODEC / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in CODEC_SOURCES]
+    jobs += [(NETWORK / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in NETWORK_SOURCES]
     jobs += [
-        (target, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else []))) for target in TARGETS
+        (target, (*SANITIZE, declared, *(["-DFHASH_FUZZ_MARCH"] if march else [])))
+        for target in TARGETS
     ]
 
     def compiled(job: tuple[Path, tuple[str, ...]]) -> Path:
@@ -130,6 +143,22 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     binary = folder / "fuzzer"
     _compile([*compiler.split(), *SANITIZE, *map(str, objects), "-o", str(binary)])
     return binary
+
+
+def native_sources() -> list[Path]:
+    """Return all files of the three libraries."""
+    return [path for folder in (NATIVE, CODEC, NETWORK) for path in sorted(folder.glob("*.cpp"))]
+
+
+def _declare(folder: Path) -> Path:
+    """Write the header of what the libraries export, which targets include; return its folder.
+
+    No target declares a function itself, so none can be called by another signature than its own.
+    """
+    from declarations import header
+
+    (folder / "exports.hpp").write_text(header(native_sources()), encoding="utf-8")
+    return folder
 
 
 def _compile(command: list[str]) -> None:

@@ -25,9 +25,10 @@ from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
-from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.entropy.table import Table, single_band
+from fhash_formats.transform.entropy.trellis import choose_levels
 from fhash_formats.transform.tile.apart import join_mask
-from fhash_formats.transform.tile.sections import parse_stream
+from fhash_formats.transform.tile.sections import parse_stream, unpack_settings
 from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
@@ -44,10 +45,15 @@ NAMES = (
     "label-encoder",
     "training",
     "figures",
+    "slopes",
+    "samples",
+    "points",
     "march",
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
 CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
+TRELLIS = 16
+"""Bit that says in an input of CODER that the integers are those of two quantisers."""
 WITH_SEEDS = (CODER, PREDICTOR)
 """Targets that have seeds of their own only; those of all others are random bytes, too."""
 
@@ -82,13 +88,16 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
 
     Returns the bands as (shape, table) and the passes as (shape, Predictor), in their order there.
     """
-    bands = [(shape, single_band(shape)) for shape in SHAPES]
-    bands += [(shape, band_table(_spec(axes), shape)) for axes in SPECS for shape in SHAPES]
-    bands += [
-        (shape, band_table(settings.transform, shape))
-        for _, settings, shape in golden_streams()
-        if np.prod(shape) < 1 << 14
-    ]
+    tables = [(shape, single_band(shape)) for shape in SHAPES]
+    tables += [(shape, band_table(_spec(axes), shape)) for axes in SPECS for shape in SHAPES]
+    for _, settings, shape in golden_streams():
+        if np.prod(shape) < 1 << 14:
+            tables += [
+                (shape, band_table(settings.transform, shape)),
+                (shape, single_band(shape)),
+            ]
+    # Many tiles of the goldens have the same bands.
+    bands = list({(shape, table.tobytes()): (shape, table) for shape, table in tables}.values())
     passes = [
         (shape, _predictor(levels, order, reach))
         for levels, reach in PREDICTORS
@@ -106,7 +115,7 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             file.write(struct.pack("<q", len(data)) + data)
 
         labels = blank_label_state(), blank_label_state(wide=True)
-        coders = [prior_state(coder) for coder in CODERS]
+        coders = [prior_state(coder, trellis) for trellis in (False, True) for coder in CODERS]
         for state in (*coders, mask_prior_state(), blank_state(), *labels):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
@@ -147,9 +156,14 @@ def write_seeds(
     for number, (shape, table) in enumerate(bands):
         for scale in (0.5, 30.0, 1e8):
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
+            scaled = (rng.laplace(0, scale, shape)).clip(-9e8, 9e8)
+            path = choose_levels(scaled, table, 0.1)
             for model, coder in enumerate(CODERS):
                 data = encode_integers(integers, table, coder=coder).data
                 put(CODER, struct.pack("<HB", number, model), data)
+                if model:  # a stream by contexts alone has one quantiser
+                    data = encode_integers(path, table, coder=coder, trellis=True).data
+                    put(CODER, struct.pack("<HB", number, model | TRELLIS), data)
     for number, (shape, predictor) in enumerate(passes):
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
@@ -165,10 +179,11 @@ def write_seeds(
         for number, (shape, table) in reversed(list(enumerate(bands)))
     }
     for stream, settings, shape in golden_streams():
-        data = coefficients_of(stream)
-        setup = setup_of_bands.get((shape, band_table(settings.transform, shape).tobytes()))
-        if data and setup is not None:
-            put(CODER, struct.pack("<HB", setup, CODERS.index(settings.coder)), data)
+        for data, table, coder, trellis in coded_sections(stream, settings, shape):
+            setup = setup_of_bands.get((shape, table.tobytes()))
+            if setup is not None:
+                how = CODERS.index(coder) | TRELLIS * trellis
+                put(CODER, struct.pack("<HB", setup, how), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):
@@ -210,15 +225,23 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
                     stream = bytes(array.coded(index))
                     if array.masks is not None:
                         stream = join_mask(stream, array.masks.coded(index))
-                    yield stream, array.settings, (t, z, y, x)
+                    own = parse_stream(stream).settings
+                    settings = array.settings if own is None else unpack_settings(own)
+                    yield stream, settings, (t, z, y, x)
 
 
-def coefficients_of(stream: bytes) -> bytes:
-    """Return the section of coded coefficients of a tile; empty if there is none."""
+def coded_sections(
+    stream: bytes, settings: TileSettings, shape: tuple[int, ...]
+) -> Iterator[tuple[bytes, Table, str, bool]]:
+    """Yield the coded integers of a tile: bytes, bands, coder, and whether of two quantisers."""
     parts = parse_stream(stream)
-    return (
-        bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
-    )
+    if parts.coded and not parts.predicted and parts.body is not None:
+        table = band_table(settings.transform, shape)
+        yield bytes(parts.body), table, settings.coder, settings.trellis
+    if parts.residual is not None:
+        yield bytes(parts.residual), single_band(shape), settings.residual_coder, False
+    if parts.missing is not None:
+        yield bytes(parts.missing[4:]), single_band(shape), CODERS[0], False
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:

@@ -2,34 +2,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-extern "C" {
-int64_t fhash_encode(std::int32_t*, const float*, double, int64_t, int64_t, const int64_t*,
-                     const std::int32_t*, int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t,
-                     std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
-                     const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                     const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_encode_mask(const std::uint8_t*, const std::uint8_t*, const std::uint8_t*,
-                          const int64_t*, std::uint16_t*, int64_t, std::int32_t*, int64_t,
-                          std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
-                          const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                          const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_encode_predicted(std::int32_t*, const std::uint8_t*, const int64_t*, const int64_t*,
-                               const std::int32_t*, int64_t, const std::int32_t*,
-                               const std::int16_t*, const std::uint16_t*, int64_t,
-                               const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
-                               std::uint8_t*, int64_t);
-int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*,
-                               int64_t, const std::int32_t*, const std::int16_t*,
-                               const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                               const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-}
 
 namespace {
 
@@ -60,30 +37,40 @@ std::vector<std::int32_t> bounded(Reader& in, int64_t n, std::int32_t most) {
     return values;
 }
 
+int64_t bands_of(const Bands& with) { return static_cast<int64_t>(with.table.size() / 29); }
+
+// How integers are coded: by which Model, whether as those of two quantisers, and whether the
+// encoder leaves its state adapted.
+struct How {
+    int64_t model;
+    bool trellis, keep;
+};
+
 // Codes integers and decodes them. With `scaled`, the encoder chooses the integers; without, it
 // must not change them.
 std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int32_t>& q,
                                          const std::vector<float>& scaled, double lambda,
-                                         std::size_t room, int64_t model) {
-    State state = setups().coders[model];
+                                         std::size_t room, How how) {
+    const State& prior = setups().coders[how.trellis][how.model];
+    State state = prior;
     const std::vector<std::int32_t> given = q;
-    const int64_t bands = static_cast<int64_t>(with.table.size() / 29);
+    const int64_t bands = bands_of(with);
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
         q = given;
-        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, model, 0,
-                            with.shape.data(), with.table.data(), bands, state.slots.data(),
-                            static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
-                            static_cast<int64_t>(state.weights.size()), state.simples.data(),
-                            static_cast<int64_t>(state.simples.size() / 2), 0, into.data(),
-                            length(into));
+        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, how.model,
+                            how.trellis, with.shape.data(), with.table.data(), bands,
+                            state.slots.data(), static_cast<int64_t>(state.slots.size() / 4),
+                            state.weights.data(), static_cast<int64_t>(state.weights.size()),
+                            state.simples.data(), static_cast<int64_t>(state.simples.size() / 2),
+                            how.keep, into.data(), length(into));
     });
     require(!scaled.empty() || q == given, "integers that the encoder changed");
     std::vector<std::int32_t> decoded(q.size(), 0);
     const int64_t code = fhash_decode(
-        decoded.data(), model, 0, with.shape.data(), with.table.data(), bands, state.slots.data(),
-        static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
-        static_cast<int64_t>(state.weights.size()), state.simples.data(),
-        static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
+        decoded.data(), how.model, how.trellis, with.shape.data(), with.table.data(), bands,
+        prior.slots.data(), static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
+        static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
+        static_cast<int64_t>(prior.simples.size() / 2), data.data(), length(data));
     require(code == 0, "bytes of the encoder are refused");
     return decoded;
 }
@@ -94,7 +81,7 @@ const std::vector<std::int32_t>& inside(std::size_t number) {
     if (covered[number].empty()) {
         const Bands& with = setups().bands[number];
         std::vector<std::int32_t> ones(static_cast<std::size_t>(volume(with.shape)), 1);
-        covered[number] = there_and_back(with, ones, {}, 0, 0, 0);
+        covered[number] = there_and_back(with, ones, {}, 0, 0, {0, false, false});
     }
     return covered[number];
 }
@@ -113,11 +100,78 @@ void of_integers(Reader& in) {
     for (std::size_t i = 0; i < scaled.size(); i++)
         scaled[i] =
             static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
-    const int model = (how >> 1) % 3;
     const std::vector<std::int32_t> decoded =
-        there_and_back(with, q, scaled, lambda, room, model);
+        there_and_back(with, q, scaled, lambda, room, {(how >> 1) % 3, false, how >= 128});
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
+}
+
+// The functions that choose integers of two quantisers, by the type of the coefficients.
+auto guess(const float*) { return fhash_trellis_guess_f32; }
+auto guess(const double*) { return fhash_trellis_guess_f64; }
+auto choose(const float*) { return fhash_trellis_choose_f32; }
+auto choose(const double*) { return fhash_trellis_choose_f64; }
+
+// Vertices of all bands.
+std::size_t vertices_of(const Bands& with) {
+    std::size_t sum = 0;
+    for (std::size_t row = 0; row < with.table.size(); row += 29) {
+        std::size_t size = 1;
+        for (std::size_t a = 0; a < 4; a++)
+            size *= static_cast<std::size_t>(with.table[row + 4 + a] - with.table[row + a]);
+        sum += size;
+    }
+    return sum;
+}
+
+// The integers of the path that is cheapest by hostile rates.
+template <class T>
+std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vector<T>& scaled) {
+    const int64_t buckets = 64, rates = 24, most = 1 << 19;  // as in trellis.cpp
+    std::vector<std::uint8_t> bucket(vertices_of(with));
+    std::vector<int64_t> counts(2 * buckets * rates);
+    std::vector<std::int32_t> costs = repeated<std::int32_t>(in, 2 * buckets * rates);
+    for (std::int32_t& cost : costs)
+        cost = static_cast<std::int32_t>((cost & 0xfffff) % (most + 1));
+    const int64_t *const shape = with.shape.data(), bands = bands_of(with);
+    const std::int32_t* const table = with.table.data();
+    std::vector<std::int32_t> levels(scaled.size(), 0);
+    const auto all_counted = [&] {
+        int64_t sum = 0;
+        for (const int64_t count : counts) sum += count;
+        require(sum == static_cast<int64_t>(bucket.size()), "another number of indices");
+    };
+    require(guess(scaled.data())(scaled.data(), shape, table, bands, bucket.data(),
+                                 counts.data()) == 0,
+            "coefficients of which no path is guessed");
+    all_counted();
+    for (int turn = in.byte() & 1; turn >= 0; turn--) {
+        std::fill(levels.begin(), levels.end(), 0);
+        require(choose(scaled.data())(scaled.data(), shape, table, bands, bucket.data(),
+                                      costs.data(), levels.data()) == 0,
+                "coefficients for which there is no path");
+        std::fill(counts.begin(), counts.end(), 0);
+        require(fhash_trellis_count(levels.data(), shape, table, bands, bucket.data(),
+                                    counts.data()) == 0,
+                "levels that are not counted");
+        all_counted();
+    }
+    return levels;
+}
+
+// Integers of two quantisers: those of a path come back.
+template <class T> void of_path(Reader& in) {
+    const Bands& with = setups().bands[in.word() % setups().bands.size()];
+    const std::size_t room = 4U * in.byte();
+    const int64_t model = in.byte() % 3;
+    const std::vector<std::int32_t> whole = bounded(in, volume(with.shape), 999999999);
+    std::vector<T> scaled;
+    for (std::size_t i = 0; i < whole.size(); i++)
+        scaled.push_back(static_cast<T>(whole[i]) * static_cast<T>(0.999) +
+                         static_cast<T>(i % 15) / 16);
+    std::vector<std::int32_t> levels = path_of(in, with, scaled);
+    require(there_and_back(with, levels, {}, 0, room, {model, true, false}) == levels,
+            "other integers of two quantisers");
 }
 
 void of_masks(Reader& in) {
@@ -179,9 +233,11 @@ void of_predicted(Reader& in) {
 }  // namespace
 
 void round_trip(Reader& in) {
-    switch (in.byte() % 3) {
+    switch (in.byte() % 5) {
         case 0: of_integers(in); break;
         case 1: of_masks(in); break;
-        default: of_predicted(in);
+        case 2: of_predicted(in); break;
+        case 3: of_path<float>(in); break;
+        default: of_path<double>(in);
     }
 }

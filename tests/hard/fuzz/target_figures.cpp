@@ -3,29 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-extern "C" {
-int64_t fhash_scan_f32(const float*, int64_t, double, double*);
-int64_t fhash_scan_f64(const double*, int64_t, double, double*);
-int64_t fhash_errors_f32(const float*, const float*, const std::uint8_t*, int64_t, double, double*);
-int64_t fhash_errors_f64(const double*, const double*, const std::uint8_t*, int64_t, double,
-                         double*);
-int64_t fhash_bulk_errors_f32(const float*, const float*, const std::uint8_t*, int64_t, double,
-                              double, double, double*);
-int64_t fhash_bulk_errors_f64(const double*, const double*, const std::uint8_t*, int64_t, double,
-                              double, double, double*);
-int64_t fhash_histogram_f32(const float*, int64_t, double, double, double, int64_t, int64_t*);
-int64_t fhash_histogram_f64(const double*, int64_t, double, double, double, int64_t, int64_t*);
-int64_t fhash_ssim_f32(const float*, const float*, const std::uint8_t*, const int64_t*,
-                       const int64_t*, const double*, double*);
-int64_t fhash_ssim_f64(const double*, const double*, const std::uint8_t*, const int64_t*,
-                       const int64_t*, const double*, double*);
-int64_t fhash_magnitudes(const float*, int64_t, int64_t, int64_t*, double*);
-}
 
 namespace {
 

@@ -1,22 +1,11 @@
 // The coder of labels: any bytes decode to labels below the count, and what it encodes comes back.
 #include <algorithm>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-#define STATE                                                                                      \
-    const std::uint16_t*, int64_t, const std::int32_t*, int64_t, const std::uint16_t*, int64_t
-extern "C" {
-int64_t fhash_encode_labels(std::uint8_t*, int64_t, const int64_t*, STATE, std::uint8_t*, int64_t);
-int64_t fhash_encode_wide_labels(std::uint16_t*, int64_t, const int64_t*, STATE, std::uint8_t*,
-                                 int64_t);
-int64_t fhash_decode_labels(std::uint8_t*, int64_t, const int64_t*, STATE, const std::uint8_t*,
-                            int64_t);
-int64_t fhash_decode_wide_labels(std::uint16_t*, int64_t, const int64_t*, STATE,
-                                 const std::uint8_t*, int64_t);
-}
 
 namespace {
 

@@ -3,18 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-extern "C" {
-int64_t fhash_march_extinction(const float*, const int64_t*, const float*, int64_t, double, double,
-                               int64_t, const int64_t*, int64_t, int64_t, const float*, float*,
-                               float*);
-int64_t fhash_march_sum(const float*, const int64_t*, const double*, int64_t, int64_t, int64_t,
-                        float*);
-}
 
 void light(Reader& in) {
     int64_t shape[3], points[3];

@@ -6,22 +6,12 @@
 #include <cmath>
 #include <limits>
 
+#include "exports.hpp"
 #include "march.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-extern "C" {
-int64_t fhash_march(const FhashMarch*, int64_t, int64_t, int64_t, int64_t*);
-int64_t fhash_march_bricks(const float*, const int64_t*, const int64_t*, int64_t, int64_t, int64_t,
-                           float*, float*, float*);
-int64_t fhash_march_cells(const float*, const int64_t*, const int64_t*, const float*, int64_t,
-                          const int64_t*, int64_t, int64_t, std::uint32_t*);
-int64_t fhash_march_distance_layers(const int64_t*, std::int32_t*, int64_t, int64_t,
-                                    std::int32_t*);
-int64_t fhash_march_distance_rows(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
-}
 
 namespace {
 
@@ -36,7 +26,7 @@ double number_of(Reader& in) {
 // The arrays to which a task points.
 struct Arrays {
     std::vector<float> values, lowest, highest, scratch, table, light, powers, out, depth, normal;
-    std::vector<float> grading;
+    std::vector<float> grading, smooth;
     std::vector<double> extinction;
     std::vector<std::int32_t> distance;
     std::vector<std::uint32_t> cells;
@@ -195,6 +185,9 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
     m.grading = arrays.grading.data();
     m.grade_scale = std::fabs(number_of(in));
     m.unlit = in.within(0, 1);
+    const int64_t vertices = static_cast<int64_t>(arrays.values.size());
+    if (in.byte() & 1) arrays.smooth = repeated<float>(in, vertices);
+    m.smooth = arrays.smooth.empty() ? nullptr : arrays.smooth.data();
     arrays.out.resize(static_cast<std::size_t>(4 * m.width * m.height));
     arrays.depth.assign(arrays.out.size() / 4, std::numeric_limits<float>::infinity());
     arrays.normal.resize(3 * arrays.depth.size());

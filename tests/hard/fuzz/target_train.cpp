@@ -3,18 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
-
-extern "C" {
-int64_t fhash_head_learn(const std::int16_t*, const std::int32_t*, const std::int32_t*,
-                         const std::int32_t*, const int64_t*, double*, double*, double*,
-                         const double*, const double*, int64_t, int64_t, int64_t);
-int64_t fhash_head_errors(const std::int16_t*, const std::int32_t*, const std::int32_t*,
-                          const std::int32_t*, const int64_t*, double*, int64_t, int64_t*);
-}
 
 namespace {
 

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdlib>
 
+#include "exports.hpp"
 #include "reader.hpp"
 #include "setups.hpp"
 
@@ -18,67 +19,20 @@ void decode_label_bytes(Reader& in);  // target_labels.cpp
 void label_round_trip(Reader& in);    // target_labels.cpp
 void train(Reader& in);               // target_train.cpp
 void figures(Reader& in);             // target_figures.cpp
+void slopes(Reader& in);              // target_slopes.cpp
+void samples(Reader& in);             // target_samples.cpp
+void points(Reader& in);              // target_points.cpp
 #if defined(FHASH_FUZZ_MARCH)
 void march(Reader& in);  // target_march.cpp
 #endif
-
-extern "C" {
-int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
-                     const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                     const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
-                          const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                          const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*,
-                               int64_t, const std::int32_t*, const std::int16_t*,
-                               const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                               const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_transform_inverse_f32(const float*, float*, const int64_t*, const int64_t*,
-                                    const int64_t*, const int64_t*, const float* const*,
-                                    const float*, const float*);
-int64_t fhash_transform_inverse_f64(const double*, double*, const int64_t*, const int64_t*,
-                                    const int64_t*, const int64_t*, const double* const*,
-                                    const double*, const double*);
-int64_t fhash_reconstruct_f32(const std::int32_t*, float*, const int64_t*, const int64_t*,
-                              const int64_t*, const int64_t*, const float* const*, const float*,
-                              const float*, const double*, int64_t);
-int64_t fhash_reconstruct_f64(const std::int32_t*, double*, const int64_t*, const int64_t*,
-                              const int64_t*, const int64_t*, const double* const*, const double*,
-                              const double*, const double*, int64_t);
-int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const int64_t*,
-                                    const int64_t*, const int64_t*, const float* const*,
-                                    const float*, const float*);
-int64_t fhash_transform_forward_f64(const double*, double*, const int64_t*, const int64_t*,
-                                    const int64_t*, const int64_t*, const double* const*,
-                                    const double*, const double*);
-int64_t fhash_head_apply(const float*, const int64_t*, int64_t, int64_t, int64_t, const int64_t*,
-                         const float*, const float*, const float*, const float*, int64_t, int64_t,
-                         float*);
-int64_t fhash_clip_f32(float*, int64_t, double, double, double);
-int64_t fhash_clip_f64(double*, int64_t, double, double, double);
-int64_t fhash_correct_f32_f32(const float*, const std::int32_t*, int64_t, double, float*);
-int64_t fhash_correct_f32_f64(const float*, const std::int32_t*, int64_t, double, double*);
-int64_t fhash_correct_f64_f32(const double*, const std::int32_t*, int64_t, double, float*);
-int64_t fhash_correct_f64_f64(const double*, const std::int32_t*, int64_t, double, double*);
-int64_t fhash_residual_f32_f32(const float*, const float*, const std::uint8_t*, int64_t, double,
-                               double, std::int32_t*);
-int64_t fhash_residual_f64_f64(const double*, const double*, const std::uint8_t*, int64_t, double,
-                               double, std::int32_t*);
-int64_t fhash_within_f32(const float*, const float*, const std::uint8_t*, int64_t, double);
-int64_t fhash_within_f64(const double*, const double*, const std::uint8_t*, int64_t, double);
-int64_t fhash_quantise_f32(const float*, int64_t, double, double, double, std::int32_t*, float*);
-int64_t fhash_quantise_f64(const double*, int64_t, double, double, double, std::int32_t*, float*);
-int64_t fhash_dequantise_f32(const std::int32_t*, int64_t, double, double, double, double, float*);
-int64_t fhash_dequantise_f64(const std::int32_t*, int64_t, double, double, double, double, double*);
-}
 
 namespace {
 
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
     const std::uint8_t how = in.byte();
-    const int64_t model = how % 3, trellis = how >> 4 & 1;
-    const State& prior = setups().coders[model];
+    const int64_t model = (how & 15) % 3, trellis = how >> 4 & 1;
+    const State& prior = setups().coders[trellis][model];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
     fhash_decode(q.data(), model, trellis, with.shape.data(), with.table.data(),
@@ -221,6 +175,18 @@ void head(Reader& in) {
                      out.data());
 }
 
+auto free_of(const float*) { return fhash_free_f32; }
+auto free_of(const double*) { return fhash_free_f64; }
+
+template <class T>
+void free_values(std::vector<T>& target, const std::vector<T>& rebuilt,
+                 const std::uint8_t* counted, double low, double high) {
+    const int64_t n = static_cast<int64_t>(target.size());
+    const int64_t count = free_of(rebuilt.data())(target.data(), rebuilt.data(), counted, n,
+                                                  low, high);
+    require(count >= 0 && count <= n, "more free values than there are");
+}
+
 void values(Reader& in) {
     const std::uint8_t which = in.byte();
     const int64_t n = in.word() % 3000;
@@ -232,7 +198,10 @@ void values(Reader& in) {
     std::vector<std::int32_t> whole = integers(in, n), result(count);
     const std::vector<std::uint8_t> counts = repeated<std::uint8_t>(in, n);
     const std::uint8_t* const chosen = which & 64 ? counts.data() : nullptr;
-    switch (which % 10) {
+    std::vector<double> shifts;  // in steps, as settings have them
+    for (int i = 0; i < 6; i++)
+        shifts.push_back(static_cast<double>(in.within(0, 255) - 128) / 128);
+    switch (which % 12) {
         case 0:
             fhash_clip_f32(one.data(), n, a, std::min(b, c), std::max(b, c));
             fhash_clip_f64(first.data(), n, a, std::min(b, c), std::max(b, c));
@@ -248,9 +217,15 @@ void values(Reader& in) {
         case 3:
             fhash_residual_f32_f32(one.data(), other.data(), chosen, n, a, 1073741823.0,
                                    result.data());
+            std::fill(result.begin(), result.end(), 0);
+            fhash_residual_f32_f64(one.data(), second.data(), chosen, n, a, 1073741823.0,
+                                   result.data());
             break;
         case 4:
             fhash_residual_f64_f64(first.data(), second.data(), chosen, n, a, 1073741823.0,
+                                   result.data());
+            std::fill(result.begin(), result.end(), 0);
+            fhash_residual_f64_f32(first.data(), other.data(), chosen, n, a, 1073741823.0,
                                    result.data());
             break;
         case 5: fhash_within_f32(one.data(), other.data(), chosen, n, a); break;
@@ -259,9 +234,11 @@ void values(Reader& in) {
         case 8:
             fhash_quantise_f64(first.data(), n, a, 0.5, 1e9, result.data(), narrow.data());
             break;
+        case 9: free_values(one, other, chosen, std::min(b, c), std::max(b, c)); break;
+        case 10: free_values(first, second, chosen, std::min(b, c), std::max(b, c)); break;
         default:
-            fhash_dequantise_f32(whole.data(), n, a, b, c, a, narrow.data());
-            fhash_dequantise_f64(whole.data(), n, a, b, c, a, wide.data());
+            fhash_dequantise_f32(whole.data(), n, a, shifts.data(), narrow.data());
+            fhash_dequantise_f64(whole.data(), n, a, shifts.data(), wide.data());
     }
 }
 
@@ -277,9 +254,9 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     static const int only = only_target();
     Reader in(data, size);
 #if defined(FHASH_FUZZ_MARCH)
-    const int targets = 13;
+    const int targets = 16;
 #else
-    const int targets = 12;
+    const int targets = 15;
 #endif
     const int chosen = in.byte() % targets;
     switch (only < 0 ? chosen : only) {
@@ -295,6 +272,9 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         case 9: label_round_trip(in); break;
         case 10: train(in); break;
         case 11: figures(in); break;
+        case 12: slopes(in); break;
+        case 13: samples(in); break;
+        case 14: points(in); break;
 #if defined(FHASH_FUZZ_MARCH)
         default: march(in);
 #endif

@@ -1,6 +1,6 @@
 """The native code holds under the sanitizers for a few seconds of fuzzing.
 
-`run.py` is for long runs. The quick set starts from every fifth seed, the long set from all.
+`run.py` is for long runs. The quick set starts from every seventh seed, the long set from all.
 """
 
 from __future__ import annotations
@@ -13,14 +13,29 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import declarations
 import run
 from reporting import LONG
 
+from fhash_codec import native as codec
+from fhash_codec.native import network
+from fhash_formats import native as formats
+
 SECONDS = 5.0
 """Seconds for which the fuzzer mutates inputs, after it has run all seeds."""
-EVERY = 1 if LONG else 5
-"""Every so many of the seeds of each target are run. 5 has no factor in common with the numbers of
-seeds of one setup (2 and 3), so that all kinds of seeds take turns."""
+EVERY = 1 if LONG else 7
+"""Every so many of the seeds of each target are run. 7 has no factor in common with the numbers of
+seeds of one setup (2 and 15), so that all kinds of seeds take turns."""
+NOT_FUZZED = {
+    **dict.fromkeys(("fhash_abi_version", "fhash_codec_abi_version"), "takes nothing"),
+    **dict.fromkeys(("fhash_network_abi_version",), "takes nothing"),
+    **dict.fromkeys(("fhash_network_fma", "fhash_network_copy"), "for benchmarks alone"),
+    **dict.fromkeys(
+        ("fhash_bricks_work", "fhash_bricks_gaps", "fhash_bricks_touch", "fhash_bricks_run"),
+        "trains a network of the caller's own values, by arrays that Python alone makes",
+    ),
+}
+"""Exported functions that no target calls, and why."""
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +74,54 @@ def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
     assert first == set(range(len(seeds.NAMES)))
 
 
+def test_declarations_are_of_all_that_python_calls() -> None:
+    """Functions behind a macro are declared, too, and with as many parameters."""
+    declared = declarations.exported(run.native_sources())
+    for prototypes in (formats.PROTOTYPES, codec.PROTOTYPES, network.PROTOTYPES):
+        for name, arguments in prototypes.items():
+            parameters = [each for each in declared[name].split(",") if each]
+            assert len(parameters) == len(arguments), name
+            for parameter, argument in zip(parameters, arguments, strict=True):
+                assert ("*" in parameter) == (argument is formats.ARRAY), name
+
+
+def test_a_header_declares_what_stands_behind_macros(tmp_path: Path) -> None:
+    source = tmp_path / "some.cpp"
+    source.write_text(
+        "#define BOTH \\\n    const uint8_t* given, i64 size\n"
+        "#define EACH(NAME, T) \\\n    FHASH_EXPORT int64_t fhash_##NAME(T* to, \\\n"
+        "                                      BOTH) { return 0; }\n"
+        "EACH(one, float)\nEACH(two, FhashTask)  // FHASH_EXPORT int64_t fhash_three()\n",
+        encoding="utf-8",
+    )
+    assert declarations.header([source]).splitlines()[2:] == [
+        'extern "C" {',
+        "struct FhashTask;",
+        "std::int64_t fhash_one(float* to, const std::uint8_t* given, std::int64_t size);",
+        "std::int64_t fhash_two(FhashTask* to, const std::uint8_t* given, std::int64_t size);",
+        "}",
+    ]
+
+
+def test_every_exported_function_has_a_target_and_no_target_declares_one() -> None:
+    called = set()
+    for path in (*run.TARGETS, run.HERE / "target_march.cpp", run.HERE / "overrun.cpp"):
+        text = path.read_text(encoding="utf-8")
+        assert '#include "exports.hpp"' in text, path.name
+        assert not re.search(r"int64_t fhash_", text), f"{path.name} declares a function itself"
+        called |= set(declarations.CALL.findall(text))
+    declared = set(declarations.exported(run.native_sources()))
+    assert called & declared == declared - NOT_FUZZED.keys()
+    assert set(NOT_FUZZED) <= declared
+
+
+def test_every_file_that_is_called_is_built() -> None:
+    """A file of a library that no list names has no function that a target calls."""
+    built = {*run.SOURCES, *run.CODEC_SOURCES, *run.NETWORK_SOURCES, *run.MARCH}
+    others = [path for path in run.native_sources() if path.stem not in built]
+    assert set(declarations.exported(others)) <= NOT_FUZZED.keys()
+
+
 def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fuzzer that sees nothing would pass all other tests."""
     source = (run.NATIVE / "quantise.cpp").read_text(encoding="utf-8")
@@ -73,6 +136,7 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
     monkeypatch.setattr(run, "CODEC_SOURCES", ())
+    monkeypatch.setattr(run, "NETWORK_SOURCES", ())
     monkeypatch.setattr(run, "TARGETS", (run.HERE / "overrun.cpp",))
     try:
         figures = run.fuzz(
@@ -94,6 +158,7 @@ def test_code_that_does_not_compile_is_no_reason_to_skip(
     broken.write_text("int missing();\nint used = missing() +;\n", encoding="utf-8")
     monkeypatch.setattr(run, "SOURCES", ())
     monkeypatch.setattr(run, "CODEC_SOURCES", ())
+    monkeypatch.setattr(run, "NETWORK_SOURCES", ())
     monkeypatch.setattr(run, "TARGETS", (broken,))
     try:
         with pytest.raises(RuntimeError, match=r"(?s)does not compile: .*broken\.cpp"):

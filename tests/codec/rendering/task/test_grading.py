@@ -41,6 +41,19 @@ def test_neighbours_that_are_missing_do_not_count(way: str) -> None:
     np.testing.assert_allclose(factors, [0.5, 0.5, 0, 0, 0, 0, 0.5, 0.5], atol=1e-6)
 
 
+def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(
+    volume: Volume, way: str
+) -> None:
+    """Their inverse would be infinite, and infinity times a gradient of 0 is no number."""
+    scene = Scene.from_dict({"transfer_function": {"gradient_opacity": [[0, 0], [5e-324, 1]]}})
+    grading = Renderer(volume).plan(scene).task.grading
+    assert grading is not None
+    assert grading.top > 0
+    row = np.array([[[3.0, 3.0, 3.0, 4.0]]], dtype=np.float32)
+    for spacing in (np.ones(3), np.full(3, 1e-30)):
+        assert factors_at_vertices(row, grading, spacing).tolist() == [[[0, 0, 1, 1]]]
+
+
 @pytest.mark.skipif(native.library() is None, reason="needs the native library")
 def test_both_ways_to_find_factors_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.random.default_rng(2).random((7, 8, 9), dtype=np.float32)
