@@ -129,7 +129,7 @@ def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
 
 @pytest.mark.parametrize(("lost", "share"), [(2.2, 1), (4, 0.5), (24, 1 / 12), (0.8, 2), (0, 2)])
 def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> None:
-    """By what they lost at the usual step, in dB, and by slopes that are believed."""
+    """Their loss in dB at the usual step decides, within a power of 2."""
     fine = TileSettings(
         transform=usual_transform((2, 4, 4, 4)),
         step=0.5,
