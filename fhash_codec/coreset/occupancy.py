@@ -9,6 +9,8 @@ Source: the paper, Feature Dilation and Rendering.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 
@@ -66,8 +68,8 @@ def pack(mask: npt.NDArray[np.bool_]) -> Bits:
         vertices = mask[z :: steps[0], y :: steps[1], x :: steps[2]].view(np.uint8)
         blocks[_corner(vertices)] |= vertices << (7 - place)
     bits = np.zeros(packed_bytes(shape), dtype=np.uint8)
-    for z, plane in enumerate(blocks):
-        bits[_byte_index(z, plane.shape, steps, shape)] = plane
+    for plane, index in zip(blocks, _byte_indices(blocks.shape, steps, shape), strict=True):
+        bits[index] = plane
     return bits
 
 
@@ -77,8 +79,8 @@ def unpack(bits: Bits, shape: Shape) -> npt.NDArray[np.bool_]:
     blocks = np.empty(
         [-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8
     )
-    for z, plane in enumerate(blocks):
-        plane[...] = bits[_byte_index(z, plane.shape, steps, shape)]
+    for plane, index in zip(blocks, _byte_indices(blocks.shape, steps, shape), strict=True):
+        plane[...] = bits[index]
     mask = np.empty(shape, dtype=np.uint8)
     for place, (z, y, x) in enumerate(offsets):
         vertices = mask[z :: steps[0], y :: steps[1], x :: steps[2]]
@@ -112,16 +114,13 @@ def _byte_block(shape: Shape) -> tuple[list[int], list[tuple[int, int, int]]]:
     return steps, offsets
 
 
-def _byte_index(
-    z: int, blocks: tuple[int, ...], steps: list[int], shape: Shape
-) -> npt.NDArray[np.int64]:
-    """Byte numbers (blocks y, blocks x) of one plane of byte blocks."""
-    y = np.arange(blocks[0])[:, None] * steps[1]
-    x = np.arange(blocks[1])[None, :] * steps[2]
+def _byte_indices(
+    blocks: tuple[int, ...], steps: list[int], shape: Shape
+) -> Iterator[npt.NDArray[np.int64]]:
+    """Byte numbers (blocks y, blocks x) of each plane of byte blocks, from z = 0 on."""
+    z, y, x = (np.arange(count) * step for count, step in zip(blocks, steps, strict=True))
     # z, y and x have different bits of the index: interleave each axis by itself, then join them.
-    index = (
-        morton_index(z * steps[0], 0, 0, shape)
-        | morton_index(0, y, 0, shape)
-        | morton_index(0, 0, x, shape)
-    )
-    return index >> 3
+    of_plane = morton_index(0, y[:, None], 0, shape) | morton_index(0, 0, x[None, :], shape)
+    of_plane >>= 3
+    for of_row in morton_index(z, 0, 0, shape) >> 3:
+        yield of_plane | of_row
