@@ -118,8 +118,7 @@ def choose_head(
         return settings, outcome, []
     why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
     with stage("head", why):
-        # A head is trained on what it will meet: coarser data, which it lifts to the quality asked
-        # for.
+        # A head is trained on what it will meet: coarser data, which it lifts to the promise.
         coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
         if aim is not None:
             lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
