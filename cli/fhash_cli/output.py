@@ -239,7 +239,7 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
 def _bulk_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The row of the PSNR within the middle 98 % of the values; none where it is not known."""
     bulk = report.get("quality", report).get("bulk")
-    if bulk is None:
+    if bulk is None or "psnr" not in bulk:
         return []
     low, high = apart(*bulk["range"])
     psnr = "exact" if bulk["psnr"] is None else number(bulk["psnr"], "dB")

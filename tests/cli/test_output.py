@@ -16,6 +16,7 @@ from fhash_cli.output import (
     factor,
     listed,
     number,
+    quality_rows,
     size,
     table,
 )
@@ -179,3 +180,18 @@ def test_numbers_have_as_many_digits_as_tell_them_apart() -> None:
     assert apart(347921.0, 347921.002) == ["347921", "347921.002"]
     assert apart(7.0, 7.0) == ["7", "7"]
     assert apart(1.0, 1.0 + 1e-15) == ["1", "1"]
+
+
+@pytest.mark.parametrize(
+    ("bulk", "row"),
+    [
+        ({"psnr": 40, "range": [0, 1]}, ["40 dB, of the 98 % from 0 to 1"]),
+        ({"psnr": None, "range": [0, 1]}, ["exact, of the 98 % from 0 to 1"]),
+        ({"range": [0, 1]}, []),
+        (None, []),
+    ],
+)
+def test_a_bulk_without_a_psnr_has_no_row(bulk: dict[str, object] | None, row: list[str]) -> None:
+    figures = dict.fromkeys(("psnr", "psnr_all", "rmse", "max_abs_error", "ssim"), 1.0)
+    rows = quality_rows({**figures, "bulk": bulk})
+    assert [text for name, text in rows if name == "PSNR, bulk"] == row

@@ -127,7 +127,6 @@ def _check_bulk(quality: Record) -> None:
     if not quality.has("bulk") or quality.get("bulk") is None:
         return
     bulk = quality.record("bulk")
-    bulk.need(bulk.has("psnr"), "psnr", "a number or null")
     bulk.number_or_null("psnr")
     low, high = bulk.numbers("range", 2)
     bulk.need(low <= high, "range", "two numbers, the lower first")
