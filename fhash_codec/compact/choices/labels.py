@@ -213,8 +213,10 @@ def holds_beside(task: PlanTask, labelled: Attempt, other: Attempt) -> bool:
     Where that is known of a sample only, they must also do so on the sample of the other one: their
     own may lie on a plateau.
     """
-    if labelled.outcome.size > other.outcome.size or other.sample.complete:
-        return labelled.outcome.size <= other.outcome.size
+    if labelled.outcome.size > other.outcome.size:
+        return False
+    if other.sample.complete:
+        return True
     transform = usual_transform(other.sample.blocks.tile)
     settings = replace(labelled.settings, transform=transform)
     outcome = other.sample.run(settings, task.goal.bounded(labelled.coding))

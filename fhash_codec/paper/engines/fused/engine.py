@@ -123,9 +123,7 @@ class FusedEngine(SlabEngine):
         # The kernels read on the device what slab keeps on the host.
         self._visited = torch.from_numpy(self.visited).to(device, copy=True)
         limits = kernels.limits
-        # The driver keeps a kilobyte of each block's shared memory.
-        resident = limits.shared_per_multiprocessor // (self._sizes.shared_bytes + 1024)
-        self._slots = limits.multiprocessors * max(1, min(2, resident))
+        self._slots = self._sizes.slots(limits, 2)
         self._matrix_gradients = torch.empty(self._slots * self._sizes.matrices, device=device)
         self._errors = torch.empty(self._slots, dtype=torch.float64, device=device)
         self._record = self._model()

@@ -121,9 +121,7 @@ class FusedPoints:
         """
         self._sizes = point_sizes(architecture_of(network), network.sparse, kernels.limits)
         self._program = kernels.load(self._sizes)
-        # The driver keeps a kilobyte of each block's shared memory.
-        resident = kernels.limits.shared_per_multiprocessor // (self._sizes.shared_bytes + 1024)
-        self._slots = kernels.limits.multiprocessors * max(1, min(MAX_BLOCKS, resident))
+        self._slots = self._sizes.slots(kernels.limits, MAX_BLOCKS)
         self._device = device
         self._spans = [float(max(size - 1, 1)) for size in reversed(network.box_size)]
         tables = PointTables.of_box(network, key).at(key)

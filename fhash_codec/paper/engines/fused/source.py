@@ -22,6 +22,8 @@ THREADS = 256
 """Threads of a block."""
 COLUMNS = (128, 64, 32)
 """Vertices of a tile at most, in the order in which they are tried."""
+DRIVER_BYTES = 1024
+"""Bytes of shared memory that the driver keeps of each block."""
 MAX_WIDTH = 128
 """Largest width of a hidden layer."""
 MAX_INPUTS = 64
@@ -109,6 +111,11 @@ class Sizes(ABC):
     def shared_bytes(self) -> int:
         """Bytes of shared memory that a block needs."""
         return 4 * self.places["END"]
+
+    def slots(self, limits: DeviceLimits, most: int) -> int:
+        """Return the blocks that are on a device at once, on a multiprocessor 1 to `most`."""
+        resident = limits.shared_per_multiprocessor // (self.shared_bytes + DRIVER_BYTES)
+        return limits.multiprocessors * max(1, min(most, resident))
 
     def layer_constants(self) -> Iterator[str]:
         """Yield the lines that define the constants of the layers and the places."""
@@ -273,8 +280,7 @@ def best_of(fitting: Sequence[SomeSizes], limits: DeviceLimits) -> SomeSizes:
     Two blocks on a multiprocessor hide each other's waiting, so the first that allow two are taken,
     and else the first of all.
     """
-    # The driver keeps a kilobyte of each block's shared memory.
-    half = limits.shared_per_multiprocessor // 2 - 1024
+    half = limits.shared_per_multiprocessor // 2 - DRIVER_BYTES
     return next((sizes for sizes in fitting if sizes.shared_bytes <= half), fitting[0])
 
 
