@@ -34,6 +34,7 @@ from fhash_formats.errors import (
 )
 
 if TYPE_CHECKING:
+    from fhash_codec.appending.writer import Writer
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.encoding import encode
@@ -50,6 +51,7 @@ _MODULES = {
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
     "Volume": "volume",
+    "Writer": "appending.writer",
     "diff": "comparison",
     "encode": "encoding",
     "export_plain": "plain",
@@ -76,6 +78,7 @@ __all__ = [
     "TrainingError",
     "UnsupportedFileError",
     "Volume",
+    "Writer",
     "diff",
     "encode",
     "export_plain",

@@ -50,10 +50,17 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("simulation",),
         ("comparison", "demo", "isosurface"),
         ("encoding",),
-        ("plain",),
+        ("appending", "plain"),
         ("selftest",),
         ("bench",),
         ("cost",),
+    ),
+    "fhash_codec.appending": (
+        ("figures", "parts"),
+        ("layers",),
+        ("growing", "planning"),
+        ("resuming",),
+        ("merging", "writer"),
     ),
     "fhash_codec.rendering": (
         ("scene",),

@@ -132,14 +132,14 @@ def _header(
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
-        "training": _training(trained, timings=config.timings),
+        "training": training_header(trained, timings=config.timings),
         "history": history_columns(
             brief_history(trained, timings=config.timings, most=HEAD_POINTS)
         ),
     }
 
 
-def _training(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
+def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
     """Return what a header says of the training of the best head, which has this history.
 
     The device is "none" where nothing was trained.
