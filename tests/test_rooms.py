@@ -60,7 +60,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("layers",),
         ("growing", "planning"),
         ("resuming",),
-        ("merging", "writer"),
+        ("append", "merging", "writer"),
     ),
     "fhash_codec.rendering": (
         ("scene",),

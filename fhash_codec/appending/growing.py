@@ -89,24 +89,25 @@ class GrowingFile:
         return len(self._times)
 
     @property
-    def last_time(self) -> float | None:
-        """Time of the last step; None before the first."""
-        return self._times[-1] if self._times else None
+    def times(self) -> tuple[float, ...]:
+        """Time of each step."""
+        return tuple(self._times)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Vertices (z, y, x) of a frame."""
         return tuple(self._array.frame)
 
-    def add(self, layer: CodedLayer, times: Sequence[float]) -> None:
-        """Write a layer, and make the file complete with it.
+    def add(self, layer: CodedLayer, times: Sequence[float], *, publish: bool = True) -> None:
+        """Write a layer; with `publish`, make the file complete with it.
 
         Raises InputError for a file that takes no more steps, OutputError where it cannot be
         written; it then stays as it was.
         """
         self.keep(layer.streams, times, layer.nonzero, layer.value_range)
         self.figures.steps.extend(layer.errors)
-        self.publish()
+        if publish:
+            self.publish()
 
     def carry(self, array: StoredArray) -> None:
         """Write an array that does not depend on time, as another file has it."""

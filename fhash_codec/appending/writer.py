@@ -143,7 +143,7 @@ class Writer:
         self._begin(Path(path), (z, y, x))
         self._stack, self._file = stack, growing
         self._dtype = growing.coder.dtype
-        self._last = growing.last_time
+        self._last = growing.times[-1]
         return self
 
     def _begin(self, path: Path, shape: tuple[int, int, int]) -> None:

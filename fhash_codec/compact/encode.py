@@ -93,7 +93,7 @@ def encode_compact(
         with stage("writing", "tiles"):
             table.parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
-        own = _header(selection, table, config, seconds)
+        own = table_header(selection, table, config, seconds)
         own["required_features"] += coordinate_features(described["coordinates"])
         header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
@@ -107,7 +107,7 @@ def encode_compact(
     return header
 
 
-def _header(
+def table_header(
     selection: FeatureSelection, table: CodedTable, config: EncodeConfig, seconds: float | None
 ) -> dict[str, Any]:
     """Return what a header says beside the source and its coordinates, without the quality.

@@ -182,6 +182,13 @@ def test_verify_and_decode(fhash: Fhash, run: Path) -> None:
     check("export", parsed(fhash(*words)))
 
 
+def test_append(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run.fhz"
+    words = ("--max-error", "0.1", "--tile", "1x6x7x8", "--effort", "1", "-q")
+    assert fhash("encode", data, "-o", run, *words, "--t", "0:2").exit_code == 0
+    check("append", parsed(fhash("append", run, data, "--t", "2:3", "--json", "-q")))
+
+
 def test_render(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     words = ["render", run, "--size", "16x16", "--json", "-q", "-o", tmp_path / "a.png"]
     check(
