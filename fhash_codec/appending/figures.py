@@ -21,6 +21,13 @@ from fhash_formats.errors import InputError
 __all__ = ["Figures", "StepErrors"]
 
 
+ROUNDED_ONCE = 1 - 1e-12
+"""Factor of a figure that was rounded up to some decimals, so that it is not once more.
+
+Its float may lie above the decimal number.
+"""
+
+
 class StepErrors(NamedTuple):
     """Errors of one step, scaled by the power of two of its `Figures`."""
 
@@ -58,6 +65,9 @@ class Figures:
         """
         steps, *frame = header["domain"]["shape"]
         told = header["quality"].get("per_step", [])
+        most = header["quality"].get("max_abs_error")
+        # That of all steps is rounded less: it keeps the promise where those of steps may not.
+        limit = float(most) if isinstance(most, int | float) else math.inf
         count, errors = math.prod(frame), []
         for step in range(steps):
             figures = told[step] if step < len(told) else {}
@@ -66,7 +76,9 @@ class Figures:
                 raise InputError(
                     f"the file does not tell the errors of step {step}, and a longer one could not"
                 )
-            rmse, largest = (float(one) * scale for one in pair)
+            rmse, largest = (
+                float(one) * ROUNDED_ONCE * scale for one in (pair[0], min(pair[1], limit))
+            )
             errors.append(StepErrors(count, count * rmse * rmse, largest))
         return cls(scale, errors)
 

@@ -23,9 +23,10 @@ from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparer
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
-from fhash_formats.container import Container, ContainerWriter, StoredArray, coordinate_features
+from fhash_formats.container import Container, ContainerWriter, coordinate_features
 from fhash_formats.container.apart import TABLE
 from fhash_formats.container.record import Record
+from fhash_formats.container.source import damage_named
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
@@ -110,7 +111,7 @@ class _Piece:
 
     @cached_property
     def shared(self) -> dict[str, Any]:
-        """What all parts of a series have in common."""
+        """The keys and settings that all parts of a series have in common."""
         header = self.container.header
         model = {name: value for name, value in header["model"].items() if name not in OWN_MODEL}
         positions = [self.container.coordinate(axis) for axis in ("z", "y", "x")]
@@ -165,19 +166,19 @@ def _gap(parts: Sequence[_Piece], start: int, end: int) -> str:
 
 @dataclass(frozen=True)
 class _Streams(Sequence[bytes]):
-    """The tiles of several tables, one after the other in time, read when they are asked for."""
+    """The tiles of several parts, one after the other in time, read when they are asked for."""
 
-    tables: Sequence[StoredArray]
+    parts: Sequence[_Piece]
 
     @cached_property
-    def places(self) -> list[tuple[StoredArray, tuple[int, ...]]]:
-        """Table and index of each tile, in C order of the whole."""
+    def places(self) -> list[tuple[_Piece, tuple[int, ...]]]:
+        """Part and index of each tile, in C order of the whole."""
         return [
-            (table, index) for table in self.tables for index in product(*map(range, table.grid))
+            (part, index) for part in self.parts for index in product(*map(range, part.table.grid))
         ]
 
     def __len__(self) -> int:
-        return sum(prod(table.grid) for table in self.tables)
+        return sum(prod(part.table.grid) for part in self.parts)
 
     @overload
     def __getitem__(self, index: int) -> bytes: ...
@@ -186,11 +187,16 @@ class _Streams(Sequence[bytes]):
     def __getitem__(self, index: int | slice) -> bytes | Sequence[bytes]:
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
-        table, place = self.places[index]
-        return bytes(table.coded(place))
+        return _read(*self.places[index])
 
     def __iter__(self) -> Iterator[bytes]:
-        return (bytes(table.coded(place)) for table, place in self.places)
+        return (_read(part, place) for part, place in self.places)
+
+
+def _read(part: _Piece, place: tuple[int, ...]) -> bytes:
+    """The bytes of a tile, checked; raises DamagedFileError that names the part."""
+    with damage_named(part.path):
+        return bytes(part.table.coded(place))
 
 
 class _Positions(Series):
@@ -210,7 +216,7 @@ class _Whole:
         self._parts = parts
         frame = parts[0].container.header["domain"]["shape"][1:]
         self.shape: tuple[int, int, int, int] = (parts[0].steps, *frame)
-        self.streams = _Streams([part.table for part in parts])
+        self.streams = _Streams(parts)
 
     def write(self, writer: ContainerWriter, progress: Progress) -> dict[str, Any]:
         """Write the arrays of the whole; its header."""

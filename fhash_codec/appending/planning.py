@@ -33,7 +33,7 @@ OVERHEAD_BYTES = 2000
 
 @dataclass(frozen=True, kw_only=True)
 class GrowingPlan:
-    """What is decided on the first steps of a file.
+    """The decisions that are made on the first steps of a file.
 
     Attributes:
         coder: of the layers.
@@ -130,7 +130,7 @@ def _joined(first: ValueRange, second: ValueRange | None) -> ValueRange:
 
 
 def _header(selection: FeatureSelection, config: EncodeConfig, coder: LayerCoder) -> dict[str, Any]:
-    """What the header says that the first steps decide."""
+    """The header's entries that the first steps decide."""
     head, extent = coder.settings.head, selection.extent
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},

@@ -21,6 +21,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.apart import HEAD_ARRAY, TABLE
 from fhash_formats.container.header import COMPACT, PLAIN_FEATURE
+from fhash_formats.container.source import damage_named
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.transform.tile.settings import TileSettings
@@ -132,7 +133,7 @@ def _coder(
 
 
 def _lasting(header: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a full header stays the same while the file grows."""
+    """The entries of a full header that stay the same while the file grows."""
     encoder = {name: header["encoder"][name] for name in ("version", "seed")}
     model = {name: value for name, value in header["model"].items() if name != "tiling"}
     config = {**header["config"], "max_error": bound_of_file(header), "max_error_rel": None}
@@ -174,7 +175,8 @@ def _keep(growing: GrowingFile, container: Container, kept: int, value_range: Va
     for number in range(kept // layer):
         first = number * layer
         tiles = product(*map(range, table.grid[1:]))
-        streams = [bytes(table.coded((number, *tile))) for tile in tiles]
+        with damage_named(container.path):
+            streams = [bytes(table.coded((number, *tile))) for tile in tiles]
         # Where steps are dropped this is a share: the file has one number for all of them.
         before, after = (max(0, told - weights) * k // table.grid[0] for k in (number, number + 1))
         span = [float(time) for time in times[first : first + layer]]

@@ -38,7 +38,7 @@ WINDOW_BYTES = 512 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class _Source:
-    """What a new file is of: the shape of a frame, its variable, positions, settings."""
+    """The labels and settings of a new file."""
 
     path: Path
     shape: tuple[int, int, int]

@@ -69,6 +69,13 @@ MAX_LABELS = 64
     "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
     "that may be chosen.",
 )
+@click.option(
+    "--part",
+    metavar="I/N",
+    help="Encode only the I-th of N parts, counted from 1: whole layers of tiles along time, such "
+    "as 3/16 for the third machine of 16. `fhash merge` joins the parts to the file that one "
+    "command would write with --no-timings. Needs --max-error or --max-error-rel.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -87,6 +94,7 @@ def command(
     quiet: bool,
     explain: bool,
     time_budget: float | None,
+    part: str | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -99,9 +107,10 @@ def command(
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
     """
-    import fhash_codec
     from fhash_codec.promises import decided_by_bulk
 
+    if part is not None and (explain or time_budget is not None or report_folder is not None):
+        raise click.UsageError("--part goes without --explain, --time-budget and --report")
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     if report_folder is not None:
@@ -116,9 +125,8 @@ def command(
             config = choice.config
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = fhash_codec.encode(
-                series, output, config, force=force, progress=progress, predicted=predicted
-            )
+            options = {"force": force, "progress": progress, "predicted": predicted}
+            report = _encode(series, output, config, part, options)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
@@ -145,6 +153,20 @@ def command(
     if choice is not None:
         report["time_budget"] = choice.to_dict()
     emit(report, text, as_json, missed or stopped)
+
+
+def _encode(
+    series: Series, output: str, config: EncodeConfig, part: str | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Encode a series, or one part of it such as "3/16"; the report, with its stages."""
+    import fhash_codec
+    from fhash_codec.appending.parts import Part, encode_part
+
+    if part is None:
+        return fhash_codec.encode(series, output, config, **options)
+    del options["predicted"]
+    report = encode_part(series, output, config, Part.parse(part), **options)
+    return {**report, "stages": []}
 
 
 def _choose(
