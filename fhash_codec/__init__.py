@@ -34,6 +34,8 @@ from fhash_formats.errors import (
 )
 
 if TYPE_CHECKING:
+    from fhash_codec.appending.append import append
+    from fhash_codec.appending.merging import merge
     from fhash_codec.appending.writer import Writer
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
@@ -52,9 +54,11 @@ _MODULES = {
     "Scene": "rendering.scene.scene",
     "Volume": "volume",
     "Writer": "appending.writer",
+    "append": "appending.append",
     "diff": "comparison",
     "encode": "encoding",
     "export_plain": "plain",
+    "merge": "appending.merging",
     "open": "volume",
     "render": "rendering",
 }
@@ -79,9 +83,11 @@ __all__ = [
     "UnsupportedFileError",
     "Volume",
     "Writer",
+    "append",
     "diff",
     "encode",
     "export_plain",
+    "merge",
     "open",
     "render",
 ]
