@@ -24,6 +24,7 @@ from fhash_formats.container.layout import Member, document_member, ending, loca
 from fhash_formats.container.reader import Container
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
+from fhash_formats.container.variables import CONSOLIDATED, consolidated, is_several
 from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.atomic import replacing
@@ -61,7 +62,7 @@ class ContainerWriter:
         self._force = force
         self._stack = ExitStack()
         self._members: list[Member] = []
-        self._arrays: set[str] = set()
+        self._arrays: dict[str, dict[str, Any]] = {}
         self._position = 0
 
     def __enter__(self) -> ContainerWriter:
@@ -228,7 +229,7 @@ class ContainerWriter:
         except DamagedFileError as error:
             raise InputError(f"array {name} cannot be stored: {error}") from error
         self._check_name(name)
-        self._arrays.add(name)
+        self._arrays[name] = metadata.to_dict()
         member, data = document_member(f"{name}/{DOCUMENT}", self._position, document)
         self._write(member, [data])
         return metadata
@@ -275,7 +276,8 @@ class ContainerWriter:
         self._file.seek(mark.position)
         self._file.truncate()
         del self._members[mark.members :]
-        self._arrays, self._position = set(mark.arrays), mark.position
+        self._arrays = {name: self._arrays[name] for name in self._arrays if name in mark.arrays}
+        self._position = mark.position
 
     def divert(self, path: Path) -> None:
         """Let the container take another name in the same folder, which must be free.
@@ -319,9 +321,10 @@ class ContainerWriter:
             "format": FORMAT,
             "format_version": list(FORMAT_VERSION),
         }
-        documents[DOCUMENT] = strict_json.dumps(
-            {**GROUP, "attributes": {"fhash": complete}}, "the header"
-        )
+        root: dict[str, Any] = {**GROUP, "attributes": {"fhash": complete}}
+        if is_several(complete):
+            root[CONSOLIDATED] = consolidated({**dict.fromkeys(sorted(groups), GROUP), **self._arrays})
+        documents[DOCUMENT] = strict_json.dumps(root, "the header")
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)
