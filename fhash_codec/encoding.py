@@ -102,7 +102,7 @@ def encode(
         figures = report(volume, encoded.quality, seconds=seconds, files=series.files)
     figures["stages"] = clock.to_list()
     if encoded.missed is not None:
-        raise QualityError(_told(path, written, encoded.missed, encoded.advice), figures)
+        raise QualityError(missed_text(path, written, encoded.missed, encoded.advice), figures)
     for remark in remarks(config, figures):
         warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
@@ -267,7 +267,7 @@ def missed_path(path: Path) -> Path:
         number += 1
 
 
-def _told(path: Path, written: Path, missed: str, advice: str) -> str:
+def missed_text(path: Path, written: Path, missed: str, advice: str) -> str:
     """The message of a missed promise: what was missed, where the file is, and what may help."""
     where = "the file is written" if written == path else f"it is kept, the new file is {written}"
     return f"{path}: {missed}; {where}" + (f". {advice}" if advice else "")

@@ -317,12 +317,12 @@ def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -
     header = container.header
     raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
     arrays = {
-        name: {
+        array.name: {
             "shape": list(array.shape),
             "dtype": str(array.dtype),
             "bytes": array.nbytes_stored,
         }
-        for name, array in container.arrays.items()
+        for array in container.arrays.values()
     }
     return {
         **full_header(header),

@@ -41,14 +41,41 @@ CLIPPED_SINCE = (1, 2)
 """Format version since which values between vertices and steps are clipped to the range, too."""
 
 
-def open(path: str | Path, *, fill: int | float | None = None) -> Volume:
-    """Open a `.fhz` file for reading; nothing is decoded yet.
+def open(
+    path: str | Path, *, variable: str | None = None, fill: int | float | None = None
+) -> Volume:
+    """Open one variable of a `.fhz` file for reading; nothing is decoded yet.
 
+    variable: its name; None for the only one of the file.
     fill: what `volume[...]` gives at vertices without a value, see `Volume`.
 
-    Raises MissingInputError, DamagedFileError or UnsupportedFileError.
+    Raises MissingInputError, DamagedFileError or UnsupportedFileError, and InputError where the
+    file does not hold the variable, or holds several and none is named.
     """
-    return Volume(Container.open(path), fill=fill)
+    container = Container.open(path)
+    try:
+        return Volume(chosen_variable(container, variable), fill=fill)
+    except BaseException:
+        container.close()
+        raise
+
+
+def chosen_variable(container: Container, variable: str | None) -> Container:
+    """The container of one variable of a file, whose `close` closes the file; errors as `open`."""
+    names = list(container.variables) or [container.header["variable"]["name"]]
+    if variable not in names and not (variable is None and len(names) == 1):
+        listed = ", ".join(names)[:400]
+        if variable is None:
+            raise InputError(
+                f"{container.path} holds several variables, {listed}; choose one, such as"
+                f" --var {names[0]} (in Python: variable={names[0]!r})"
+            )
+        raise InputError(
+            f"{container.path} has no variable {variable[:80]!r}; it holds {listed}"
+        )
+    if not container.variables:
+        return container
+    return container.variables[variable or names[0]].closing_file()
 
 
 class Volume(Card):
@@ -71,6 +98,7 @@ class Volume(Card):
         coords: a Coordinate for each of "t", "z", "y", "x".
         box: the feature bounding box, in vertices of the domain.
         path: of the file.
+        variable: name among several variables of the file; None where it is the only one.
         info: everything the file says of itself, as JSON values.
         config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
             `model`.
@@ -88,6 +116,7 @@ class Volume(Card):
         header = container.header
         self.container = container
         self.path = Path(container.path)
+        self.variable = container.variable
         self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
         self.value_type = ValueType.of(container)
         self.float_dtype = self.value_type.floats
@@ -391,7 +420,8 @@ class Volume(Card):
         self.close()
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(open, fill=self._asked_fill), (self.path.absolute(),)
+        again = partial(open, variable=self.variable, fill=self._asked_fill)
+        return again, (self.path.absolute(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))

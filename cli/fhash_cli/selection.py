@@ -145,12 +145,18 @@ def _span(what: str, low: int | None, high: int | None, count: int, allowed: str
     raise RegionError(f"{what} is {written(low, high)}, {reason}; {allowed}")
 
 
-def opened(run: str, fill: float | None, features: Sequence[str]) -> Volume:
-    """An open container, with some of its features alone if any are named; see `only_features`."""
+def opened(
+    run: str, fill: float | None, features: Sequence[str], variable: str | None = None
+) -> Volume:
+    """An open container, with some of its features alone if any are named; see `only_features`.
+
+    variable: which one, where the container has several.
+    """
     import fhash_codec
     from fhash_codec.feature_volume import only_features
+    from fhash_codec.volume import open as open_volume
 
-    volume = fhash_codec.open(run, fill=fill)
+    volume = open_volume(run, variable=variable, fill=fill)
     try:
         return only_features(volume, features) if features else volume
     except fhash_codec.InputError:

@@ -18,6 +18,7 @@ from fhash_cli.options import (
     json_option,
     quiet_option,
     run_argument,
+    variable_option,
 )
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, say, spans, table
 from fhash_cli.selection import (
@@ -45,6 +46,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 
 @click.command("decode", cls=BaseCommand)
 @run_argument
+@variable_option
 @click.option(
     "--t",
     "steps",
@@ -114,6 +116,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @quiet_option
 def command(
     run: str,
+    variable: str | None,
     features: tuple[str, ...],
     steps: slice | None,
     times: tuple[str, ...],
@@ -139,7 +142,7 @@ def command(
     _check_output(output, isosurface, dtype, force, run)
     if isosurface is not None and fill is not None:
         raise click.UsageError("--isosurface has no fill value; leave out --fill")
-    with opened(run, fill, features) as volume, Progress(quiet=quiet) as progress:
+    with opened(run, fill, features, variable) as volume, Progress(quiet=quiet) as progress:
         if isosurface is not None:
             dtype = volume.float_dtype.name
         selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype, fill)

@@ -19,11 +19,11 @@ from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
-    config_options,
     force_option,
     json_option,
     quiet_option,
     series_options,
+    setting_options,
 )
 from fhash_cli.output import (
     Progress,
@@ -38,6 +38,7 @@ from fhash_cli.output import (
     spans,
     table,
 )
+from fhash_cli.variables import config_of, configs_of, names_to_encode, report_table
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ MAX_LABELS = 64
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
 )
 @series_options
-@config_options()
+@setting_options(by_variable=True)
 @force_option
 @json_option
 @quiet_option
@@ -81,7 +82,7 @@ def command(
     data: str,
     output: str,
     source: SourceOptions,
-    config: EncodeConfig,
+    settings: dict[str, Any],
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -95,6 +96,9 @@ def command(
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files
     in quotes ('step_*.raw').
 
+    --var u,v,w or --var all encodes several variables into one file, each with its own promise if
+    wished: --max-error u=0.1,v=0.2.
+
     Ctrl-C leaves no file, and an older RUN.fhz as it was. With --profile paper it saves a
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
@@ -104,6 +108,14 @@ def command(
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
+    names = names_to_encode(source, data, quiet=quiet)
+    if names is not None:
+        if time_budget is not None or report_folder is not None or verbose:
+            raise click.UsageError("--time-budget, --report and -v are for one variable")
+        figures = _encode_several(data, output, source, names, settings, force, quiet)
+        _emit_several(figures, explain, as_json)
+        return
+    config = config_of(settings)
     if report_folder is not None:
         check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
@@ -145,6 +157,59 @@ def command(
     if choice is not None:
         report["time_budget"] = choice.to_dict()
     emit(report, text, as_json, missed or stopped)
+
+
+def _encode_several(
+    data: str,
+    output: str,
+    source: SourceOptions,
+    names: Sequence[str],
+    settings: Mapping[str, Any],
+    force: bool,
+    quiet: bool,
+) -> tuple[dict[str, Any], QualityError | None]:
+    """Encode several variables into one file: its figures, and the promises that it misses."""
+    from fhash_codec.dataset_encoding import encode_dataset
+
+    before = _stamp(output)
+    with Progress(quiet=quiet) as progress:
+        try:
+            figures = encode_dataset(
+                data,
+                output,
+                configs_of(settings, names),
+                variables=names,
+                open_variable=lambda name: dataclasses.replace(source, var=name).open(
+                    data, progress
+                ),
+                force=force,
+                progress=progress,
+            )
+        except QualityError as error:
+            return error.figures, error
+        except KeyboardInterrupt:
+            raise InterruptedEncodingError(_after_interruption(output, before)) from None
+    return figures, None
+
+
+def _emit_several(
+    encoded: tuple[dict[str, Any], QualityError | None], explain: bool, as_json: bool
+) -> None:
+    """Print the figures of a file of several variables, and raise what it misses."""
+    report, missed = encoded
+    variables = report["variables"]
+    rows = [
+        ("written", str(report["path"])),
+        ("size", compared(report)),
+        ("time", duration(report["seconds"])),
+    ]
+    text = f"{table(rows)}\n\n{table(report_table(variables))}"
+    for name, figures in variables.items():
+        stages = figures.pop("stages")
+        if explain:
+            figures["stages"] = stages
+            text += f"\n\n{name}\n{stage_table(stages)}"
+    emit(report, text, as_json, missed)
 
 
 def _choose(

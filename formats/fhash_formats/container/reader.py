@@ -67,6 +67,7 @@ class Container:
         arrays: StoredArray by name, in the order of the file.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
+        variable: name of the variable where the container is one of those; else None.
     """
 
     path: Path
@@ -76,6 +77,7 @@ class Container:
     header_bytes: int
     arrays: Mapping[str, StoredArray]
     variables: Mapping[str, VariableContainer] = MappingProxyType({})
+    variable: str | None = None
 
     def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Read a container from an open source, which `close` closes; `open` is for files.
@@ -226,7 +228,6 @@ class VariableContainer(Container):
     It reads from the file of the others, and shares their cache.
 
     Attributes:
-        variable: name of the variable.
         size: bytes of the arrays of this variable alone, with their places in the ZIP.
         digest: of the file and the variable.
         arrays: StoredArray by the name that it has in a file of one variable. The shared
