@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import TracebackType
 from typing import Any
 
 from fhash_codec.progress import Progress, silent
@@ -56,9 +56,7 @@ class Dataset(Mapping[str, Volume]):
         """
         self.container = container
         self.path = Path(container.path)
-        self.attributes: Mapping[str, Any] = MappingProxyType(
-            dict(container.header.get("attributes", {}))
-        )
+        self.attributes: Mapping[str, Any] = container.attributes
         self._fill = fill
         self._volumes: dict[str, Volume] = {}
 

@@ -27,11 +27,12 @@ from fhash_codec.report import report
 from fhash_codec.stage_clock import recording
 from fhash_codec.training.devices import choose_device, need_torch
 from fhash_formats import list_variables, open_series
-from fhash_formats.container import Container, ContainerWriter, SeveralWriter
+from fhash_formats.container import Container, ContainerWriter, SeveralWriter, VariableWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.readers.common.listing import Listed
 from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
+from fhash_formats.support.attributes import json_attributes
 
 __all__ = ["encodable", "encode_dataset"]
 
@@ -81,14 +82,13 @@ def encode_dataset(
     encoded: dict[str, EncodedVariable] = {}
     stages: dict[str, list[dict[str, Any]]] = {}
     with ContainerWriter(path, force=force) as writer:
+        writer.attributes = json_attributes(getattr(source, "attrs", {}))
         several = SeveralWriter(writer, names)
         for number, name in enumerate(names):
             told = _of_variable(progress, f"{name}, {number + 1} of {len(names)}")
-            with recording() as clock, sources.opened(name) as series, _named(name):
-                own = several.variable(name, labels[name])
-                encoded[name] = encode_variable(own, series, configs[name], None, path, told)
-                own.finish(encoded[name].header)
-            stages[name] = clock.to_list()
+            own = several.variable(name, labels[name])
+            # A function of its own, so that nothing of a variable is held with the next one.
+            encoded[name], stages[name] = _encoded(sources, own, configs[name], path, told)
         missed = [name for name in names if encoded[name].missed is not None]
         if missed and os.path.lexists(path):
             writer.divert(missed_path(path))
@@ -134,6 +134,16 @@ class _Sources:
         opened = self._open(name) if self._open is not None else open_series(source, var=name)
         with opened as series:
             yield series
+
+
+def _encoded(
+    sources: _Sources, writer: VariableWriter, config: EncodeConfig, path: Path, progress: Progress
+) -> tuple[EncodedVariable, list[dict[str, Any]]]:
+    """Write one variable; what is known of it, and what the stages took."""
+    with recording() as clock, _named(writer.name), sources.opened(writer.name) as series:
+        encoded = encode_variable(writer, series, config, None, path, progress)
+        writer.finish(encoded.header)
+    return encoded, clock.to_list()
 
 
 def _described(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any
 
@@ -48,12 +48,14 @@ class Hierarchy:
         arrays: metadata by name of the array.
         chunks: members by name of the array and index of the chunk.
         variables: of a file of several; none in others.
+        attributes: of the root beside the header.
     """
 
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
     chunks: dict[str, dict[tuple[int, ...], Member]]
     variables: tuple[VariablePlaces, ...] = ()
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
@@ -87,11 +89,15 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
     # A newer format says so in its header, and may have arrays of which nothing is known here.
     header = groups[""]["fhash"]
+    attributes = {name: value for name, value in groups[""].items() if name != "fhash"}
     if not is_several(header):
         validate_header(header)
         arrays = _read_arrays(source, members, documents)
         return Hierarchy(
-            header=header, arrays=arrays, chunks=_place_chunks(arrays, chunk_members)
+            header=header,
+            arrays=arrays,
+            chunks=_place_chunks(arrays, chunk_members),
+            attributes=attributes,
         )
     variables, others = read_variables(header, documents.keys())
     _check_consolidated(group_documents, documents)
@@ -104,6 +110,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
         arrays={name: arrays[name] for name in documents},
         chunks=_place_chunks(arrays, chunk_members),
         variables=tuple(variables),
+        attributes=attributes,
     )
 
 

@@ -63,6 +63,7 @@ class Container:
         digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
             everything, so that files of different content have different digests.
         header: attribute "fhash" of the root (FORMAT.md).
+        attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
         arrays: StoredArray by name, in the order of the file.
         variables: of a file of several, by name in the order of its list; each is a container as
@@ -74,6 +75,7 @@ class Container:
     size: int
     digest: str
     header: dict[str, Any]
+    attributes: Mapping[str, Any]
     header_bytes: int
     arrays: Mapping[str, StoredArray]
     variables: Mapping[str, VariableContainer] = MappingProxyType({})
@@ -100,6 +102,7 @@ class Container:
                 if not tree.variables:
                     check_arrays(tree.header, tree.arrays)
             self.header, self.header_bytes = tree.header, members[DOCUMENT].size
+            self.attributes = MappingProxyType(dict(tree.attributes))
             self.arrays = MappingProxyType(self._stored_arrays(tree))
             if tree.variables:
                 self.variables = MappingProxyType(self._variables(tree, members))
@@ -239,7 +242,7 @@ class VariableContainer(Container):
     ) -> None:
         """Take the arrays of a variable from an open file. Raises DamagedFileError."""
         self.path, self.variable, self.header = file.path, variable.name, variable.header
-        self.header_bytes = file.header_bytes
+        self.header_bytes, self.attributes = file.header_bytes, file.attributes
         self.arrays = MappingProxyType(
             {name: file.arrays[place] for name, place in variable.places.items()}
         )

@@ -64,6 +64,7 @@ class ContainerWriter:
         self._members: list[Member] = []
         self._arrays: dict[str, dict[str, Any]] = {}
         self._position = 0
+        self.attributes: Mapping[str, Any] = {}
 
     def __enter__(self) -> ContainerWriter:
         with ExitStack() as stack:
@@ -321,9 +322,11 @@ class ContainerWriter:
             "format": FORMAT,
             "format_version": list(FORMAT_VERSION),
         }
-        root: dict[str, Any] = {**GROUP, "attributes": {"fhash": complete}}
+        attributes = {**plain_json(self.attributes), "fhash": complete}
+        root: dict[str, Any] = {**GROUP, "attributes": attributes}
         if is_several(complete):
-            root[CONSOLIDATED] = consolidated({**dict.fromkeys(sorted(groups), GROUP), **self._arrays})
+            others = {**dict.fromkeys(groups, GROUP), **self._arrays}
+            root[CONSOLIDATED] = consolidated(others)
         documents[DOCUMENT] = strict_json.dumps(root, "the header")
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
