@@ -1,4 +1,4 @@
-"""`Dataset`: the variables of a `.fhz` file of several, each a `Volume`; and `open` for any file."""
+"""`Dataset`: the variables of a `.fhz` file of several, each a `Volume`; `open` for any file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from fhash_codec.progress import Progress, silent
-from fhash_codec.volume import Volume, chosen_variable
+from fhash_codec.volume import Volume
 from fhash_formats.container import Container
 
 __all__ = ["Dataset", "open"]
@@ -31,7 +31,7 @@ def open(
     try:
         if container.variables and variable is None:
             return Dataset(container, fill=fill)
-        return Volume(chosen_variable(container, variable), fill=fill)
+        return Volume(container.select(variable), fill=fill)
     except BaseException:
         container.close()
         raise

@@ -105,7 +105,8 @@ def encode_dataset(
             missed_text(path, written, "; ".join(texts), encoded[missed[0]].advice), figures
         )
     for name in names:
-        for remark in remarks(configs[name], figures["variables"][name]):
+        promised = {**figures["variables"][name], "ratio": encoded[name].ratio}
+        for remark in remarks(configs[name], promised):
             warnings.warn(f"{name}: {remark}", FhashWarning, stacklevel=2)
     return figures
 
@@ -124,16 +125,22 @@ class _Sources:
     def opened(self, name: str) -> Iterator[Series]:
         """The series of a variable, closed at the end of the context where it was opened here."""
         if isinstance(self._source, Mapping):
-            if name not in self._source:
+            try:
+                source = self._source[name]
+            except KeyError:
                 listed = ", ".join(map(str, self._source))[:400]
-                raise InputError(f"there is no variable {name[:80]!r}; the source has {listed}")
-            with open_source(self._source[name]) as series:
+                raise InputError(f"no variable {name[:80]!r}; the source has {listed}") from None
+            with open_source(source) as series:
+                if not isinstance(source, Series | str | Path):
+                    series.name = name
                 yield series
             return
-        source = self._source
-        opened = self._open(name) if self._open is not None else open_series(source, var=name)
-        with opened as series:
+        with (self._open or self._open_file)(name) as series:
             yield series
+
+    def _open_file(self, name: str) -> Series:
+        assert isinstance(self._source, str | Path)
+        return open_series(self._source, var=name)
 
 
 def _encoded(
@@ -153,18 +160,23 @@ def _described(
 
     Every variable is opened once, so that one that cannot be read is refused before the work.
     """
-    labels, files = {}, []
+    labels: dict[str, dict[str, Any]] = {}
+    files: list[str | Path] = []
     for name in names:
         config = configs[name]
         if config.profile == "paper":
             need_torch("profile paper")
             choose_device(config.device)
-        with sources.opened(name) as series:
-            labels[name] = {**series.attributes}
-            if series.units:
-                labels[name]["units"] = str(series.units)
-            files += [*series.files, *mask_files(config)]
+        labels[name], read = _looked_at(sources, name)
+        files += [*read, *mask_files(config)]
     return labels, files
+
+
+def _looked_at(sources: _Sources, name: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """Attributes that the array of a variable shows, and the files that it is read from."""
+    with sources.opened(name) as series:
+        units = {"units": str(series.units)} if series.units else {}
+        return {**series.attributes, **units}, tuple(series.files)
 
 
 def _by_name(config: Configs | None, names: Sequence[str]) -> dict[str, EncodeConfig]:

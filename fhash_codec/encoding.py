@@ -115,6 +115,7 @@ class EncodedVariable:
     Attributes:
         header: complete, with the measured quality.
         quality: `metrics.Quality` as JSON values.
+        ratio: of the bytes of the series to those by which the file grows by the variable.
         checkpoint: of the training, to be removed once the file is complete.
         missed: what was promised and is missed; None where the promise is kept.
         advice: what may help where it is missed.
@@ -122,6 +123,7 @@ class EncodedVariable:
 
     header: dict[str, Any]
     quality: dict[str, Any]
+    ratio: float
     checkpoint: Path | None
     missed: str | None
     advice: str
@@ -151,11 +153,13 @@ def encode_variable(
     else:
         header, checkpoint, advice = encode_paper(writer, series, config, mask, path, progress)
         header = measured.complete(header)
+    figures = measured.figures(header)
     return EncodedVariable(
         header=header,
         quality=measured.quality,
+        ratio=figures["ratio"],
         checkpoint=checkpoint,
-        missed=missed_promise(config, measured.figures(header)),
+        missed=missed_promise(config, figures),
         advice=advice,
     )
 

@@ -22,6 +22,7 @@ from fhash_codec.indexing import (
     coarse_vertices,
     expand_index,
     index_ranges,
+    shared_part,
     slice_of,
 )
 from fhash_codec.measure.value_range import ValueRange
@@ -54,28 +55,10 @@ def open(
     """
     container = Container.open(path)
     try:
-        return Volume(chosen_variable(container, variable), fill=fill)
+        return Volume(container.select(variable), fill=fill)
     except BaseException:
         container.close()
         raise
-
-
-def chosen_variable(container: Container, variable: str | None) -> Container:
-    """The container of one variable of a file, whose `close` closes the file; errors as `open`."""
-    names = list(container.variables) or [container.header["variable"]["name"]]
-    if variable not in names and not (variable is None and len(names) == 1):
-        listed = ", ".join(names)[:400]
-        if variable is None:
-            raise InputError(
-                f"{container.path} holds several variables, {listed}; choose one, such as"
-                f" --var {names[0]} (in Python: variable={names[0]!r})"
-            )
-        raise InputError(
-            f"{container.path} has no variable {variable[:80]!r}; it holds {listed}"
-        )
-    if not container.variables:
-        return container
-    return container.variables[variable or names[0]].closing_file()
 
 
 class Volume(Card):
@@ -180,7 +163,7 @@ class Volume(Card):
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        common = self._within_box(region)
+        common = shared_part(self.box, region)
         if common is None:
             result: npt.NDArray[Any] = np.full(region.shape, np.nan, dtype=self.float_dtype)
         else:
@@ -211,7 +194,7 @@ class Volume(Card):
         read = self.read(t, region, outside=outside)
         gaps = np.isnan(read)
         result: npt.NDArray[Any] = rounded(read, self.dtype)
-        common = self._within_box(self._checked(region))
+        common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             # float64 has not every integer of 64 bits.
             in_region, in_box = common
@@ -343,7 +326,7 @@ class Volume(Card):
         key = self._key_index(t)
         region = self._checked(region)
         result = np.zeros(region.shape, dtype=bool)
-        common = self._within_box(region)
+        common = shared_part(self.box, region)
         if common is not None:
             in_region, in_box = common
             result[in_region.slices()] = self._occupied(key, in_box)
@@ -382,17 +365,6 @@ class Volume(Card):
 
     def _checked(self, region: Spans | None) -> Box:
         return checked_region(region, self.shape[1:], str(self.path))
-
-    def _within_box(self, region: Box) -> tuple[Box, Box] | None:
-        """The vertices that a region shares with the feature bounding box; None if there are none.
-
-        They are returned twice: in vertices of the region, and in vertices of the box.
-        """
-        common = self.box.intersect(region)
-        if common is None:
-            return None
-        in_region = common.shift(-first for first in region.first)
-        return in_region, common.shift(-first for first in self.box.first)
 
     def _occupied(self, key: float, region: Box) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the coreset at a key index; the region is in vertices of the box."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fhash_cli.intervals import written
 from fhash_formats.errors import RegionError
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from fhash_codec import Volume
     from fhash_formats.series import Coordinate
 
@@ -129,6 +131,21 @@ def coordinates(
         axis: Coordinate(name=coords[axis].name, values=cut, attributes=coords[axis].attributes)
         for axis, cut in values.items()
     }
+
+
+def count_inside(
+    volume: Volume,
+    step: float,
+    region: tuple[Span, Span, Span],
+    frame: npt.NDArray[Any],
+    outside: str,
+) -> int:
+    """Number of vertices of a decoded frame that are in the coreset."""
+    import numpy as np
+
+    if outside == "nan":
+        return frame.size - int(np.isnan(frame).sum())
+    return int(volume.occupancy(step, region).sum())
 
 
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:

@@ -24,6 +24,7 @@ from fhash_cli.output import Progress, apart, emit, extent, listed, number, say,
 from fhash_cli.selection import (
     Span,
     coordinates,
+    count_inside,
     dates_of,
     opened,
     region_of,
@@ -273,7 +274,7 @@ class Selection:
                 if self.lod is None
                 else volume.read_lod(step, self.lod, self.region)
             )
-            statistics.add(frame, _inside(volume, step, self.region, frame, self.outside))
+            statistics.add(frame, count_inside(volume, step, self.region, frame, self.outside))
             if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
                 # float64 has not every integer of 64 bits.
                 frame = volume.values(step, self.region, outside=self.outside)
@@ -368,21 +369,6 @@ class Statistics:
             "mean": self.mean.value() if defined else None,
             "inside_fraction": self.inside / self.all,
         }
-
-
-def _inside(
-    volume: Volume,
-    step: float,
-    region: tuple[Span, Span, Span],
-    frame: npt.NDArray[Any],
-    outside: str,
-) -> int:
-    """Number of vertices of a decoded frame that are in the coreset."""
-    import numpy as np
-
-    if outside == "nan":
-        return frame.size - int(np.isnan(frame).sum())
-    return int(volume.occupancy(step, region).sum())
 
 
 def _rows(result: dict[str, Any], volume: Volume) -> list[tuple[str, str]]:

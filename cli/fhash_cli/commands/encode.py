@@ -104,7 +104,6 @@ def command(
     profile compact the same command starts again.
     """
     import fhash_codec
-    from fhash_codec.promises import decided_by_bulk
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
@@ -112,9 +111,8 @@ def command(
     if names is not None:
         if time_budget is not None or report_folder is not None or verbose:
             raise click.UsageError("--time-budget, --report and -v are for one variable")
-        figures = _encode_several(data, output, source, names, settings, force, quiet)
-        _emit_several(figures, explain, as_json)
-        return
+        encoded = _encode_several(data, output, source, names, settings, force, quiet)
+        return _emit_several(encoded, explain, as_json)
     config = config_of(settings)
     if report_folder is not None:
         check_report_folder(Path(report_folder), force, data)
@@ -140,23 +138,45 @@ def command(
             stopped = _write_report(
                 series, report, config, Path(report_folder), force, missed, progress
             )
-    _say_unmet(source, series, quiet)
-    integers = (series.source_dtype or series.dtype).kind in "iu"
-    if integers and not quiet and looks_categorical(report):
-        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
-    if not quiet and missed is None and (line := decided_by_bulk(config, report)) is not None:
-        say(line)
+    if not quiet:
+        _say_remarks(source, series, config, report, promise_kept=missed is None)
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))
-    text = table(rows)
-    stages = report.pop("stages")
-    if explain:
-        report["stages"] = stages
-        text += f"\n\n{stage_table(stages)}"
+    text = table(rows) + _explained(report, explain)
     if choice is not None:
         report["time_budget"] = choice.to_dict()
-    emit(report, text, as_json, missed or stopped)
+    return emit(report, text, as_json, missed or stopped)
+
+
+def _explained(figures: dict[str, Any], explain: bool, title: str = "") -> str:
+    """The table of the stages of a report, which keeps them only where they are asked for."""
+    stages = figures.pop("stages")
+    if not explain:
+        return ""
+    figures["stages"] = stages
+    return f"\n\n{title}{stage_table(stages)}"
+
+
+def _say_remarks(
+    source: SourceOptions,
+    series: Series,
+    config: EncodeConfig,
+    report: Mapping[str, Any],
+    *,
+    promise_kept: bool,
+) -> None:
+    """Lines on what may be a slip in the command, or decided the size."""
+    from fhash_codec.promises import decided_by_bulk
+
+    for value in source.missing:
+        if value == value and value not in series.occurring:
+            say(f"--missing {value:.9g}: {series.source} holds no such value")
+    integers = (series.source_dtype or series.dtype).kind in "iu"
+    if integers and looks_categorical(report):
+        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
+    if promise_kept and (line := decided_by_bulk(config, report)) is not None:
+        say(line)
 
 
 def _encode_several(
@@ -205,10 +225,7 @@ def _emit_several(
     ]
     text = f"{table(rows)}\n\n{table(report_table(variables))}"
     for name, figures in variables.items():
-        stages = figures.pop("stages")
-        if explain:
-            figures["stages"] = stages
-            text += f"\n\n{name}\n{stage_table(stages)}"
+        text += _explained(figures, explain, f"{name}\n")
     emit(report, text, as_json, missed)
 
 
@@ -278,13 +295,6 @@ def _write_report(
     return InterruptedEncodingError(
         f"interrupted; {figures['path']} is complete, {page} has what was measured until then"
     )
-
-
-def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:
-    """One line for each `--missing V` that occurs nowhere: it may be a slip."""
-    for value in source.missing:
-        if value == value and value not in series.occurring and not quiet:
-            say(f"--missing {value:.9g}: {series.source} holds no such value")
 
 
 def looks_categorical(report: Mapping[str, Any]) -> bool:

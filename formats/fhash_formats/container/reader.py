@@ -30,7 +30,7 @@ from fhash_formats.container.zip_checked import (
     find_signature,
     read_members,
 )
-from fhash_formats.errors import FhashError
+from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import Coordinate
 
 CACHE_BYTES = 256 << 20
@@ -208,6 +208,23 @@ class Container:
         """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
 
+    def select(self, variable: str | None) -> Container:
+        """The container of one variable, whose `close` closes the file.
+
+        variable: its name; None for the only one of the file. Raises InputError where the file
+        does not hold it, or holds several and none is named.
+        """
+        names = list(self.variables) or [self.header["variable"]["name"]]
+        listed = ", ".join(names)[:400]
+        if variable is None and len(names) > 1:
+            raise InputError(
+                f"{self.path} holds several variables, {listed}; choose one, such as"
+                f" --var {names[0]} (in Python: variable={names[0]!r})"
+            )
+        if variable is not None and variable not in names:
+            raise InputError(f"{self.path} has no variable {variable[:80]!r}; it holds {listed}")
+        return self.variables[variable or names[0]].closing_file() if self.variables else self
+
     def close(self) -> None:
         """Release the file and the cache."""
         self._source.close()
@@ -251,11 +268,7 @@ class VariableContainer(Container):
         self._closes_file = False
         own = [f"{place}/" for name, place in variable.places.items() if name[:7] != "coords/"]
         documents = [f"{place}{DOCUMENT}" for place in own]
-        chunks = (
-            member
-            for place in own
-            for member in file.arrays[place[:-1]].chunks.values()
-        )
+        chunks = (member for place in own for member in file.arrays[place[:-1]].chunks.values())
         self.size = sum(
             member.end - member.offset + len(directory_entry(member))
             for member in chain(chunks, (members[name] for name in documents))

@@ -170,7 +170,10 @@ class VariableWriter(ContainerWriter):
         )
 
     def preview(self, header: Mapping[str, Any]) -> Container:
-        """The variable as written so far; see `ContainerWriter.preview`. `close` closes the file."""
+        """The variable as written so far, whose `close` closes the file.
+
+        See `ContainerWriter.preview`.
+        """
         complete = self._complete({"quality": {}, "history": [], **header})
         container = self._array_file.preview(self._several.root(complete))
         return container.variables[self.name].closing_file()

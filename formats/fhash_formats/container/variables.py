@@ -1,8 +1,8 @@
 """Several variables in one container: names of their arrays, and checks of the root's header.
 
 FORMAT.md describes such files in its section "Several variables". Each variable has a header and
-arrays as a file of its own would have them. Here its arrays' names in such a file ("tables/level_1")
-become their places in the hierarchy ("u"), and back.
+arrays as a file of its own would have them. Here the names of arrays in such a file
+("tables/level_1") become their places in the hierarchy ("u"), and back.
 """
 
 from __future__ import annotations
@@ -167,9 +167,8 @@ def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             fits = fits and all(NODE.fullmatch(dimension) for dimension in dimensions)
             record.need(fits, "dimensions", "four different names of A-Z a-z 0-9 _ -")
             for feature in record.texts("required_features"):
-                record.need(
-                    feature in features, "required_features", f"{feature[:40]!a} at the root as well"
-                )
+                known = f"{feature[:40]!a} at the root as well"
+                record.need(feature in features, "required_features", known)
             complete = {"format": root["format"], "format_version": root["format_version"]}
             validate_header(header := {**entry, **complete})
         nodes.add(node)

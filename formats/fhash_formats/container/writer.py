@@ -54,7 +54,14 @@ class ContainerWriter:
     written once, in this order: for each array its metadata and its chunks, then the groups, then
     the root. Identical calls give identical bytes. Entering raises OutputExistsError or
     OutputError.
+
+    Attributes:
+        path: name that the file takes.
+        attributes: of the root beside the header, JSON values; they may be set until `commit`.
+        one_of_several: whether the arrays are those of one variable among several in the file.
     """
+
+    one_of_several = False
 
     def __init__(self, path: str | Path, *, force: bool = False) -> None:
         """Prepare a writer; `force` allows it to replace an existing file."""

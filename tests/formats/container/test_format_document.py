@@ -66,10 +66,8 @@ def test_variables_are_valid_and_can_be_written(tmp_path) -> None:
         several = SeveralWriter(writer, [header["name"] for header in root["variables"]])
         for header in root["variables"]:
             variable = several.variable(header["name"])
-            names = zip(
-                ("time", "z", "y", "x"), header["dimensions"], header["domain"]["shape"], strict=True
-            )
-            for axis, name, length in names:
+            axes, lengths = ("time", "z", "y", "x"), header["domain"]["shape"]
+            for axis, name, length in zip(axes, header["dimensions"], lengths, strict=True):
                 variable.add_whole(f"coords/{axis}", np.zeros(length), attributes={"name": name})
             levels = header["model"]["levels"][0]
             variable.add_whole("tables/level_1", np.zeros(levels, dtype=np.float32))
