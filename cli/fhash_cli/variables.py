@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,38 +12,109 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+    from fhash_formats.readers.common.listing import Listed
 
 ALL = "all"
 """Value of `--var` that stands for every variable that can be encoded as it is."""
+MAX_COMPONENTS = 9
+"""Components of a vector or a tensor that become variables at most."""
 
 
-def names_to_encode(source: SourceOptions, path: str, *, quiet: bool) -> list[str] | None:
-    """The names of several variables that `--var` asks for; None where it is one, or not given.
+def variables_to_encode(
+    source: SourceOptions, path: str, components: str | None, *, quiet: bool
+) -> dict[str, SourceOptions] | None:
+    """How each of several variables is opened, by its name; None where one variable is asked for.
 
-    One line on stderr says which variables `--var all` leaves out. Raises InputError where there
-    is nothing to take, and for a name that is given twice.
+    Several are asked for by `--var u,v`, `--var all`, and by `--components DIM`: each index along
+    that dimension makes a variable of its own, such as velocity_0. One line on stderr says which
+    variables `--var all` leaves out.
+
+    Raises InputError where there is nothing to take, for a name that is given twice, and for a
+    dimension that no variable has, or that is an axis.
     """
-    if source.var is None or not (source.var == ALL or "," in source.var):
+    several = source.var is not None and (source.var == ALL or "," in source.var)
+    if not several and components is None:
         return None
-    import dataclasses
+    listed = dataclasses.replace(source, var=None).list(path)
+    if several and components is None and source.var in [entry.name for entry in listed]:
+        return None
+    parts = {} if components is None else _components(listed, components, path)
+    names = _names(source, path, listed, parts, components, quiet=quiet)
+    found: dict[str, SourceOptions] = {}
+    for name in names:
+        own = dataclasses.replace(source, var=name)
+        if name not in parts:
+            found[name] = own
+        for index in range(parts.get(name, 0)):
+            select = (*source.select, (str(components), str(index)))
+            found[f"{name}_{index}"] = dataclasses.replace(own, select=select)
+    expected = sum(parts.get(name, 1) for name in names)
+    if len(found) < expected:
+        raise InputError(f"{path}: components have the name of another variable; choose others")
+    return found
 
+
+def _components(listed: Sequence[Listed], components: str, path: str) -> dict[str, int]:
+    """The number of components of each variable that has the dimension."""
+    lengths = {}
+    for entry in listed:
+        for (dimension, axis), length in zip(entry.dimensions, entry.shape, strict=False):
+            if dimension == components and axis in ("select", "?"):
+                lengths[entry.name] = length
+    if not lengths:
+        raise InputError(
+            f"--components {components}: no variable has that dimension beside t, z, y and x;"
+            f" see: fhash info {path}"
+        )
+    longest = max(lengths.values())
+    if longest > MAX_COMPONENTS:
+        raise InputError(
+            f"--components {components}: {longest} along it; at most {MAX_COMPONENTS} become"
+            " variables"
+        )
+    return lengths
+
+
+def _names(
+    source: SourceOptions,
+    path: str,
+    listed: Sequence[Listed],
+    parts: Mapping[str, int],
+    components: str | None,
+    *,
+    quiet: bool,
+) -> list[str]:
+    """The names that `--var` asks for, those of vectors whole."""
     from fhash_codec.dataset_encoding import encodable
 
-    listed = dataclasses.replace(source, var=None).list(path)
-    if source.var in [entry.name for entry in listed]:
-        return None
+    if source.var is None:
+        if len(parts) > 1:
+            raise InputError(
+                f"--components {components} is a dimension of {', '.join(parts)};"
+                " choose by --var, or take --var all"
+            )
+        return list(parts)
     if source.var != ALL:
-        names = [name.strip() for name in source.var.split(",")]
+        every = [entry.name for entry in listed]
+        names = [source.var] if source.var in every else source.var.split(",")
+        names = [name.strip() for name in names]
         twice = next((name for name in names if names.count(name) > 1 or not name), None)
         if twice is not None:
             raise InputError(f"--var {source.var} has '{twice}' where another name is needed")
         return names
-    names, others = encodable(listed, len(source.select))
+    scalars = [entry for entry in listed if entry.name not in parts]
+    names = encodable(scalars, len(source.select))[0]
+    if parts:
+        select = (*source.select, (str(components), "0"))
+        again = dataclasses.replace(source, var=None, select=select).list(path)
+        vectors = [entry for entry in again if entry.name in parts]
+        names += encodable(vectors, len(select))[0]
     if not names:
         raise InputError(f"{path} has no variable that can be encoded; see: fhash info {path}")
+    others = [entry.name for entry in listed if entry.name not in names]
     if others and not quiet:
         say(f"--var all leaves out {', '.join(others)}; fhash info {path} says why")
-    return names
+    return [entry.name for entry in listed if entry.name in names]
 
 
 def config_of(settings: Mapping[str, Any]) -> EncodeConfig:

@@ -71,6 +71,26 @@ def test_several_names_with_a_plain_promise(fhash: Fhash, data: Path, tmp_path: 
     assert report["bytes"] == path.stat().st_size
 
 
+def test_components_become_variables(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data, "-o", path, *SMALL, "--components", "dim0", "--json"]
+    result = fhash(*words, "--max-error", "members_1=0.5")
+    assert list(json.loads(result.stdout)["variables"]) == ["members_0", "members_1"]
+    report = json.loads(fhash("info", path, "--json").stdout)["variables"]
+    assert report["members_1"]["config"]["max_error"] == 0.5
+    assert report["members_0"]["variable"]["name"] == "members"
+    difference = ["diff", data, path, "--var", "members", "--select", "dim0=1", "--json"]
+    assert json.loads(fhash(*difference).stdout)["max_abs_error"] <= 0.5
+    result = fhash(*words, "--var", "all", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == [
+        *(f"members_{n}" for n in range(2)),
+        "u",
+        "v",
+    ]
+    result = fhash(*words, "--var", "u,members", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == ["u", "members_0", "members_1"]
+
+
 def test_info_lists_the_variables_and_tells_all_of_one(fhash: Fhash, run: Path) -> None:
     text = fhash("info", run).stdout
     assert [line.split()[:2] for line in text.splitlines() if line[:2] in ("u ", "v ")] == [
@@ -147,6 +167,8 @@ BAD = {
         ["--var", "u,v", "--psnr", "u=40", "--max-error", "u=1"],
         "promise one of them",
     ),
+    "components of no dimension": (["--components", "dim9"], "no variable has that dimension"),
+    "an axis as components": (["--components", "t"], "no variable has that dimension"),
     "a budget": (["--var", "u,v", "--time-budget", "9s"], "are for one variable"),
 }
 

@@ -105,6 +105,11 @@ def _variable_of(run: str, source: SourceOptions) -> str | None:
     with Container.open(run) as container:
         if not container.variables:
             return None
+        # A component of a vector: --var velocity --select component=0 is velocity_0.
+        components = [f"{source.var}_{index}" for _, index in source.select]
+        for name in (source.var, *components):
+            if name in container.variables:
+                return name
     with open_volume(run, variable=source.var) as volume:
         return volume.variable
 

@@ -38,7 +38,7 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_cli.variables import config_of, configs_of, names_to_encode, report_table
+from fhash_cli.variables import config_of, configs_of, report_table, variables_to_encode
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
@@ -57,6 +57,12 @@ MAX_LABELS = 64
 )
 @series_options
 @setting_options(by_variable=True)
+@click.option(
+    "--components",
+    metavar="DIM",
+    help="Dimension of vectors, each component of which becomes a variable of its own, such as "
+    "velocity_0.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -83,6 +89,7 @@ def command(
     output: str,
     source: SourceOptions,
     settings: dict[str, Any],
+    components: str | None,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -107,11 +114,11 @@ def command(
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
-    names = names_to_encode(source, data, quiet=quiet)
-    if names is not None:
+    several = variables_to_encode(source, data, components, quiet=quiet)
+    if several is not None:
         if time_budget is not None or report_folder is not None or verbose:
             raise click.UsageError("--time-budget, --report and -v are for one variable")
-        encoded = _encode_several(data, output, source, names, settings, force, quiet)
+        encoded = _encode_several(data, output, several, settings, force, quiet)
         return _emit_several(encoded, explain, as_json)
     config = config_of(settings)
     if report_folder is not None:
@@ -182,16 +189,18 @@ def _say_remarks(
 def _encode_several(
     data: str,
     output: str,
-    source: SourceOptions,
-    names: Sequence[str],
+    several: Mapping[str, SourceOptions],
     settings: Mapping[str, Any],
     force: bool,
     quiet: bool,
 ) -> tuple[dict[str, Any], QualityError | None]:
-    """Encode several variables into one file: its figures, and the promises that it misses."""
+    """Encode several variables into one file: its figures, and the promises that it misses.
+
+    several: how each is opened, by its name.
+    """
     from fhash_codec.dataset_encoding import encode_dataset
 
-    before = _stamp(output)
+    before, names = _stamp(output), list(several)
     with Progress(quiet=quiet) as progress:
         try:
             figures = encode_dataset(
@@ -199,9 +208,7 @@ def _encode_several(
                 output,
                 configs_of(settings, names),
                 variables=names,
-                open_variable=lambda name: dataclasses.replace(source, var=name).open(
-                    data, progress
-                ),
+                open_variable=lambda name: several[name].open(data, progress),
                 force=force,
                 progress=progress,
             )
