@@ -36,30 +36,35 @@ from fhash_formats.errors import (
 if TYPE_CHECKING:
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.dataset import Dataset, open
+    from fhash_codec.dataset_encoding import encode_dataset
     from fhash_codec.encoding import encode
     from fhash_codec.plain import export_plain
     from fhash_codec.rendering import render
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
-    from fhash_codec.volume import Volume, open
+    from fhash_codec.volume import Volume
 
 __version__ = version("fhash")
 
 _MODULES = {
+    "Dataset": "dataset",
     "EncodeConfig": "config",
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
     "Volume": "volume",
     "diff": "comparison",
     "encode": "encoding",
+    "encode_dataset": "dataset_encoding",
     "export_plain": "plain",
-    "open": "volume",
+    "open": "dataset",
     "render": "rendering",
 }
 """Public names that load on first use, with their modules in this package."""
 
 __all__ = [
     "DamagedFileError",
+    "Dataset",
     "EncodeConfig",
     "FhashError",
     "FhashWarning",
@@ -78,6 +83,7 @@ __all__ = [
     "Volume",
     "diff",
     "encode",
+    "encode_dataset",
     "export_plain",
     "open",
     "render",

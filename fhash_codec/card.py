@@ -151,7 +151,7 @@ class Card:
             return {"path": "", "coding": otherwise, "bytes": 0}
         size = sum(array.nbytes_stored for array in arrays)
         return {
-            "path": name,
+            "path": name if name not in stored else stored[name].name,
             "coding": arrays[0].coding,
             "bytes": size + (0 if bias is None else bias.nbytes_stored),
         }

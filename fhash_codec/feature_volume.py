@@ -45,7 +45,8 @@ class FeatureVolume(Volume):
         return self._model.occupied_by(self.numbers, first, last, region)
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(_reopen, self.numbers, self._asked_fill), (self.path.absolute(),)
+        again = partial(_reopen, self.numbers, self.variable, self._asked_fill)
+        return again, (self.path.absolute(),)
 
 
 def only_features(volume: Volume, features: Sequence[str]) -> Volume:
@@ -112,6 +113,9 @@ def _names(volume: Volume) -> list[str]:
     return [str(name) for name in volume.container.header["features"]]
 
 
-def _reopen(numbers: Sequence[int], fill: int | float | None, path: Path) -> Volume:
+def _reopen(
+    numbers: Sequence[int], variable: str | None, fill: int | float | None, path: Path
+) -> Volume:
     """A volume of some features of the file at a path."""
-    return FeatureVolume(open_volume(path, fill=fill).container, numbers, fill=fill)
+    container = open_volume(path, variable=variable, fill=fill).container
+    return FeatureVolume(container, numbers, fill=fill)

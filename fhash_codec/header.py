@@ -80,11 +80,12 @@ def write_series(
     """Write coordinates, key frames, and masks of the values that are not finite.
 
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows. everything: all finite values are in the coreset of every step, so that its mask says
+    allows, but for the coordinates of one of several variables, which share their arrays.
+    everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
     coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
-    described = describe_coordinates(coords) if brief else {}
+    described = describe_coordinates(coords) if brief and not writer.one_of_several else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -316,12 +317,12 @@ def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -
     header = container.header
     raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
     arrays = {
-        name: {
+        array.name: {
             "shape": list(array.shape),
             "dtype": str(array.dtype),
             "bytes": array.nbytes_stored,
         }
-        for name, array in container.arrays.items()
+        for array in container.arrays.values()
     }
     return {
         **full_header(header),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fhash_cli.intervals import written
 from fhash_formats.errors import RegionError
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from fhash_codec import Volume
     from fhash_formats.series import Coordinate
 
@@ -131,6 +133,21 @@ def coordinates(
     }
 
 
+def count_inside(
+    volume: Volume,
+    step: float,
+    region: tuple[Span, Span, Span],
+    frame: npt.NDArray[Any],
+    outside: str,
+) -> int:
+    """Number of vertices of a decoded frame that are in the coreset."""
+    import numpy as np
+
+    if outside == "nan":
+        return frame.size - int(np.isnan(frame).sum())
+    return int(volume.occupancy(step, region).sum())
+
+
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:
     """Ends of low:high among `count` as Python means them, but without its clipping."""
     first = 0 if low is None else low + count if low < 0 else low
@@ -145,12 +162,18 @@ def _span(what: str, low: int | None, high: int | None, count: int, allowed: str
     raise RegionError(f"{what} is {written(low, high)}, {reason}; {allowed}")
 
 
-def opened(run: str, fill: float | None, features: Sequence[str]) -> Volume:
-    """An open container, with some of its features alone if any are named; see `only_features`."""
+def opened(
+    run: str, fill: float | None, features: Sequence[str], variable: str | None = None
+) -> Volume:
+    """An open container, with some of its features alone if any are named; see `only_features`.
+
+    variable: which one, where the container has several.
+    """
     import fhash_codec
     from fhash_codec.feature_volume import only_features
+    from fhash_codec.volume import open as open_volume
 
-    volume = fhash_codec.open(run, fill=fill)
+    volume = open_volume(run, variable=variable, fill=fill)
     try:
         return only_features(volume, features) if features else volume
     except fhash_codec.InputError:

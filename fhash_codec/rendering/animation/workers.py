@@ -39,12 +39,14 @@ class _Job:
 
     Attributes:
         path: of the container.
+        variable: which one of it, where it has several.
         digest: `Container.digest` of it, so that no other file is rendered.
         scenes: of its pictures, in order.
         threads: that it may use.
     """
 
     path: Path
+    variable: str | None
     digest: str
     scenes: tuple[Scene, ...]
     threads: int
@@ -67,6 +69,7 @@ def rendered_by_workers(
             here, there = context.Pipe(duplex=False)
             job = _Job(
                 path=volume.path.absolute(),
+                variable=volume.variable,
                 digest=volume.container.digest,
                 scenes=tuple(scenes[first::processes]),
                 threads=threads,
@@ -142,7 +145,7 @@ def _work(end: Connection, job: _Job) -> None:
 
 def _images(job: _Job) -> Generator[Image, None, None]:
     """Render the scenes of a job; raises InputError where the container is another one now."""
-    with open_volume(job.path) as volume:
+    with open_volume(job.path, variable=job.variable) as volume:
         if volume.container.digest != job.digest:
             raise InputError(f"{job.path}: the file changed while it was rendered; render it again")
         renderer = Renderer(volume)

@@ -28,11 +28,14 @@ The tests prove that the zarr library reads every array equal.
     stored           StoredArray: one array, read region by region
     reader           Container: a file for reading
     writer           ContainerWriter: a file for writing
+    variables        names and headers of several variables in a file
+    several          SeveralWriter: several variables, one after the other
 """
 
 from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
 from fhash_formats.container.reader import Container, is_container
+from fhash_formats.container.several import SeveralWriter, VariableWriter
 from fhash_formats.container.sharding import shard_order, shard_shape
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
@@ -41,7 +44,9 @@ __all__ = [
     "FORMAT_VERSION",
     "Container",
     "ContainerWriter",
+    "SeveralWriter",
     "StoredArray",
+    "VariableWriter",
     "coordinate_features",
     "describe_coordinates",
     "is_container",
