@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume, open
+    from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
 
@@ -55,6 +56,7 @@ _MODULES = {
     "export_plain": "plain",
     "open": "volume",
     "render": "rendering",
+    "zarr_store": "zarr_view.store",
 }
 """Public names that load on first use, with their modules in this package."""
 
@@ -81,6 +83,7 @@ __all__ = [
     "export_plain",
     "open",
     "render",
+    "zarr_store",
 ]
 
 

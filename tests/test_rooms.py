@@ -45,7 +45,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("volume_model",),
         ("card", "sampling", "times", "value_type"),
         ("volume",),
-        ("feature_volume", "promises", "report"),
+        ("feature_volume", "promises", "report", "zarr_view"),
         ("rendering",),
         ("simulation",),
         ("comparison", "demo", "isosurface"),
