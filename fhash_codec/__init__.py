@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume
+    from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
 
@@ -59,6 +60,7 @@ _MODULES = {
     "export_plain": "plain",
     "open": "dataset",
     "render": "rendering",
+    "zarr_store": "zarr_view.store",
 }
 """Public names that load on first use, with their modules in this package."""
 
@@ -87,6 +89,7 @@ __all__ = [
     "export_plain",
     "open",
     "render",
+    "zarr_store",
 ]
 
 

@@ -45,6 +45,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("volume_model",),
         ("card", "sampling", "times", "value_type"),
         ("volume",),
+        ("zarr_view",),
         ("dataset", "feature_volume", "promises", "report"),
         ("rendering",),
         ("simulation",),
