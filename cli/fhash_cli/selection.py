@@ -11,6 +11,7 @@ from fhash_formats.errors import RegionError
 if TYPE_CHECKING:
     from fhash_codec import Volume
     from fhash_formats.series import Coordinate
+    from fhash_formats.source_metadata import SourceMetadata
 
 Span = tuple[int, int]
 
@@ -129,6 +130,19 @@ def coordinates(
         axis: Coordinate(name=coords[axis].name, values=cut, attributes=coords[axis].attributes)
         for axis, cut in values.items()
     }
+
+
+def metadata(
+    volume: Volume, steps: Sequence[float], vertices: Sequence[range]
+) -> SourceMetadata | None:
+    """All that belongs to the variable in its source, at some (fractional) steps and vertices."""
+    if volume.metadata is None:
+        return None
+    whole = all(float(step).is_integer() for step in steps)
+    places = dict(zip("zyx", map(list, vertices), strict=True))
+    # between two steps nothing but the values and the time is known
+    times = {"t": [int(step) for step in steps] if whole else None}
+    return volume.metadata.cut({**times, **places})
 
 
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:

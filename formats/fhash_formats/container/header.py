@@ -19,7 +19,7 @@ from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 6)
+FORMAT_VERSION = (1, 7)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
