@@ -22,7 +22,13 @@ from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_codec.provenance import date_of, source_parts
+from fhash_formats.container import (
+    SOURCE,
+    Container,
+    ContainerWriter,
+    describe_coordinates,
+)
 from fhash_formats.container.header import MISSING
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
@@ -49,7 +55,7 @@ STEP_DIGITS = 5
 def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
-    """Header entries of a series: variable, shape and range, and a quality to be filled in."""
+    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
     variable: dict[str, Any] = {
         "name": str(series.name),
         "units": str(series.units),
@@ -58,7 +64,9 @@ def describe_source(
     }
     if series.fill is not None and math.isfinite(series.fill):
         variable["fill"] = series.fill
+    source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
     return {
+        **({} if source is None else {SOURCE: source | date_of(config)}),
         "encoder": {"version": version("fhash"), "seed": config.seed},
         "variable": variable,
         "domain": {"shape": list(series.shape)},
@@ -84,7 +92,9 @@ def write_series(
     everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
-    coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
+    coords = _storable_coords(series)
+    for name, array in source_parts(series, coords, {})[1].items():
+        writer.add_whole(name, array)
     described = describe_coordinates(coords) if brief and not writer.one_of_several else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
@@ -102,6 +112,11 @@ def write_series(
         return {"coordinates": described, "missing": OUTSIDE}
     _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
+
+
+def _storable_coords(series: Series) -> dict[str, Coordinate]:
+    """The coordinates of a series as a container holds them."""
+    return {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
 
 
 def _storable(coordinate: Coordinate) -> Coordinate:

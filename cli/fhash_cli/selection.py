@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from fhash_codec import Volume
     from fhash_formats.series import Coordinate
+    from fhash_formats.source_metadata import SourceMetadata
 
 Span = tuple[int, int]
 
@@ -146,6 +147,19 @@ def count_inside(
     if outside == "nan":
         return frame.size - int(np.isnan(frame).sum())
     return int(volume.occupancy(step, region).sum())
+
+
+def metadata(
+    volume: Volume, steps: Sequence[float], vertices: Sequence[range]
+) -> SourceMetadata | None:
+    """All that belongs to the variable in its source, at some (fractional) steps and vertices."""
+    if volume.metadata is None:
+        return None
+    whole = all(float(step).is_integer() for step in steps)
+    places = dict(zip("zyx", map(list, vertices), strict=True))
+    # between two steps nothing but the values and the time is known
+    times = {"t": [int(step) for step in steps] if whole else None}
+    return volume.metadata.cut({**times, **places})
 
 
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:

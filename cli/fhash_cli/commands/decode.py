@@ -26,6 +26,7 @@ from fhash_cli.selection import (
     coordinates,
     count_inside,
     dates_of,
+    metadata,
     opened,
     region_of,
     region_of_box,
@@ -302,8 +303,7 @@ def _save_surface(
         )
     coords = coordinates(volume, selection.steps, selection.vertices)
     (frame,) = frames
-    time = float(coords["t"].values[0])
-    mesh = surface(frame, isosurface, coords, name=volume.name, time=time)
+    mesh = surface(frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0]))
     return [str(save_mesh(output, mesh, force=force, sources=[run]))]
 
 
@@ -326,9 +326,9 @@ def _save_region(
         shape=selection.shape,
         coords=coordinates(volume, selection.steps, selection.vertices),
         attributes=volume.attrs,
+        metadata=metadata(volume, selection.steps, selection.vertices),
     )
-    paths = save_region(output, region, frames, force=force, sources=[run])
-    return [str(path) for path in paths]
+    return [str(path) for path in save_region(output, region, frames, force=force, sources=[run])]
 
 
 class Statistics:

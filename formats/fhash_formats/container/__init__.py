@@ -20,6 +20,9 @@ The tests prove that the zarr library reads every array equal.
     header           checks of the header
     expected_arrays  arrays that a header asks for
     coordinates      positions in the header
+    source_described what belongs to the variable in its source -> header and arrays
+    source_entry     and back, checked
+    typed_values     attributes and small arrays as JSON that keeps their type
     array            metadata of one array
     coding           values of a chunk <-> bytes
     chunks           arrays cut into chunks
@@ -37,11 +40,14 @@ from fhash_formats.container.header import FORMAT_VERSION, validate_header
 from fhash_formats.container.reader import Container, is_container
 from fhash_formats.container.several import SeveralWriter, VariableWriter
 from fhash_formats.container.sharding import shard_order, shard_shape
+from fhash_formats.container.source_described import describe_metadata
+from fhash_formats.container.source_entry import SOURCE, read_metadata
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
 
 __all__ = [
     "FORMAT_VERSION",
+    "SOURCE",
     "Container",
     "ContainerWriter",
     "SeveralWriter",
@@ -49,7 +55,9 @@ __all__ = [
     "VariableWriter",
     "coordinate_features",
     "describe_coordinates",
+    "describe_metadata",
     "is_container",
+    "read_metadata",
     "shard_order",
     "shard_shape",
     "validate_header",

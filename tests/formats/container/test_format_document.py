@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_formats.container import Container, ContainerWriter, SeveralWriter, validate_header
+from fhash_formats.container import (
+    Container,
+    ContainerWriter,
+    SeveralWriter,
+    read_metadata,
+    validate_header,
+)
 from fhash_formats.container.array import DTYPES, ArrayMetadata
 from fhash_formats.container.coding import ARRAY_CODECS, PlainCoder, plain_codecs
 from fhash_formats.container.header import FORMAT_VERSION
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.series import AXIS_NAMES
 from fhash_formats.transform.tile.settings import TileSettings
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
@@ -44,18 +51,28 @@ def test_compact_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
     validate_header(header)
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
+        writer.add_whole("auxiliary/area", np.ones((5, 6), dtype=np.float32))
         writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.header == header
         assert container.coordinate("x").name == "lon"
+        coords = {axis: container.coordinate(name) for axis, name in AXIS_NAMES.items()}
+        metadata = read_metadata(header, container.arrays, coords)
+    assert list(metadata.dimensions) == ["time", "level", "y", "lon", "member"]
+    assert [each.name for each in metadata.variables][:2] == ["time", "lon"]
+    assert metadata.named("lon").values.dtype == np.float32
+    assert metadata.variable_attributes["missing_value"] == np.float32(1e20)
     for key in (
         "coordinates",
         *header["model"],
         *header["coordinates"]["x"],
+        *header["source"],
+        *(key for each in header["source"]["variables"] for key in each),
         "values",
         "attributes",
     ):
         assert f"`{key}`" in DOCUMENT
+    assert "`auxiliary/" in DOCUMENT
     for name in ("occupancy/bits", "occupancy/mask", "tables/level_1"):
         assert f"`{name}`" in DOCUMENT
 
