@@ -13,8 +13,9 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any
 
+from fhash_codec.dataset import Dataset
+from fhash_codec.dataset import open as open_file
 from fhash_codec.volume import Volume
-from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 
 __all__ = ["Handle", "acquire", "place_of", "release", "volumes_of"]
@@ -28,8 +29,8 @@ Key = tuple[Any, ...]
 def volumes_of(path: str, storage_options: Mapping[str, Any] | None = None) -> Mapping[str, Volume]:
     """The variables of a container by name, opened; `storage_options` are for a URL."""
     options: dict[str, Any] = {"storage_options": storage_options} if storage_options else {}
-    volume = open_volume(path, **options)
-    return {volume.name: volume}
+    opened = open_file(path, **options)
+    return opened if isinstance(opened, Dataset) else {opened.name: opened}
 
 
 def place_of(path: str | os.PathLike[str]) -> str:
@@ -50,7 +51,9 @@ class Handle:
     def __init__(self, key: Key, volumes: Mapping[str, Volume]) -> None:
         self.key, self.volumes = key, volumes
         self.digest = next(iter(volumes.values())).container.digest
-        weakref.finalize(self, _close, tuple(volumes.values()))
+        # Volumes of a dataset are closed with it alone.
+        owners = (volumes,) if isinstance(volumes, Dataset) else tuple(volumes.values())
+        weakref.finalize(self, _close, owners)
 
     def is_of_this_process(self) -> bool:
         """Whether it was opened here; a forked process shares the offset of an open file."""
@@ -101,6 +104,6 @@ def _state(place: str) -> Key:
     return place, found.st_mtime_ns, found.st_size, found.st_ino
 
 
-def _close(volumes: tuple[Volume, ...]) -> None:
-    for volume in volumes:
-        volume.close()
+def _close(owners: tuple[Dataset | Volume, ...]) -> None:
+    for owner in owners:
+        owner.close()
