@@ -21,6 +21,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
+from fhash_formats.container import Place
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
 
@@ -35,8 +36,8 @@ def ssim_budget(config: EncodeConfig) -> int:
     return QUICK_SSIM_BUDGET if config.effort == 1 else SSIM_BUDGET
 
 
-def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
-    """Decode every step of the container `path` and measure it against the data.
+def diff(source: Source, path: Place, *, progress: Progress = silent) -> dict[str, Any]:
+    """Decode every step of the container `path`, or at a URL, and measure it against the data.
 
     Returns the figures of `report` and, as "differences", the lines of `differences`. Raises
     InputError if the shapes differ, DamagedFileError for a damaged container.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -30,7 +29,7 @@ from fhash_codec.sampling import interpolable
 from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
-from fhash_formats.container import Container
+from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
@@ -41,14 +40,15 @@ CLIPPED_SINCE = (1, 2)
 """Format version since which values between vertices and steps are clipped to the range, too."""
 
 
-def open(path: str | Path, *, fill: int | float | None = None) -> Volume:
-    """Open a `.fhz` file for reading; nothing is decoded yet.
+def open(
+    path: Place, *, fill: int | float | None = None, storage_options: StorageOptions = None
+) -> Volume:
+    """Open a `.fhz` file for reading, a URL or an open binary file; nothing is decoded yet.
 
     fill: what `volume[...]` gives at vertices without a value, see `Volume`.
-
-    Raises MissingInputError, DamagedFileError or UnsupportedFileError.
+    storage_options: options of a URL's file system in fsspec. Raises what `Container.open` raises.
     """
-    return Volume(Container.open(path), fill=fill)
+    return Volume(Container.open(path, storage_options=storage_options), fill=fill)
 
 
 class Volume(Card):
@@ -70,7 +70,7 @@ class Volume(Card):
         name, units, attrs: of the variable.
         coords: a Coordinate for each of "t", "z", "y", "x".
         box: the feature bounding box, in vertices of the domain.
-        path: of the file.
+        path: of the file; a URL is text.
         info: everything the file says of itself, as JSON values.
         config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
             `model`.
@@ -87,7 +87,7 @@ class Volume(Card):
         """
         header = container.header
         self.container = container
-        self.path = Path(container.path)
+        self.path = container.path
         self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
         self.value_type = ValueType.of(container)
         self.float_dtype = self.value_type.floats
@@ -390,8 +390,8 @@ class Volume(Card):
     ) -> None:
         self.close()
 
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(open, fill=self._asked_fill), (self.path.absolute(),)
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
+        return partial(open, fill=self._asked_fill), (self.container.reopening(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))

@@ -74,7 +74,10 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
 def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
     from fhash_formats.container import is_container
+    from fhash_formats.support.locations import is_url
 
+    if is_url(path):
+        return True
     place = Path(path)
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
 

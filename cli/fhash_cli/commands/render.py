@@ -19,6 +19,7 @@ from fhash_cli.options import check_writable, force_option, json_option, quiet_o
 from fhash_cli.output import Progress, emit, extent, number, table
 from fhash_cli.scene_options import SceneOptions, scene_options
 from fhash_formats.errors import InputError
+from fhash_formats.support.locations import file_name
 
 if TYPE_CHECKING:
     from fhash_codec.rendering.picture.image import Image
@@ -69,7 +70,7 @@ def command(
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.times import time_text
 
-    path = Path(output) if output is not None else Path(Path(run).stem + ".png")
+    path = Path(output) if output is not None else Path(Path(file_name(run)).stem + ".png")
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):

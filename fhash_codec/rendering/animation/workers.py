@@ -17,13 +17,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
+from fhash_formats.container import Location
 from fhash_formats.errors import FhashError, FhashWarning, InputError
 from fhash_formats.support.threads import usable_threads
 
@@ -38,13 +38,13 @@ class _Job:
     """The work of one process.
 
     Attributes:
-        path: of the container.
+        place: of the container, to be opened again.
         digest: `Container.digest` of it, so that no other file is rendered.
         scenes: of its pictures, in order.
         threads: that it may use.
     """
 
-    path: Path
+    place: Location
     digest: str
     scenes: tuple[Scene, ...]
     threads: int
@@ -66,7 +66,7 @@ def rendered_by_workers(
         for first in range(processes):
             here, there = context.Pipe(duplex=False)
             job = _Job(
-                path=volume.path.absolute(),
+                place=dataclasses.replace(volume.container.reopening(), digest=None),
                 digest=volume.container.digest,
                 scenes=tuple(scenes[first::processes]),
                 threads=threads,
@@ -142,9 +142,11 @@ def _work(end: Connection, job: _Job) -> None:
 
 def _images(job: _Job) -> Generator[Image, None, None]:
     """Render the scenes of a job; raises InputError where the container is another one now."""
-    with open_volume(job.path) as volume:
+    with open_volume(job.place) as volume:
         if volume.container.digest != job.digest:
-            raise InputError(f"{job.path}: the file changed while it was rendered; render it again")
+            raise InputError(
+                f"{volume.path}: the file changed while it was rendered; render it again"
+            )
         renderer = Renderer(volume)
         for scene, upcoming in zip(job.scenes, (*job.scenes[1:], None), strict=True):
             image = renderer.render(scene, upcoming=upcoming)

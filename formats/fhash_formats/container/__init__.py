@@ -11,7 +11,11 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
+    ranges           ranges of bytes that are asked for together
     source           bytes at offsets of a file
+    remote           bytes of a file elsewhere, in few requests
+    fsspec_file      requests to any file system of fsspec
+    location         paths, URLs and open files -> sources
     layout           bytes of the ZIP
     zip_checked      safe opening of the ZIP
     strict_json      metadata documents as JSON
@@ -24,6 +28,7 @@ The tests prove that the zarr library reads every array equal.
     coding           values of a chunk <-> bytes
     chunks           arrays cut into chunks
     sharding         many chunks in one member
+    shard_places     where they lie in it
     cache            decoded chunks
     stored           StoredArray: one array, read region by region
     reader           Container: a file for reading
@@ -32,6 +37,7 @@ The tests prove that the zarr library reads every array equal.
 
 from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
+from fhash_formats.container.location import Location, Place, StorageOptions
 from fhash_formats.container.reader import Container, is_container
 from fhash_formats.container.sharding import shard_order, shard_shape
 from fhash_formats.container.stored import StoredArray
@@ -41,6 +47,9 @@ __all__ = [
     "FORMAT_VERSION",
     "Container",
     "ContainerWriter",
+    "Location",
+    "Place",
+    "StorageOptions",
     "StoredArray",
     "coordinate_features",
     "describe_coordinates",
