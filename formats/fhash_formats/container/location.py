@@ -1,4 +1,4 @@
-"""Where a container is: a path, a URL or an open file."""
+"""Places of containers: paths, URLs and open files, and the sources of their bytes."""
 
 from __future__ import annotations
 

@@ -25,6 +25,11 @@ class Request:
     ranges: tuple[Range, ...]
 
     @property
+    def place(self) -> Range:
+        """The range that all others lie in."""
+        return self.start, self.size
+
+    @property
     def size(self) -> int:
         """Number of bytes."""
         return self.stop - self.start

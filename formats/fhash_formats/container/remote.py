@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+from bisect import bisect_right, insort
 from collections import OrderedDict, deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -90,7 +91,8 @@ class RemoteSource(Source):
         self._lock = threading.Lock()
         self._pool: ThreadPoolExecutor | None = None
         self._fetches: dict[Range, _Fetch] = {}
-        self._kept: OrderedDict[_Fetch, None] = OrderedDict()
+        self._kept: OrderedDict[Range, _Fetch] = OrderedDict()
+        self._kept_places: list[Range] = []
         self._kept_bytes = 0
         self._waiting: deque[_Fetch] = deque()
         self._ahead: set[_Fetch] = set()
@@ -102,8 +104,8 @@ class RemoteSource(Source):
             self._reset()
         if self._closed:
             raise InputError("the container is closed")
-        if offset + size <= self._tail_start:
-            return self._fetched(offset, size)
+        if size == 0:
+            return b""
         with self._lock:
             start, tail = self._tail_start, self._tail
         if offset >= start:
@@ -120,20 +122,21 @@ class RemoteSource(Source):
     def prefetch(self, ranges: Iterable[Range]) -> None:
         """Begin to fetch ranges that will be read soon, each as it stands here.
 
-        They are merged where they are neighbours. Some requests and AHEAD_BYTES at most run ahead
-        of the reads. What the same thread announced before, and nobody has begun to fetch, is
+        They are merged where they are neighbours. No more requests than the file allows, and no
+        more than AHEAD_BYTES, run ahead of the reads. What the same thread announced before, and nobody has begun to fetch, is
         forgotten: its reader gave up.
         """
         if self._process != os.getpid():
             self._reset()
+        # An iterator may wait for a lock that a reader holds: it ends before this lock is taken.
+        places, thread = list(ranges), threading.get_ident()
         with self._lock:
-            thread = threading.get_ident()
             for fetch in [fetch for fetch in self._waiting if fetch.thread == thread]:
                 self._waiting.remove(fetch)
                 self._forget(fetch)
             in_tail = self._tail_start
-            before = {(offset, min(size, in_tail - offset)) for offset, size in ranges}
-            new = [place for place in before if place[1] > 0 and place not in self._fetches]
+            before = {(offset, min(size, in_tail - offset)) for offset, size in places}
+            new = [place for place in before if place[1] > 0 and self._known(place) is None]
             fetches = [_Fetch(request, thread) for request in merged(new, GAP, REQUEST_BYTES)]
             for fetch in fetches:
                 self._fetches.update(dict.fromkeys(fetch.request.ranges, fetch))
@@ -155,6 +158,7 @@ class RemoteSource(Source):
             pool, self._pool = self._pool, None
             self._fetches.clear()
             self._kept.clear()
+            self._kept_places.clear()
             self._kept_bytes = 0
             self._waiting.clear()
             self._tail = b""
@@ -164,7 +168,7 @@ class RemoteSource(Source):
     def _fetched(self, offset: int, size: int) -> bytes:
         """Bytes before the tail: those of a request that was announced, or of their own."""
         with self._lock:
-            fetch = self._fetches.get((offset, size))
+            fetch = self._known((offset, size))
             if fetch is None:
                 request = Request(start=offset, stop=offset + size, ranges=((offset, size),))
                 fetch = _Fetch(request, threading.get_ident())
@@ -174,8 +178,8 @@ class RemoteSource(Source):
             if mine:
                 with suppress(ValueError):
                     self._waiting.remove(fetch)
-            if fetch in self._kept:
-                self._kept.move_to_end(fetch)
+            if fetch.request.place in self._kept:
+                self._kept.move_to_end(fetch.request.place)
         self._begin_more()
         if mine:
             self._run(fetch)
@@ -213,14 +217,28 @@ class RemoteSource(Source):
             fetch.data.set_exception(error)
             return
         with self._lock:
-            if self._fetches.get(request.ranges[0]) is fetch:
-                self._kept[fetch] = None
+            announced = self._fetches.get(request.ranges[0]) is fetch
+            if announced and request.place not in self._kept:
+                self._kept[request.place] = fetch
+                insort(self._kept_places, request.place)
                 self._kept_bytes += request.size
                 while self._kept_bytes > KEPT_BYTES:
-                    dropped, _ = self._kept.popitem(last=False)
+                    place, dropped = self._kept.popitem(last=False)
+                    self._kept_places.remove(place)
                     self._kept_bytes -= dropped.request.size
                     self._forget(dropped)
         fetch.data.set_result(data)
+
+    def _known(self, place: Range) -> _Fetch | None:
+        """The request that a range was announced with, or one that came and holds it."""
+        fetch = self._fetches.get(place)
+        if fetch is None:
+            # The nearest one that begins before it is enough: requests seldom overlap.
+            number = bisect_right(self._kept_places, (place[0], self.size))
+            nearest = self._kept_places[number - 1] if number else (0, 0)
+            if sum(place) <= sum(nearest):
+                fetch = self._kept[nearest]
+        return fetch
 
     def _forget(self, fetch: _Fetch) -> None:
         """Let no range be read from a request any more."""

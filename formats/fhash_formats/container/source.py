@@ -15,7 +15,7 @@ from fhash_formats.container.ranges import Range
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 
 CHANGED = "the file changed since it was opened; open it again"
-"""What is told of a file that another took the place of."""
+"""Told of a file that another took the place of."""
 
 
 @contextmanager
