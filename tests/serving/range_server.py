@@ -53,6 +53,10 @@ class RangeServer:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Answer no more."""
         self._http.shutdown()
         self._http.server_close()
         self._thread.join()
