@@ -65,12 +65,7 @@ def rendered_by_workers(
     try:
         for first in range(processes):
             here, there = context.Pipe(duplex=False)
-            job = _Job(
-                place=dataclasses.replace(volume.container.reopening(), digest=None),
-                digest=volume.container.digest,
-                scenes=tuple(scenes[first::processes]),
-                threads=threads,
-            )
+            job = _job(volume, scenes[first::processes], threads)
             worker = context.Process(target=_work, args=(there, job), daemon=True)
             with _interrupts_ignored():
                 worker.start()
@@ -89,6 +84,16 @@ def rendered_by_workers(
                 worker.join()
         for end in ends:
             end.close()
+
+
+def _job(volume: Volume, scenes: Sequence[Scene], threads: int) -> _Job:
+    """The work of a process that draws scenes; raises InputError for a volume of an open file."""
+    return _Job(
+        place=dataclasses.replace(volume.container.reopening(), digest=None),
+        digest=volume.container.digest,
+        scenes=tuple(scenes),
+        threads=threads,
+    )
 
 
 @contextmanager

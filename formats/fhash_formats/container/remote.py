@@ -123,8 +123,8 @@ class RemoteSource(Source):
         """Begin to fetch ranges that will be read soon, each as it stands here.
 
         They are merged where they are neighbours. No more requests than the file allows, and no
-        more than AHEAD_BYTES, run ahead of the reads. What the same thread announced before, and nobody has begun to fetch, is
-        forgotten: its reader gave up.
+        more than AHEAD_BYTES, run ahead of the reads. What the same thread announced before,
+        and nobody has begun to fetch, is forgotten: its reader gave up.
         """
         if self._process != os.getpid():
             self._reset()
