@@ -73,8 +73,8 @@ def _opened(file: Any) -> tuple[None, str, Source]:
 
         if getattr(file, "compression", None) is not None:
             raise InputError(f"{path}: a compressed file; decompress it, ranges of it are needed")
-        name = str(getattr(file, "full_name", path))
-        return None, name, RemoteSource(FsspecFile(fs, path, name))
+        full_name = str(getattr(file, "full_name", path))
+        return None, full_name, RemoteSource(FsspecFile(fs, path, full_name))
     if not (hasattr(file, "read") and hasattr(file, "seek")):
         raise InputError(
             f"{type(file).__name__} is no place of a container; "

@@ -63,6 +63,7 @@ class Source(Protocol):
 
     def prefetch(self, ranges: Iterable[Range]) -> None:
         """Begin to fetch ranges that will be read soon, each as it stands here; waits for none."""
+        return None
 
     def changed(self) -> bool:
         """Whether the file is known to be another one than was opened."""

@@ -77,7 +77,9 @@ class StoredArray:
         self.nbytes_stored = sum(member.size for member in chunks.values())
         self.masks: StoredArray | None = None
         sharding = metadata.sharding
-        self._shards = sharding and ShardPlaces(sharding, self.shape, chunks, source)
+        self._shards = (
+            None if sharding is None else ShardPlaces(sharding, self.shape, chunks, source)
+        )
         self._ahead = Ahead()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
