@@ -21,6 +21,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
+from fhash_formats.container import Place
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
 
@@ -36,9 +37,9 @@ def ssim_budget(config: EncodeConfig) -> int:
 
 
 def diff(
-    source: Source, path: str | Path, *, variable: str | None = None, progress: Progress = silent
+    source: Source, path: Place, *, variable: str | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Decode every step of the container `path` and measure it against the data.
+    """Decode every step of the container `path`, or at a URL, and measure it against the data.
 
     variable: which one of the container, where it has several.
 

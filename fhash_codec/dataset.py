@@ -4,30 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
-from fhash_formats.container import Container
+from fhash_formats.container import Container, Place, StorageOptions
 
 __all__ = ["Dataset", "open"]
 
 
 def open(
-    path: str | Path, *, variable: str | None = None, fill: int | float | None = None
+    path: Place,
+    *,
+    variable: str | None = None,
+    fill: int | float | None = None,
+    storage_options: StorageOptions = None,
 ) -> Volume | Dataset:
-    """Open a `.fhz` file for reading; nothing is decoded yet.
+    """Open a `.fhz` file for reading, a URL or an open binary file; nothing is decoded yet.
 
     variable: name of the variable to open. None for the only one of a file, or for all of them.
     fill: what `volume[...]` gives at vertices without a value, see `Volume`.
+    storage_options: options of a URL's file system in fsspec.
 
-    Returns the Volume of one variable, or the Dataset of a file of several. Raises
-    MissingInputError, DamagedFileError or UnsupportedFileError, and InputError where the file does
-    not hold the variable.
+    Returns the Volume of one variable, or the Dataset of a file of several. Raises what
+    `Container.open` raises, and InputError where the file does not hold the variable.
     """
-    container = Container.open(path)
+    container = Container.open(path, storage_options=storage_options)
     try:
         if container.variables and variable is None:
             return Dataset(container, fill=fill)
@@ -44,7 +47,7 @@ class Dataset(Mapping[str, Volume]):
     closing it does nothing.
 
     Attributes:
-        path: of the file.
+        path: of the file; a URL is text.
         container: the file, with the containers of its variables.
         attributes: of the whole, JSON values.
     """
@@ -55,7 +58,7 @@ class Dataset(Mapping[str, Volume]):
         fill: of the volumes, see `Volume`.
         """
         self.container = container
-        self.path = Path(container.path)
+        self.path = container.path
         self.attributes: Mapping[str, Any] = container.attributes
         self._fill = fill
         self._volumes: dict[str, Volume] = {}
@@ -97,8 +100,8 @@ class Dataset(Mapping[str, Volume]):
     ) -> None:
         self.close()
 
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(open, fill=self._fill), (self.path.absolute(),)
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
+        return partial(open, fill=self._fill), (self.container.reopening(),)
 
     def __repr__(self) -> str:
         return f"<fhash Dataset {', '.join(self)[:200]} of {self.path}>"

@@ -12,7 +12,6 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from itertools import zip_longest
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -327,7 +326,7 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
-def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -> dict[str, Any]:
+def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> dict[str, Any]:
     """The header of a container, and what follows from it; see `Volume.info`."""
     header = container.header
     raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize

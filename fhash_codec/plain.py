@@ -66,7 +66,7 @@ def export_plain(
     """
     path = Path(os.path.normpath(path))
     check_name(path)
-    check_output(path, force, sources=[Path(source)])
+    check_output(path, force, sources=[source])
     with open_volume(source) as volume, ContainerWriter(path, force=force) as writer:
         export = _Export(volume, writer, progress)
         if volume.profile == "paper":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -31,7 +30,7 @@ from fhash_codec.sampling import interpolable
 from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
-from fhash_formats.container import Container
+from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
@@ -43,17 +42,22 @@ CLIPPED_SINCE = (1, 2)
 
 
 def open(
-    path: str | Path, *, variable: str | None = None, fill: int | float | None = None
+    path: Place,
+    *,
+    variable: str | None = None,
+    fill: int | float | None = None,
+    storage_options: StorageOptions = None,
 ) -> Volume:
-    """Open one variable of a `.fhz` file for reading; nothing is decoded yet.
+    """Open one variable of a `.fhz` file for reading, a URL or an open binary file.
 
     variable: its name; None for the only one of the file.
     fill: what `volume[...]` gives at vertices without a value, see `Volume`.
+    storage_options: options of a URL's file system in fsspec.
 
-    Raises MissingInputError, DamagedFileError or UnsupportedFileError, and InputError where the
-    file does not hold the variable, or holds several and none is named.
+    Nothing is decoded yet. Raises what `Container.open` raises, and InputError where the file does
+    not hold the variable, or holds several and none is named.
     """
-    container = Container.open(path)
+    container = Container.open(path, storage_options=storage_options)
     try:
         return Volume(container.select(variable), fill=fill)
     except BaseException:
@@ -80,7 +84,7 @@ class Volume(Card):
         name, units, attrs: of the variable.
         coords: a Coordinate for each of "t", "z", "y", "x".
         box: the feature bounding box, in vertices of the domain.
-        path: of the file.
+        path: of the file; a URL is text.
         variable: name among several variables of the file; None where it is the only one.
         info: everything the file says of itself, as JSON values.
         config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
@@ -98,7 +102,7 @@ class Volume(Card):
         """
         header = container.header
         self.container = container
-        self.path = Path(container.path)
+        self.path = container.path
         self.variable = container.variable
         self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
         self.value_type = ValueType.of(container)
@@ -391,9 +395,9 @@ class Volume(Card):
     ) -> None:
         self.close()
 
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
         again = partial(open, variable=self.variable, fill=self._asked_fill)
-        return again, (self.path.absolute(),)
+        return again, (self.container.reopening(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))

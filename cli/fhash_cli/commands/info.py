@@ -99,7 +99,10 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
 def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
     from fhash_formats.container import is_container
+    from fhash_formats.support.locations import is_url
 
+    if is_url(path):
+        return True
     place = Path(path)
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
 

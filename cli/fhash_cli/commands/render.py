@@ -26,6 +26,7 @@ from fhash_cli.options import (
 from fhash_cli.output import Progress, emit, extent, number, table
 from fhash_cli.scene_options import SceneOptions, scene_options
 from fhash_formats.errors import InputError
+from fhash_formats.support.locations import file_name
 
 if TYPE_CHECKING:
     from fhash_codec.rendering.picture.image import Image
@@ -78,7 +79,7 @@ def command(
     from fhash_codec.times import time_text
     from fhash_codec.volume import open as open_volume
 
-    path = Path(output) if output is not None else Path(Path(run).stem + ".png")
+    path = Path(output) if output is not None else Path(Path(file_name(run)).stem + ".png")
     with open_volume(run, variable=variable) as volume, Progress(quiet=quiet) as progress:
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):

@@ -11,7 +11,11 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
+    ranges           ranges of bytes that are asked for together
     source           bytes at offsets of a file
+    remote           bytes of a file elsewhere, in few requests
+    fsspec_file      requests to any file system of fsspec
+    location         paths, URLs and open files -> sources
     layout           bytes of the ZIP
     zip_checked      safe opening of the ZIP
     strict_json      metadata documents as JSON
@@ -27,6 +31,7 @@ The tests prove that the zarr library reads every array equal.
     coding           values of a chunk <-> bytes
     chunks           arrays cut into chunks
     sharding         many chunks in one member
+    shard_places     where they lie in it
     cache            decoded chunks
     stored           StoredArray: one array, read region by region
     reader           Container: a file for reading
@@ -37,6 +42,7 @@ The tests prove that the zarr library reads every array equal.
 
 from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
+from fhash_formats.container.location import Location, Place, StorageOptions
 from fhash_formats.container.reader import Container, is_container
 from fhash_formats.container.several import SeveralWriter, VariableWriter
 from fhash_formats.container.sharding import shard_order, shard_shape
@@ -50,7 +56,10 @@ __all__ = [
     "SOURCE",
     "Container",
     "ContainerWriter",
+    "Location",
+    "Place",
     "SeveralWriter",
+    "StorageOptions",
     "StoredArray",
     "VariableWriter",
     "coordinate_features",

@@ -13,7 +13,7 @@ from math import prod
 from typing import Any
 
 from fhash_formats.container import strict_json
-from fhash_formats.container.apart import inline
+from fhash_formats.container.apart import HEAD_ARRAY, inline
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.header import validate_header
@@ -65,6 +65,13 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     """
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
+    if source.gap:
+        heads = (f"{HEAD_ARRAY}/c/0",)
+        source.prefetch(
+            (member.offset, member.header_size + member.size)
+            for name, member in members.items()
+            if name.rpartition("/")[2] == DOCUMENT or name in heads
+        )
     groups: dict[str, Mapping[str, Any]] = {}
     group_documents: dict[str, Mapping[str, Any]] = {}
     documents: dict[str, Mapping[str, Any]] = {}

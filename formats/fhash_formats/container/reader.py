@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from hashlib import sha256
 from itertools import chain
 from math import prod
@@ -20,6 +21,7 @@ from fhash_formats.container.expected_arrays import check_arrays, check_key_fram
 from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
 from fhash_formats.container.layout import Member, directory_entry
+from fhash_formats.container.location import Location, Place, StorageOptions, located
 from fhash_formats.container.mask_array import MaskArray
 from fhash_formats.container.source import CountedSource, FileSource, Source, damage_named
 from fhash_formats.container.stored import StoredArray
@@ -58,7 +60,8 @@ class Container:
     """A container for reading; a context manager, safe for several threads.
 
     Attributes:
-        path: as given.
+        path: as given; text of a URL; name of an open file.
+        location: from which it can be opened again; None for an open file.
         size: bytes of the file.
         digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
             everything, so that files of different content have different digests.
@@ -71,7 +74,8 @@ class Container:
         variable: name of the variable where the container is one of those; else None.
     """
 
-    path: Path
+    path: Path | str
+    location: Location | None = None
     size: int
     digest: str
     header: dict[str, Any]
@@ -81,16 +85,16 @@ class Container:
     variables: Mapping[str, VariableContainer] = MappingProxyType({})
     variable: str | None = None
 
-    def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
+    def __init__(self, path: Path | str, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Read a container from an open source, which `close` closes; `open` is for files.
 
         Raises DamagedFileError, or UnsupportedFileError for a newer format.
         """
-        self.path, self.size = path, source.size
+        self.path, self.size, self.location = path, source.size, None
         self._source = source = CountedSource(source)
         self._cache = ChunkCache(cache_bytes)
         try:
-            with damage_named(path):
+            with damage_named(path, source):
                 members = read_members(source)
                 signature = find_signature(source)
                 assert signature is not None
@@ -114,16 +118,52 @@ class Container:
             raise
 
     @classmethod
-    def open(cls, path: str | Path, *, cache_bytes: int = CACHE_BYTES) -> Container:
-        """Open a file; `cache_bytes` bounds the decoded chunks that are kept.
+    def open(
+        cls,
+        place: Place,
+        *,
+        cache_bytes: int = CACHE_BYTES,
+        storage_options: StorageOptions = None,
+    ) -> Container:
+        """Open a path, a URL, a binary file that is open, or a `Location`.
+
+        Args:
+            place: an open file is neither closed here nor may it change.
+            cache_bytes: most bytes of decoded chunks that are kept.
+            storage_options: options of a URL's file system in fsspec.
 
         Raises:
             MissingInputError: for no such file.
-            InputError: for a folder, or a file without permission.
+            MissingDependencyError: for a URL whose package is not installed.
+            InputError: for a folder, a file without permission, a server that does not answer, or
+                a location whose file is another one now.
             DamagedFileError: for a file that is no container, or a damaged one.
             UnsupportedFileError: for a newer format.
         """
-        return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
+        location, name, source = located(place, storage_options)
+        container = cls(name, source, cache_bytes=cache_bytes)
+        container.location = location
+        if isinstance(place, Location) and place.digest not in (None, container.digest):
+            container.close()
+            raise InputError(f"{name}: another file is there than was opened before; open it again")
+        return container
+
+    def reopening(self) -> Location:
+        """The location, digest included, to open this file again, in another process as well.
+
+        Raises InputError for an open file.
+        """
+        if self.location is None:
+            raise InputError(
+                f"{self.path}: a volume of an open file cannot be opened again elsewhere;"
+                " open it by its path or URL"
+            )
+        place = self.location.place
+        return replace(
+            self.location,
+            place=place.absolute() if isinstance(place, Path) else place,
+            digest=self.digest,
+        )
 
     def _stored_arrays(self, tree: Hierarchy) -> dict[str, StoredArray]:
         """The arrays by path."""
@@ -142,7 +182,7 @@ class Container:
         found = {}
         for variable in tree.variables:
             own = {name: tree.arrays[place] for name, place in variable.places.items()}
-            with damage_named(self.path), variable_named(variable.name):
+            with damage_named(self.path, self._source), variable_named(variable.name):
                 check_arrays(variable.header, own)
             found[variable.name] = VariableContainer(self, variable, members)
         return found
@@ -186,7 +226,7 @@ class Container:
             if progress is not None:
                 progress(done, total)
 
-        with damage_named(self.path):
+        with damage_named(self.path, self._source):
             for array in self.arrays.values():
                 array.verify(count)
         return len(self.arrays)
@@ -197,7 +237,7 @@ class Container:
         The array is checked by the checksums of its members, and no chunk is decoded. The chunks
         become read-only. Raises DamagedFileError for a member that is not what was written.
         """
-        with damage_named(self.path):
+        with damage_named(self.path, self._source):
             for member in self.arrays[name].chunks.values():
                 check_member(self._source, member)
         for index, values in chunks.items():
@@ -283,6 +323,10 @@ class VariableContainer(Container):
         self._closes_file = True
         return self
 
+    def reopening(self) -> Location:
+        """The location of the file that holds the variable, with the digest of the whole."""
+        return self._file.reopening()
+
     def _usual_name(self, array: StoredArray, stored: str) -> str:
         return array.name
 
@@ -308,5 +352,5 @@ def _check_key_frames(container: Container) -> None:
     """Raise DamagedFileError for key frames that do not fit the header."""
     if "key_frames" in container.arrays:
         key_frames = container.arrays["key_frames"].read()
-        with damage_named(container.path):
+        with damage_named(container.path, container._source):
             check_key_frames(container.header, key_frames)
