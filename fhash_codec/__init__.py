@@ -39,16 +39,20 @@ if TYPE_CHECKING:
     from fhash_codec.appending.writer import Writer
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.dataset import Dataset, open
+    from fhash_codec.dataset_encoding import encode_dataset
     from fhash_codec.encoding import encode
     from fhash_codec.plain import export_plain
     from fhash_codec.rendering import render
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
-    from fhash_codec.volume import Volume, open
+    from fhash_codec.volume import Volume
+    from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
 
 _MODULES = {
+    "Dataset": "dataset",
     "EncodeConfig": "config",
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
@@ -57,15 +61,18 @@ _MODULES = {
     "append": "appending.append",
     "diff": "comparison",
     "encode": "encoding",
+    "encode_dataset": "dataset_encoding",
     "export_plain": "plain",
     "merge": "appending.merging",
-    "open": "volume",
+    "open": "dataset",
     "render": "rendering",
+    "zarr_store": "zarr_view.store",
 }
 """Public names that load on first use, with their modules in this package."""
 
 __all__ = [
     "DamagedFileError",
+    "Dataset",
     "EncodeConfig",
     "FhashError",
     "FhashWarning",
@@ -86,10 +93,12 @@ __all__ = [
     "append",
     "diff",
     "encode",
+    "encode_dataset",
     "export_plain",
     "merge",
     "open",
     "render",
+    "zarr_store",
 ]
 
 

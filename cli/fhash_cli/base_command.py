@@ -35,6 +35,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "march", "device", "step", "threshold", "samples-per-pass", "skipping",
     ),
     "Comparison": ("peer", "part", "seconds", "turns", "speed"),
+    "Address": ("host", "port"),
     "Cases": ("all", "case", "group"),
     "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
     "Run": (

@@ -29,6 +29,7 @@ COMMANDS = {
     "decode": "rebuild a region of RUN.fhz, at any time",
     "render": "draw a picture of RUN.fhz",
     "info": "say what RUN.fhz holds and how good it is",
+    "serve": "give decoded values of RUN.fhz over HTTP, as Zarr, to any client",
     "export": "write the model of RUN.fhz in plain numbers, for any Zarr library",
     "verify": "read and check every part of RUN.fhz",
     "diff": "measure RUN.fhz against the data it was made from",

@@ -14,7 +14,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.parts import COLUMNS, ERRORS, PART, comparisons_of
+from fhash_codec.appending.parts import COLUMNS, ERRORS, PART, WHOLE, comparisons_of
 from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.encoding import check_name
@@ -23,11 +23,12 @@ from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparer
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
-from fhash_formats.container import Container, ContainerWriter, coordinate_features
+from fhash_formats.container import SOURCE, Container, ContainerWriter, coordinate_features
 from fhash_formats.container.apart import TABLE
 from fhash_formats.container.record import Record
 from fhash_formats.container.source import damage_named
 from fhash_formats.container.table_parts import TableParts
+from fhash_formats.container.variables import is_several
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.atomic import check_output
@@ -35,7 +36,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["merge"]
 
-OWN = ("coordinates", "domain", "quality", "required_features", PART)
+OWN = ("coordinates", "domain", "quality", "required_features", SOURCE, PART)
 """Keys of a part's header that differ from part to part."""
 OWN_MODEL = ("levels", "parameters", "gains")
 """Keys of its model that do."""
@@ -85,7 +86,7 @@ class _Piece:
     def __init__(self, container: Container) -> None:
         self.container, self.path = container, container.path
         header = container.header
-        if PART not in header:
+        if is_several(header) or PART not in header:
             raise InputError(
                 f"{self.path} is no part of a series but a whole file; parts are made by "
                 "fhash encode --part I/N"
@@ -229,6 +230,9 @@ class _Whole:
             value_range=ValueRange(low, high), mean=low, finite_count=0, missing=self._missing()
         )
         series = _Positions(self.shape, self._coords())
+        for name, array in first.container.arrays.items():
+            if name.startswith(WHOLE):
+                writer.add_whole(name.removeprefix(WHOLE), array.read())
         described = write_series(writer, series, scan, range(self.shape[0]), brief=True)
         table = TableParts(
             shape=(self.shape[0], *first.table.shape[1:]),
@@ -240,6 +244,8 @@ class _Whole:
         progress("merging", 0, 1, "")
         table.write(writer)
         progress("merging", 1, 1, "")
+        if SOURCE in first.container.header[PART]:
+            header[SOURCE] = first.container.header[PART][SOURCE]
         header["required_features"] = table.features + coordinate_features(described["coordinates"])
         header["coordinates"] = described["coordinates"]
         header["domain"] = {"shape": list(self.shape)}

@@ -33,10 +33,11 @@ from fhash_codec.measure.metrics import Comparison
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.sums import ErrorSums
 from fhash_codec.progress import Progress, silent
+from fhash_codec.provenance import source_parts
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.container import ContainerWriter, coordinate_features
+from fhash_formats.container import SOURCE, ContainerWriter, coordinate_features
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series, StepsSeries
@@ -49,6 +50,8 @@ PART = "part"
 """Key of a part's header: which part it is, of how many steps of what."""
 ERRORS = "steps/errors"
 """Array of a part: sums of the errors of each step, of which the figures of the whole follow."""
+WHOLE = "whole/"
+"""Prefix of arrays of the first part that belong to the whole series."""
 COLUMNS = 10
 """Numbers that it has for each step, see `_row`."""
 
@@ -179,6 +182,7 @@ class _Job:
         """Write the part and measure it; its quality."""
         steps = StepsSeries(self.series, self.steps)
         everything = any(isinstance(one, Everything) for one in self.selection.features)
+        source = self._write_source(writer)
         described = write_series(
             writer, steps, self._scan(), range(len(self.steps)), brief=True, everything=everything
         )
@@ -218,9 +222,19 @@ class _Job:
             "size": self.table.outcome.size,
             "nonzero": self.table.outcome.nonzero,
             "ssim_steps": whole,
+            **source,
         }
         writer.commit(header)
         return quality
+
+    def _write_source(self, writer: ContainerWriter) -> dict[str, Any]:
+        """Write what belongs to the whole series in its source, in the first part alone."""
+        if self.part.number != 1:
+            return {}
+        whole = describe_source(self.series, self.selection.scanned.value_range, self.config)
+        for name, array in source_parts(self.series, self.series.coords, {})[1].items():
+            writer.add_whole(f"{WHOLE}{name}", array)
+        return {SOURCE: whole[SOURCE]} if SOURCE in whole else {}
 
     def _scan(self) -> Scan:
         """The scan of the whole series, with the missing values of the part's steps."""

@@ -18,10 +18,11 @@ from fhash_codec.compact.tiles.coding import WEIGHT, Coding
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import Container, StoredArray
+from fhash_formats.container import SOURCE, Container, StoredArray
 from fhash_formats.container.apart import HEAD_ARRAY, TABLE
 from fhash_formats.container.header import COMPACT, PLAIN_FEATURE
 from fhash_formats.container.source import damage_named
+from fhash_formats.container.variables import is_several
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.transform.tile.settings import TileSettings
@@ -41,6 +42,8 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
     state = os.stat(path) if path.exists() else None
     with Container.open(path) as container:
         assert state is not None
+        if is_several(container.header):
+            raise InputError(f"{path} has several variables; only a file of one can grow")
         header = full_header(container.header)
         settings = _settings(container, header)
         kept = _kept_steps(container, steps)
@@ -139,11 +142,23 @@ def _lasting(header: Mapping[str, Any]) -> dict[str, Any]:
     config = {**header["config"], "max_error": bound_of_file(header), "max_error_rel": None}
     return {
         **header,
+        **({SOURCE: _lasting_source(header[SOURCE])} if SOURCE in header else {}),
         "encoder": encoder,
         "model": {**model, "gains": []},
         "config": config,
         "history": header["history"],
     }
+
+
+def _lasting_source(source: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry of the source without what is true of the first steps alone."""
+    lasting = {name: value for name, value in source.items() if name not in ("digest", "date")}
+    # Later times may need every bit of float64.
+    lasting["variables"] = [
+        {key: value for key, value in one.items() if key != "dtype" or one.get("axis") != "t"}
+        for one in source.get("variables", [])
+    ]
+    return lasting
 
 
 def _figures(path: Path, header: Mapping[str, Any], value_range: ValueRange, kept: int) -> Figures:
@@ -167,6 +182,12 @@ def _keep(growing: GrowingFile, container: Container, kept: int, value_range: Va
                 "arrays cannot grow"
             )
         growing.carry(array)
+    for one in container.header.get(SOURCE, {}).get("variables", []):
+        if "axis" not in one and container.coordinate("time").name in one.get("dimensions", []):
+            raise InputError(
+                f"{container.path}: {one['name']} of its source has a value for each step; a file "
+                "with such arrays cannot grow"
+            )
     table = container.arrays[TABLE]
     times = container.coordinate("time").values
     layer = table.chunk_shape[0]

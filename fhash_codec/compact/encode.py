@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -90,10 +91,15 @@ def encode_compact(
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
+        parts = table.parts
+        if writer.one_of_several:
+            # A library that shows the array decodes it by what the array itself says.
+            parts = replace(parts, apart=False)
         with stage("writing", "tiles"):
-            table.parts.write(writer)
+            parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         own = table_header(selection, table, config, seconds)
+        own["required_features"] = list(parts.features)
         own["required_features"] += coordinate_features(described["coordinates"])
         header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
@@ -123,7 +129,6 @@ def table_header(
             "seed": config.seed,
             **({} if seconds is None else {"seconds": seconds}),
         },
-        "required_features": table.parts.features,
         "background": extent.background,
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],

@@ -33,6 +33,7 @@ from fhash_codec.cost.results import (
 from fhash_codec.cost.results import Stage as StageOfCost
 from fhash_codec.selftest.case import Finding
 from fhash_codec.selftest.results import CaseResult, Summary
+from fhash_codec.zarr_view.server import Server
 
 Fhash = Callable[..., Result]
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "json.md"
@@ -132,6 +133,11 @@ def test_the_document_names_every_command() -> None:
 )
 def test_types_are_told_apart(value: Any, kind: str, fit: bool) -> None:
     assert fits(value, kind) is fit
+
+
+def test_serve(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Server, "serve_forever", lambda self: None)
+    check("serve", parsed(fhash("serve", run, "--port", 0, "--json")))
 
 
 def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:

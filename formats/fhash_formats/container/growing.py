@@ -187,7 +187,8 @@ class GrowingContainer(ContainerWriter):
             super().rewind(mark)
             return
         del self._members[mark.members :]
-        self._arrays, self._position = set(mark.arrays), mark.position
+        self._arrays = {name: self._arrays[name] for name in self._arrays if name in mark.arrays}
+        self._position = mark.position
 
     def _write(self, member: Member, parts: Sequence[bytes]) -> None:
         self._wake()

@@ -1,0 +1,227 @@
+"""A view over HTTP: every key of the hierarchy is a file to GET, with ranges, ETag and CORS."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import socketserver
+import sys
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import unquote
+
+from fhash_codec.zarr_view.ranges import UNSATISFIABLE, byte_range, names_tag
+from fhash_codec.zarr_view.view import ZarrView
+from fhash_formats.errors import FhashError, InputError
+
+__all__ = ["Server"]
+
+IDLE_SECONDS = 60
+"""Seconds after which a connection without a request is closed."""
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""Names of this machine that no other reaches it by."""
+CORS = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
+}
+"""Headers of every answer, so that pages of other origins may read it."""
+PREFLIGHT = {
+    "Access-Control-Allow-Methods": "GET, HEAD, OPTIONS",
+    "Access-Control-Allow-Headers": "*, Range, If-Match, If-None-Match, If-Range, Cache-Control",
+    "Access-Control-Max-Age": "86400",
+    "Access-Control-Allow-Private-Network": "true",
+}
+"""Headers of the answer to a browser that asks what another origin may do.
+
+Without the last one Chrome keeps pages of the Internet from servers of the own machine.
+"""
+NEWS = Callable[[str], None]
+"""Is told a line for each answer that is an error of the server."""
+
+
+class Server(ThreadingHTTPServer):
+    """A server of one view; several clients are served at once.
+
+    Attributes:
+        view: what is served.
+        url: where, with a slash at the end.
+        is_local: whether no other machine reaches it.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 64
+    # On Windows the option would let two servers have one port.
+    allow_reuse_address = os.name == "posix"
+
+    def __init__(
+        self, view: ZarrView, *, host: str = "127.0.0.1", port: int = 0, news: NEWS = print
+    ) -> None:
+        """Listen at a port, 0 for any that is free; `serve_forever` answers.
+
+        Raises InputError where the port is taken or the host is no address of this machine.
+        """
+        self.view, self.news = view, news
+        try:
+            family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            self.address_family = family
+            super().__init__(address[:2], _Handler)  # type: ignore[arg-type]
+        except (OSError, UnicodeError, OverflowError) as error:
+            raise InputError(_refused(host, port, error)) from error
+        self.is_local = host in LOOPBACK
+        name = f"[{host}]" if ":" in host else host
+        self.url = f"http://{name}:{self.server_address[1]}/"
+
+    def server_bind(self) -> None:
+        """Take the address; the base class would look up the host's full name, too, and wait."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = map(str, self.server_address[:2])  # type: ignore[assignment]
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Tell what went wrong beyond a request; a client that goes away is no error."""
+        error = sys.exception()
+        if not isinstance(error, ConnectionError | TimeoutError):
+            self.news(f"a connection failed: {type(error).__name__}: {error}")
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """The answers to one client."""
+
+    server: Server
+    protocol_version = "HTTP/1.1"
+    server_version = "fhash"
+    sys_version = ""
+    timeout = IDLE_SECONDS
+    # Header and body go out together; the last packet does not wait for an acknowledgement.
+    wbufsize = -1
+    disable_nagle_algorithm = True
+
+    def do_GET(self) -> None:
+        """Answer with the bytes of a key."""
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        """Answer with the headers of a key; nothing is decoded."""
+        self._answer(body=False)
+
+    def do_OPTIONS(self) -> None:
+        """Answer a browser that asks what pages of other origins may do."""
+        self._send(HTTPStatus.NO_CONTENT, headers={**PREFLIGHT, "Allow": "GET, HEAD, OPTIONS"})
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of single requests."""
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuse a request that is no HTTP, or of another method, with one line."""
+        self.close_connection = True
+        status = HTTPStatus(code)
+        if status == HTTPStatus.NOT_IMPLEMENTED:
+            status, message = HTTPStatus.METHOD_NOT_ALLOWED, "GET, HEAD and OPTIONS are served"
+        self._tell(status, message or status.phrase, {"Allow": "GET, HEAD, OPTIONS"})
+
+    def _answer(self, *, body: bool) -> None:
+        view = self.server.view
+        key = unquote(self.path.partition("?")[0]).removeprefix("/")
+        size = view.size(key)
+        if size is None:
+            self._tell(HTTPStatus.NOT_FOUND, f"no such key; open {self.server.url} as Zarr v3")
+            return
+        tag = f'"{_key_tag(view.tag, key)}"'
+        kind = "application/json" if view.is_document(key) else "application/octet-stream"
+        headers = {
+            "ETag": tag,
+            "Accept-Ranges": "bytes",
+            "Cache-Control": "no-cache",  # kept, but asked for again: another file may be served
+            "Content-Type": kind,
+        }
+        if names_tag(self.headers.get("If-None-Match"), tag):
+            self._send(HTTPStatus.NOT_MODIFIED, headers=headers)
+            return
+        condition = self.headers.get("If-Range")
+        asked = self.headers.get("Range") if condition in (None, tag) else None
+        span = byte_range(asked, size)
+        if span == UNSATISFIABLE:
+            self._tell(
+                HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
+                f"the key has {size} bytes",
+                {"Content-Range": f"bytes */{size}"},
+            )
+            return
+        first, end = (0, size) if span is None else span
+        status = HTTPStatus.OK
+        if span is not None:
+            status = HTTPStatus.PARTIAL_CONTENT
+            headers["Content-Range"] = f"bytes {first}-{end - 1}/{size}"
+        if not body:
+            self._send(status, headers=headers, length=end - first)
+            return
+        data = self._bytes(key)
+        if data is not None:
+            self._send(status, memoryview(data)[first:end], headers=headers)
+
+    def _bytes(self, key: str) -> bytes | None:
+        """The bytes of a key; None where they could not be had, which the client was told."""
+        try:
+            data = self.server.view.get(key)
+            assert data is not None, "a key that has a size has bytes"
+            return data
+        except FhashError as error:
+            line = str(error)
+        except MemoryError:
+            line = "out of memory"
+        except Exception as error:
+            line = f"unexpected {type(error).__name__}: {error}"
+        line = " ".join(line.split())
+        self.server.news(f"{key}: {line}")
+        self._tell(HTTPStatus.INTERNAL_SERVER_ERROR, line)
+        return None
+
+    def _tell(self, status: HTTPStatus, line: str, headers: dict[str, str] | None = None) -> None:
+        """Answer with one line of text."""
+        text = f"{line}\n".encode()
+        told = {
+            "Content-Type": "text/plain; charset=utf-8",
+            "Cache-Control": "no-store",
+            **(headers or {}),
+        }
+        if self.command == "HEAD":
+            self._send(status, headers=told, length=len(text))
+        else:
+            self._send(status, text, headers=told)
+
+    def _send(
+        self,
+        status: HTTPStatus,
+        data: bytes | memoryview = b"",
+        *,
+        headers: dict[str, str],
+        length: int | None = None,
+    ) -> None:
+        """Send an answer. length: bytes that a body would have, where none is sent."""
+        self.send_response(status)
+        for name, value in {**CORS, **headers}.items():
+            self.send_header(name, value)
+        if status not in (HTTPStatus.NO_CONTENT, HTTPStatus.NOT_MODIFIED):
+            self.send_header("Content-Length", str(len(data) if length is None else length))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def _key_tag(tag: str, key: str) -> str:
+    """The entity tag of a key, without quotes."""
+    return hashlib.sha256(f"{tag}/{key}".encode()).hexdigest()[:32]
+
+
+def _refused(host: str, port: int, error: Exception) -> str:
+    """Says why nothing can listen there, and what to do."""
+    if isinstance(error, socket.gaierror | UnicodeError):
+        return f"host '{host}' is not known; 127.0.0.1 is this machine alone, 0.0.0.0 every address"
+    if isinstance(error, OverflowError):
+        return f"port {port} is outside 0 to 65535"
+    reason = getattr(error, "strerror", None) or str(error)
+    return f"{host}:{port} cannot be served: {reason}; give another --port, 0 for any that is free"

@@ -1,0 +1,277 @@
+"""`ZarrView`: decoded values as the keys and bytes of a Zarr v3 hierarchy, read-only.
+
+    zarr.json                        all metadata, consolidated
+    density/zarr.json                the values over the whole domain
+    density/c/0/0/0/0                a chunk of them: little-endian values, no compression
+    time/zarr.json, time/c/0         positions along each axis
+    lod/zarr.json                    the levels of detail as a multiscale image (OME-Zarr 0.5)
+    lod/0/density/..., lod/0/z/...   the values and positions once more
+    lod/1/...                        every 2nd vertex of a low-passed lattice, with its positions
+    lod/2/...                        every 4th, and so on
+
+A chunk without any value is left out, as Zarr allows it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fhash_codec.dataset import open as open_file
+from fhash_codec.volume import Volume
+from fhash_codec.zarr_view.arrays import ViewArray, chunk_index, chunk_key
+from fhash_codec.zarr_view.chunking import view_chunks
+from fhash_codec.zarr_view.levels import Level, level_count
+from fhash_codec.zarr_view.multiscales import multiscale
+from fhash_formats.series import AXES
+from fhash_formats.support.attributes import json_attributes
+from fhash_formats.writers.common.labels import (
+    DROPPED,
+    coordinate_attributes,
+    safe_name,
+    variable_attributes,
+)
+from fhash_formats.writers.common.region import Region
+
+__all__ = ["DOCUMENT", "LEVELS", "ZarrView", "opened_view"]
+
+DOCUMENT = "zarr.json"
+"""Last part of the key of a metadata document."""
+LEVELS = "lod"
+"""Name of the group that holds the levels of detail."""
+POSITIONS_CHUNK = 1 << 17
+"""Positions of a coordinate in one chunk."""
+
+
+def opened_view(path: str | Path, **options: Any) -> tuple[Any, ZarrView]:
+    """A file, opened by `fhash_codec.open` with its options, and the view of it."""
+    opened: Any = open_file(path, **options)
+    try:
+        return opened, ZarrView(opened if isinstance(opened, Mapping) else {opened.name: opened})
+    except BaseException:
+        opened.close()
+        raise
+
+
+class ZarrView:
+    """A Zarr v3 hierarchy of the decoded values of volumes. Safe for several threads.
+
+    Nothing is decoded before a chunk is asked for. The volumes belong to the caller.
+
+    Attributes:
+        volumes: the volumes by name.
+        names: name of the array of each volume, by the volume's name.
+        arrays: the arrays by path, such as "density", "time" and "lod/1/density".
+        tag: hexadecimal text that differs where any bytes of the hierarchy may.
+    """
+
+    def __init__(self, volumes: Mapping[str, Volume]) -> None:
+        self.volumes = volumes
+        self.arrays: dict[str, ViewArray] = {}
+        self.names: dict[str, str] = {}
+        groups: dict[str, dict[str, Any]] = {"": _global_attributes(volumes), LEVELS: {}}
+        scales = []
+        used = {"": {LEVELS, DOCUMENT}}
+        for key, volume in volumes.items():
+            self.names[key] = _unique(safe_name(volume.name or key), used[""])
+        for key, volume in volumes.items():
+            name = self.names[key]
+            levels = [Level(volume, lod) for lod in range(level_count(volume))]
+            for level, group in [(levels[0], ""), *((e, f"{LEVELS}/{e.lod}") for e in levels)]:
+                groups.setdefault(group, {})
+                taken = used.setdefault(group, {DOCUMENT, *self.names.values()})
+                dimensions = self._add_coordinates(group, volume, level, taken)
+                self.arrays[_join(group, name)] = _values(volume, level, dimensions)
+            paths = {f"{level.lod}/{name}": level for level in levels}
+            scales.append(multiscale(name, volume.coords, self.arrays[name].dimension_names, paths))
+        groups[LEVELS]["ome"] = {"version": "0.5", "multiscales": scales}
+        self._documents = self._write_documents(groups)
+        self.tag = self._fingerprint()
+
+    # -- what is there --
+
+    def get(self, key: str) -> bytes | None:
+        """The bytes of a key, decoded where they are values; None where there is no such key.
+
+        Raises DamagedFileError where a tile is damaged, and InputError once a volume is closed.
+        """
+        document = self._documents.get(key)
+        if document is not None:
+            return document
+        found = self._chunk(key)
+        return None if found is None else found[0].chunk(found[1])
+
+    def size(self, key: str) -> int | None:
+        """The number of bytes of a key, without decoding any; None where there is no such key."""
+        document = self._documents.get(key)
+        if document is not None:
+            return len(document)
+        found = self._chunk(key)
+        return None if found is None else found[0].chunk_bytes
+
+    def is_document(self, key: str) -> bool:
+        """Whether a key is a metadata document, whose bytes are at hand."""
+        return key in self._documents
+
+    def listing(self, prefix: str = "") -> Iterator[str]:
+        """Yield every key that begins with a prefix: the documents, then chunk after chunk."""
+        yield from (key for key in self._documents if key.startswith(prefix))
+        for path, array in self.arrays.items():
+            place = f"{path}/c/"
+            if place.startswith(prefix) or prefix.startswith(place):
+                keys = (f"{path}/{chunk_key(index)}" for index in array.indices())
+                yield from (key for key in keys if key.startswith(prefix))
+
+    def children(self, path: str) -> Iterator[str]:
+        """Yield the names right below a path, each once: documents, arrays, groups, `c`."""
+        below = f"{path}/" if path else ""
+        names = {
+            key[len(below) :].partition("/")[0] for key in self._documents if key.startswith(below)
+        }
+        yield from sorted(names)
+        if path in self.arrays:
+            yield "c"
+        elif not names:
+            seen = set()
+            for key in self.listing(below):
+                name = key[len(below) :].partition("/")[0]
+                if name not in seen:
+                    seen.add(name)
+                    yield name
+
+    def _chunk(self, key: str) -> tuple[ViewArray, tuple[int, ...]] | None:
+        """The array and the index of a chunk's key; None for other keys and absent chunks."""
+        path, _, end = key.rpartition("/c/")
+        array, index = self.arrays.get(path), chunk_index(end)
+        if array is None or index is None or not array.has(index):
+            return None
+        return array, index
+
+    # -- how it is made --
+
+    def _add_coordinates(
+        self, group: str, volume: Volume, level: Level, used: set[str]
+    ) -> tuple[str, ...]:
+        """Add the coordinates of a level to its group; return the names of its axes.
+
+        Volumes share a coordinate that has the same name, positions and attributes.
+        """
+        names = []
+        for number, axis in enumerate(AXES):
+            coordinate = volume.coords[axis]
+            values = coordinate.values[level.vertices(number - 1)] if number else coordinate.values
+            attributes = coordinate_attributes(axis, coordinate)
+            wanted = safe_name(coordinate.name or axis)
+            name, count = wanted, 1
+            while name in used and not self._is_same(_join(group, name), values, attributes, names):
+                count += 1
+                name = f"{wanted}_{count}"
+            if name not in used:
+                used.add(name)
+                self.arrays[_join(group, name)] = _positions(name, values, attributes)
+            names.append(name)
+        return tuple(names)
+
+    def _is_same(self, path: str, values: Any, attributes: Any, taken: list[str]) -> bool:
+        """Whether a path holds these positions already, and not for another axis of the volume."""
+        array = self.arrays.get(path)
+        if array is None or path.rpartition("/")[2] in taken or len(array.shape) != 1:
+            return False
+        if array.shape != values.shape or array.attributes != attributes:
+            return False
+        there = array.read((slice(0, values.size),))
+        return bool(np.array_equal(there, values, equal_nan=True))
+
+    def _write_documents(self, groups: Mapping[str, dict[str, Any]]) -> dict[str, bytes]:
+        """All metadata documents by key; those of groups hold all metadata below them."""
+        nodes: dict[str, dict[str, Any]] = {
+            path: {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+            for path, attributes in groups.items()
+        }
+        nodes |= {path: array.document() for path, array in self.arrays.items()}
+        documents = {}
+        for path, node in nodes.items():
+            if path in groups:
+                below = f"{path}/" if path else ""
+                inside = {
+                    other[len(below) :]: nodes[other]
+                    for other in nodes
+                    if other != path and other.startswith(below)
+                }
+                consolidated = {"kind": "inline", "must_understand": False, "metadata": inside}
+                node = {**node, "consolidated_metadata": consolidated}
+            text = json.dumps(node, separators=(",", ":"), allow_nan=False)
+            documents[_join(path, DOCUMENT)] = text.encode("utf-8")
+        return documents
+
+    def _fingerprint(self) -> str:
+        """A digest of the files and of all metadata."""
+        digests = [volume.container.digest for volume in self.volumes.values()]
+        seed = "\n".join((*digests, "")).encode("ascii") + self._documents[DOCUMENT]
+        return hashlib.sha256(seed).hexdigest()[:32]
+
+
+def _global_attributes(volumes: Mapping[str, Volume]) -> dict[str, Any]:
+    """Attributes of the whole file, which a mapping of several variables may have."""
+    return json_attributes(getattr(volumes, "attributes", None) or {}, without=DROPPED)
+
+
+def _values(volume: Volume, level: Level, dimensions: tuple[str, ...]) -> ViewArray:
+    """The array of a level of a volume."""
+    region = Region(
+        name=volume.name or "values",
+        dtype=volume.dtype,
+        shape=volume.shape,
+        coords=volume.coords,
+        units=volume.units,
+        attributes=volume.attrs,
+    )
+    # Integers have a fill value also where no vertex lacks a value: it marks nothing then.
+    marks = volume.fill is not None and volume.value_type.has_gaps and volume.fill == volume.fill
+    missing = {}
+    if marks:
+        # xarray takes `_FillValue` of floats as bits in base64, which no other library does.
+        missing = {"_FillValue" if volume.dtype.kind in "iu" else "missing_value": volume.fill}
+    return ViewArray(
+        shape=level.shape,
+        chunk_shape=view_chunks(level.shape, level.tile, level.dtype.itemsize),
+        dtype=level.dtype,
+        dimension_names=dimensions,
+        attributes={**variable_attributes(region), **missing},
+        fill=volume.fill,
+        read=level.read,
+        holds=level.holds,
+    )
+
+
+def _positions(name: str, values: Any, attributes: Mapping[str, Any]) -> ViewArray:
+    """The array of the positions along an axis."""
+    return ViewArray(
+        shape=values.shape,
+        chunk_shape=(min(values.size, POSITIONS_CHUNK),),
+        dtype=values.dtype,
+        dimension_names=(name,),
+        attributes=attributes,
+        fill=None,
+        read=lambda region: values[region],
+        holds=lambda region: True,
+    )
+
+
+def _unique(name: str, used: set[str]) -> str:
+    """The name, with a number where it is taken; it counts as taken from then on."""
+    unique, number = name, 2
+    while unique in used:
+        unique, number = f"{name}_{number}", number + 1
+    used.add(unique)
+    return unique
+
+
+def _join(group: str, name: str) -> str:
+    """The path of a node in a group; "" is the root."""
+    return f"{group}/{name}" if group else name

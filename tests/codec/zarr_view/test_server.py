@@ -1,0 +1,254 @@
+"""A view over HTTP: the same bytes, ranges, conditions, other origins, and what is refused."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec.zarr_view.server import Server
+from fhash_codec.zarr_view.view import opened_view
+from fhash_formats.errors import InputError
+
+CHUNK = "/density/c/0/0/0/0"
+
+Answer = tuple[int, dict[str, str], bytes]
+Ask = Callable[..., Answer]
+
+
+@contextmanager
+def serving(path: Path, news: Callable[[str], None] = print) -> Iterator[Server]:
+    """A server in a thread of its own."""
+    volume, view = opened_view(path)
+    with volume, Server(view, news=news) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def asking(server: Server) -> Ask:
+    """A function that sends one request: a path, a method, headers."""
+
+    def ask(path: str, method: str = "GET", **headers: str) -> Answer:
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=30)
+        try:
+            names = {name.replace("_", "-"): value for name, value in headers.items()}
+            connection.request(method, path, headers=names)
+            answer = connection.getresponse()
+            return answer.status, dict(answer.getheaders()), answer.read()
+        finally:
+            connection.close()
+
+    return ask
+
+
+@pytest.fixture
+def ask(whole: Path) -> Iterator[Ask]:
+    with serving(whole) as server:
+        yield asking(server)
+
+
+@pytest.mark.usefixtures("apart")
+def test_every_key_has_the_bytes_of_the_view(feature: Path) -> None:
+    with serving(feature) as server:
+        ask, view = asking(server), server.view
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1])
+        for key in view.listing():
+            connection.request("GET", f"/{key}")  # all over one connection
+            answer = connection.getresponse()
+            assert answer.status == 200
+            assert answer.read() == view.get(key)
+        connection.close()
+        absent = "/density/c/0/0/0/0"
+        assert view.size(absent[1:]) is None
+        assert ask(absent)[0] == 404
+
+
+def test_values_are_those_of_the_volume(ask: Ask, whole: Path) -> None:
+    status, headers, body = ask("/density/zarr.json")
+    assert (status, headers["Content-Type"]) == (200, "application/json")
+    chunk = json.loads(body)["chunk_grid"]["configuration"]["chunk_shape"]
+    status, headers, body = ask(CHUNK)
+    assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
+    assert "Content-Encoding" not in headers
+    with fhash_codec.open(whole) as volume:
+        expected = volume[tuple(slice(0, n) for n in chunk)]
+    assert np.frombuffer(body, "<f4").reshape(chunk).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("path", ["/zarr.json", CHUNK])
+def test_head_tells_what_get_gives(ask: Ask, path: str) -> None:
+    status, headers, body = ask(path)
+    told = ask(path, "HEAD")
+    assert (status, told[0], told[2]) == (200, 200, b"")
+    assert int(headers["Content-Length"]) == len(body)
+    headers.pop("Date")
+    told[1].pop("Date")
+    assert told[1] == headers
+
+
+def test_ranges(ask: Ask) -> None:
+    _, headers, body = ask(CHUNK)
+    size = len(body)
+    assert headers["Accept-Ranges"] == "bytes"
+    for asked, first, end in (
+        ("bytes=10-19", 10, 20),
+        (f"bytes={size - 3}-", size - 3, size),
+        ("bytes=-5", size - 5, size),
+        (f"bytes=4-{10 * size}", 4, size),
+    ):
+        status, headers, part = ask(CHUNK, Range=asked)
+        assert status == 206
+        assert part == body[first:end]
+        assert headers["Content-Range"] == f"bytes {first}-{end - 1}/{size}"
+        assert int(headers["Content-Length"]) == end - first
+    status, headers, part = ask(CHUNK, Range=f"bytes={size}-")
+    assert (status, headers["Content-Range"]) == (416, f"bytes */{size}")
+    assert ask(CHUNK, Range="bytes=0-1,4-5")[::2] == (200, body)
+    assert ask(CHUNK, "HEAD", Range="bytes=0-1")[::2] == (206, b"")
+
+
+def test_what_a_client_has_is_not_sent_again(ask: Ask) -> None:
+    _, headers, body = ask(CHUNK)
+    tag = headers["ETag"]
+    assert headers["Cache-Control"] == "no-cache"
+    status, headers, empty = ask(CHUNK, If_None_Match=f'"other", {tag}')
+    assert (status, empty, headers["ETag"]) == (304, b"", tag)
+    assert ask(CHUNK, If_None_Match='"other"')[::2] == (200, body)
+    assert ask("/zarr.json")[1]["ETag"] != tag
+    assert ask(CHUNK, Range="bytes=0-3", If_Range=tag)[0] == 206
+    assert ask(CHUNK, Range="bytes=0-3", If_Range='"other"')[::2] == (200, body)
+
+
+def test_tags_are_of_the_file_and_not_of_the_server(whole: Path, feature: Path) -> None:
+    tags = []
+    for path in (whole, whole, feature):
+        with serving(path) as server:
+            tags.append(asking(server)("/time/c/0")[1]["ETag"])
+    assert tags[0] == tags[1] != tags[2]
+
+
+@pytest.mark.parametrize("path", ["/zarr.json", CHUNK, "/nope"])
+def test_pages_of_other_origins_may_read(ask: Ask, path: str) -> None:
+    _, headers, _ = ask(path, Origin="https://example.org")
+    assert headers["Access-Control-Allow-Origin"] == "*"
+    assert "ETag" in headers["Access-Control-Expose-Headers"]
+    status, headers, body = ask(
+        path, "OPTIONS", Origin="https://example.org", Access_Control_Request_Method="GET"
+    )
+    assert (status, body) == (204, b"")
+    assert headers["Access-Control-Allow-Origin"] == "*"
+    assert "Range" in headers["Access-Control-Allow-Headers"]
+    assert headers["Access-Control-Allow-Methods"] == "GET, HEAD, OPTIONS"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/", "/nope", "/density", "/density/c/0/0/0/99", "/../../etc/passwd", "/%2e%2e/etc/passwd",
+        "/zarr.json/", "/density/c/0/0/0/%30%30", "/whole.fhz", "/%7f", "/%ff%fe",
+    ],
+)  # fmt: skip
+def test_other_paths_are_not_found(ask: Ask, path: str) -> None:
+    status, headers, body = ask(path)
+    assert status == 404
+    assert body.count(b"\n") == 1
+    assert headers["Cache-Control"] == "no-store"
+    assert ask(path, "HEAD")[::2] == (404, b"")
+    assert ask("/zarr.json")[0] == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "BREW"])
+def test_other_methods_are_refused(ask: Ask, method: str) -> None:
+    status, headers, body = ask("/zarr.json", method)
+    assert (status, headers["Allow"]) == (405, "GET, HEAD, OPTIONS")
+    assert body == b"GET, HEAD and OPTIONS are served\n"
+
+
+def test_queries_and_percent_signs_are_understood(ask: Ask) -> None:
+    assert ask("/zarr.json?time=1")[::2] == ask("/zarr.json")[::2]
+    assert ask("/%7Aarr.json")[::2] == ask("/zarr.json")[::2]
+
+
+def test_what_is_no_http_is_refused_and_the_server_goes_on(whole: Path) -> None:
+    with serving(whole) as server:
+        for line in (b"nonsense\r\n\r\n", b"GET /zarr.json HTTP/9.9\r\n\r\n", b"\x00\xff\r\n\r\n"):
+            with socket.create_connection(server.server_address[:2], timeout=30) as raw:
+                raw.sendall(line)
+                raw.recv(10_000)
+        with socket.create_connection(server.server_address[:2]) as raw:
+            raw.sendall(b"GET /zarr.json HTTP/1.1\r\n")  # and away in the middle of a request
+        assert asking(server)("/zarr.json")[0] == 200
+
+
+@pytest.mark.usefixtures("apart")
+def test_a_damaged_tile_is_a_failure_of_one_answer(damaged: Path) -> None:
+    news: list[str] = []
+    with serving(damaged, news.append) as server:
+        ask = asking(server)
+        status, headers, body = ask(CHUNK)
+        assert (status, headers["Cache-Control"]) == (500, "no-store")
+        assert body.count(b"\n") == 1
+        assert b"damaged.fhz" in body
+        assert "ETag" not in headers
+        (line,) = news
+        assert line.startswith("density/c/0/0/0/0: ")
+        last = list(server.view.listing("density/c/"))[-1]
+        assert ask(f"/{last}")[::2] == (200, server.view.get(last))
+        assert ask("/zarr.json")[0] == 200
+
+
+def test_a_defect_is_a_failure_of_one_answer(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    news: list[str] = []
+    with serving(whole, news.append) as server:
+        get = server.view.get
+
+        def fail(key: str) -> bytes | None:
+            if key.startswith("density/c"):
+                raise KeyError("several\nlines")
+            return get(key)
+
+        monkeypatch.setattr(server.view, "get", fail)
+        assert asking(server)(CHUNK)[0] == 500
+        assert news == [f"{CHUNK[1:]}: unexpected KeyError: 'several\\nlines'"]
+        assert asking(server)("/zarr.json")[0] == 200
+
+
+@pytest.mark.usefixtures("apart")
+def test_several_clients_at_once(whole: Path) -> None:
+    with serving(whole) as server, ThreadPoolExecutor(8) as pool:
+        keys = [key for key in server.view.listing() if "/c/" in key] * 4
+        answers = list(pool.map(lambda key: asking(server)(f"/{key}"), keys))
+        assert all(
+            (status, body) == (200, server.view.get(key))
+            for key, (status, _, body) in zip(keys, answers, strict=True)
+        )
+
+
+def test_addresses(whole: Path) -> None:
+    with serving(whole) as server:
+        port = server.server_address[1]
+        assert server.url == f"http://127.0.0.1:{port}/"
+        assert server.is_local
+        view = server.view
+        with pytest.raises(InputError, match=rf"127\.0\.0\.1:{port} cannot be served.*--port"):
+            Server(view, port=port)
+        with pytest.raises(InputError, match="host 'no such host' is not known"):
+            Server(view, host="no such host")
+        with pytest.raises(InputError, match="cannot be served"):
+            Server(view, host="192.0.2.1")
+        with Server(view, host="0.0.0.0") as everywhere:
+            assert not everywhere.is_local

@@ -1,0 +1,283 @@
+"""The hierarchy: its keys, documents and attributes, for one volume and for several."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig, Volume
+from fhash_codec.zarr_view.view import ZarrView, opened_view
+from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
+from fhash_formats.series import ArraySeries, Coordinate
+
+ViewOf = Callable[..., ZarrView]
+
+
+@pytest.fixture
+def view_of() -> Iterator[ViewOf]:
+    """A function that opens a file with options; all files are closed at the end."""
+    with ExitStack() as files:
+
+        def make(path: Path, **options: Any) -> ZarrView:
+            opened, view = opened_view(path, **options)
+            files.callback(opened.close)
+            return view
+
+        yield make
+
+
+def document(view: ZarrView, path: str) -> Any:
+    data = view.get(f"{path}/zarr.json" if path else "zarr.json")
+    assert data is not None
+    return json.loads(data, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+
+
+def encoded(path: Path, shape: tuple[int, ...] = (2, 3, 4, 5), **names: Any) -> Path:
+    """A container of a small ramp; names: of the variable and of its axes t, z, y, x."""
+    series = ArraySeries(np.arange(float(np.prod(shape))).reshape(shape), name=names["name"])
+    series.coords = {
+        axis: Coordinate(name=names.get(axis, axis), values=np.arange(n) * names.get("step", 1.0))
+        for axis, n in zip("tzyx", shape, strict=True)
+    }
+    fhash_codec.encode(series, path, EncodeConfig(effort=1, max_error=0.0))
+    return path
+
+
+def test_the_root_document_holds_all_metadata(view_of: ViewOf, whole: Path) -> None:
+    view = view_of(whole)
+    root = document(view, "")
+    assert (root["zarr_format"], root["node_type"]) == (3, "group")
+    assert root["consolidated_metadata"]["kind"] == "inline"
+    inside = root["consolidated_metadata"]["metadata"]
+    for path, node in inside.items():
+        alone = document(view, path)
+        alone.pop("consolidated_metadata", None)
+        assert alone == node
+    arrays = {path for path, node in inside.items() if node["node_type"] == "array"}
+    assert arrays == set(view.arrays)
+    assert {"density", "time", "height", "lat", "lon", "lod/0/density", "lod/2/lat"} <= arrays
+    assert "lod/3/density" not in arrays
+    level = document(view, "lod/1")["consolidated_metadata"]["metadata"]
+    assert set(level) == {"density", "time", "height", "lat", "lon"}
+
+
+def test_attributes_say_what_values_are_and_not_how_they_were_packed(
+    view_of: ViewOf, whole: Path
+) -> None:
+    view = view_of(whole)
+    assert document(view, "density")["attributes"] == {
+        "standard_name": "air_density",
+        "note": "é",
+        "units": "kg m-3",
+    }
+    assert document(view, "time")["attributes"] == {
+        "axis": "T",
+        "units": "hours since 2001-02-03",
+        "calendar": "standard",
+    }
+    assert document(view, "density")["dimension_names"] == ["time", "height", "lat", "lon"]
+    assert document(view, "")["attributes"] == {}
+
+
+def test_the_levels_are_a_multiscale_image(view_of: ViewOf, feature: Path) -> None:
+    view = view_of(feature)
+    (entry,) = document(view, "lod")["attributes"]["ome"]["multiscales"]
+    assert document(view, "lod")["attributes"]["ome"]["version"] == "0.5"
+    assert [dataset["path"] for dataset in entry["datasets"]] == ["0/density", "1/density"]
+    for dataset in entry["datasets"]:
+        node = document(view, f"lod/{dataset['path']}")
+        assert node["dimension_names"] == [axis["name"] for axis in entry["axes"]]
+        assert node["data_type"] == "float32"
+        scale = dataset["coordinateTransformations"][0]["scale"]
+        translation = dataset["coordinateTransformations"][1]["translation"]
+        path = f"lod/{dataset['path']}".rpartition("/")[0]
+        lon = np.frombuffer(view.get(f"{path}/lon/c/0") or b"", "<f8")
+        np.testing.assert_array_equal(lon, translation[3] + scale[3] * np.arange(lon.size))
+
+
+@pytest.mark.usefixtures("apart")
+@pytest.mark.parametrize("kind", ["whole", "feature"])
+def test_every_key_has_as_many_bytes_as_told(
+    view_of: ViewOf, kind: str, request: pytest.FixtureRequest
+) -> None:
+    view = view_of(request.getfixturevalue(kind))
+    keys = list(view.listing())
+    assert len(keys) == len(set(keys))
+    for key in keys:
+        data = view.get(key)
+        assert data is not None
+        assert view.size(key) == len(data)
+        assert view.is_document(key) == key.endswith("zarr.json")
+
+
+@pytest.mark.usefixtures("apart")
+def test_chunks_without_a_vertex_of_the_box_are_left_out(feature: Path) -> None:
+    with fhash_codec.open(feature) as volume:
+        view = ZarrView({"density": volume})
+        array = view.arrays["density"]
+        values = np.full(array.shape, np.nan, dtype=np.float32)
+        keys = [key for key in view.listing("density/c/") if key.count("/") == 5]
+        assert 0 < len(keys) < np.prod(array.grid)
+        for key in keys:
+            index = tuple(map(int, key.split("/")[2:]))
+            chunk = np.frombuffer(view.get(key) or b"", "<f4").reshape(array.chunk_shape)
+            region = tuple(
+                slice(i * n, min((i + 1) * n, m))
+                for i, n, m in zip(index, array.chunk_shape, array.shape, strict=True)
+            )
+            values[region] = chunk[tuple(slice(0, along.stop - along.start) for along in region)]
+        assert values.tobytes() == volume[...].tobytes()
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "", "/", "zarr.json/", "/zarr.json", "nope", "density", "density/", "density/c",
+        "density/c/", "density/c/0", "density/c/0/0/0/99", "density/c/0/0/0/0/0",
+        "density/c/00/0/0/0", "density/c/-1/0/0/0", "density/c/0/0/0/0/", "../density/c/0/0/0/0",
+        "lod/9/density/zarr.json", "time/c/1", "c/0/0/0/0", ".zattrs", "density/.zarray",
+    ],
+)  # fmt: skip
+def test_other_keys_are_not_there(view_of: ViewOf, whole: Path, key: str) -> None:
+    view = view_of(whole)
+    assert view.get(key) is None
+    assert view.size(key) is None
+
+
+@pytest.mark.usefixtures("apart")
+def test_names_below_a_path(view_of: ViewOf, whole: Path) -> None:
+    view = view_of(whole)
+    assert set(view.children("")) == {"zarr.json", "density", "time", "height", "lat", "lon", "lod"}
+    assert set(view.children("lod")) == {"zarr.json", "0", "1", "2"}
+    assert set(view.children("density")) == {"zarr.json", "c"}
+    grid = view.arrays["density"].grid
+    assert list(view.children("density/c")) == [str(n) for n in range(grid[0])]
+    assert list(view.children("density/c/1/0/0")) == [str(n) for n in range(grid[3])]
+    assert list(view.children("nope")) == []
+    assert set(view.listing("lod/1/lat")) == {"lod/1/lat/zarr.json", "lod/1/lat/c/0"}
+
+
+def test_integers_have_their_fill_value_where_some_are_missing(view_of: ViewOf) -> None:
+    golden = Path(__file__).resolve().parents[2] / "golden"
+    view = view_of(golden / "compact-1.2-labels.fhz")
+    node = document(view, "density")
+    assert (node["data_type"], node["fill_value"]) == ("int8", -100)
+    assert node["attributes"]["_FillValue"] == -100
+
+
+def test_a_fill_value_of_ones_own_marks_missing_floats(view_of: ViewOf, feature: Path) -> None:
+    node = document(view_of(feature, fill=-9), "density")
+    assert node["fill_value"] == node["attributes"]["missing_value"] == -9
+    assert "_FillValue" not in node["attributes"]
+
+
+def test_integers_without_missing_values_mark_none(view_of: ViewOf, tmp_path: Path) -> None:
+    path = tmp_path / "a.fhz"
+    values = np.arange(60, dtype=np.int32).reshape(1, 3, 4, 5)
+    fhash_codec.encode(values, path, EncodeConfig(effort=1, max_error=0.0))
+    node = document(view_of(path), "values")
+    assert (node["data_type"], node["fill_value"]) == ("int32", 0)
+    assert "_FillValue" not in node["attributes"]
+
+
+@pytest.mark.parametrize(
+    ("names", "arrays"),
+    [
+        ({"name": "lod", "t": "time"}, {"lod_2", "time", "z", "y", "x"}),
+        ({"name": "a/b", "x": "lod"}, {"a_b", "t", "z", "y", "lod_2"}),
+        ({"name": "x"}, {"x", "t", "z", "y", "x_2"}),
+        ({"name": "a", "z": "n", "y": "n", "x": "n"}, {"a", "t", "n", "n_2", "n_3"}),
+        ({"name": "zarr.json", "t": "../up"}, {"zarr.json_2", ".._up", "z", "y", "x"}),
+        ({"name": "c", "t": "__t"}, {"c", "_t", "z", "y", "x"}),
+    ],
+)
+def test_names_that_would_collide_are_changed(
+    tmp_path: Path, names: dict[str, str], arrays: set[str]
+) -> None:
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", **names)) as volume:
+        view = ZarrView({volume.name: volume})
+        assert {path for path in view.arrays if not path.startswith("lod/")} == arrays
+        (name,) = view.names.values()
+        dimensions = view.arrays[name].dimension_names
+        assert len(set(dimensions)) == 4
+        assert set(dimensions) == arrays - {name}
+        got = b"".join(view.get(key) or b"" for key in view.listing(f"{name}/c/"))
+        assert got == volume[...].tobytes()
+
+
+class Several(Mapping[str, Volume]):
+    """A stand-in for a file of several variables."""
+
+    def __init__(self, volumes: dict[str, Volume]) -> None:
+        self._volumes = volumes
+        self.attributes = {"title": "two", "_FillValue": 3, "bad": float("nan")}
+
+    def __getitem__(self, name: str) -> Volume:
+        return self._volumes[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._volumes)
+
+    def __len__(self) -> int:
+        return len(self._volumes)
+
+
+def test_several_volumes_share_the_coordinates_that_are_equal(tmp_path: Path) -> None:
+    first = fhash_codec.open(encoded(tmp_path / "u.fhz", name="u"))
+    second = fhash_codec.open(encoded(tmp_path / "v.fhz", name="v", shape=(2, 3, 4, 6)))
+    with first, second:
+        view = ZarrView(Several({"u": first, "v": second}))
+        assert view.arrays["u"].dimension_names == ("t", "z", "y", "x")
+        assert view.arrays["v"].dimension_names == ("t", "z", "y", "x_2")
+        assert view.arrays["x_2"].shape == (6,)
+        root = document(view, "")
+        assert root["attributes"] == {"title": "two", "bad": "NaN"}
+        scales = document(view, "lod")["attributes"]["ome"]["multiscales"]
+        assert [entry["name"] for entry in scales] == ["u", "v"]
+        assert view.get("v/c/0/0/0/0") == second[...].tobytes()
+
+
+def test_the_tag_tells_files_and_settings_apart(
+    view_of: ViewOf, whole: Path, feature: Path
+) -> None:
+    assert view_of(whole).tag == view_of(whole).tag
+    tags = {view_of(whole).tag, view_of(feature).tag, view_of(feature, fill=1).tag}
+    assert len(tags) == 3
+
+
+def test_nothing_is_decoded_before_a_chunk_is_asked_for(whole: Path) -> None:
+    with fhash_codec.open(whole) as volume:
+        before = volume.container.bytes_read
+        view = ZarrView({"density": volume})
+        assert all(view.size(key) is not None for key in view.listing())
+        assert volume.container.bytes_read == before
+        view.get("density/c/0/0/0/0")
+        assert volume.container.bytes_read > before
+
+
+@pytest.mark.usefixtures("apart")
+def test_a_damaged_tile_is_refused_and_others_are_read(view_of: ViewOf, damaged: Path) -> None:
+    view = view_of(damaged)
+    with pytest.raises(DamagedFileError, match=r"damaged\.fhz"):
+        view.get("density/c/0/0/0/0")
+    last = list(view.listing("density/c/"))[-1]
+    assert view.get(last)
+
+
+def test_what_cannot_be_opened_is_refused(tmp_path: Path, whole: Path) -> None:
+    with pytest.raises(MissingInputError):
+        opened_view(tmp_path / "nope.fhz")
+    (tmp_path / "text.fhz").write_text("no container")
+    with pytest.raises(DamagedFileError):
+        opened_view(tmp_path / "text.fhz")
+    opened, view = opened_view(whole)
+    opened.close()
+    with pytest.raises(InputError, match="closed"):
+        view.get("density/c/0/0/0/0")
