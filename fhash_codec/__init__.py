@@ -34,6 +34,9 @@ from fhash_formats.errors import (
 )
 
 if TYPE_CHECKING:
+    from fhash_codec.appending.append import append
+    from fhash_codec.appending.merging import merge
+    from fhash_codec.appending.writer import Writer
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.dataset import Dataset, open
@@ -54,10 +57,13 @@ _MODULES = {
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
     "Volume": "volume",
+    "Writer": "appending.writer",
+    "append": "appending.append",
     "diff": "comparison",
     "encode": "encoding",
     "encode_dataset": "dataset_encoding",
     "export_plain": "plain",
+    "merge": "appending.merging",
     "open": "dataset",
     "render": "rendering",
     "zarr_store": "zarr_view.store",
@@ -83,10 +89,13 @@ __all__ = [
     "TrainingError",
     "UnsupportedFileError",
     "Volume",
+    "Writer",
+    "append",
     "diff",
     "encode",
     "encode_dataset",
     "export_plain",
+    "merge",
     "open",
     "render",
     "zarr_store",

@@ -93,11 +93,17 @@ def _is_index(positions: npt.NDArray[np.float64]) -> bool:
 
 
 def measure(
-    series: Series, volume: Volume, progress: Progress, *, ssim_budget: int = SSIM_BUDGET
+    series: Series,
+    volume: Volume,
+    progress: Progress,
+    *,
+    ssim_budget: int = SSIM_BUDGET,
+    **options: Any,
 ) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
-    ssim_budget: vertices whose SSIM is measured; with 0 it is None.
+    ssim_budget: vertices whose SSIM is measured; with 0 it is None. options: further ones of
+    `measure_quality`.
 
     The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
@@ -115,6 +121,7 @@ def measure(
         bulk=_bulk(series, volume),
         neighbours=_neighbours(series, volume),
         ssim_budget=ssim_budget,
+        **options,
     )
     series.check()
     return quality.to_dict()

@@ -56,10 +56,17 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("shared_volumes",),
         ("lazy_array",),
         ("encoding",),
-        ("dataset_encoding", "plain", "xarray_backend"),
+        ("appending", "dataset_encoding", "plain", "xarray_backend"),
         ("selftest",),
         ("bench",),
         ("cost",),
+    ),
+    "fhash_codec.appending": (
+        ("figures", "parts"),
+        ("layers",),
+        ("growing", "planning"),
+        ("resuming",),
+        ("append", "merging", "writer"),
     ),
     "fhash_codec.rendering": (
         ("scene",),

@@ -98,7 +98,8 @@ def encode_compact(
         with stage("writing", "tiles"):
             parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
-        own = _header(selection, table, config, seconds) | {"required_features": parts.features}
+        own = table_header(selection, table, config, seconds)
+        own["required_features"] = list(parts.features)
         own["required_features"] += coordinate_features(described["coordinates"])
         header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
@@ -112,7 +113,7 @@ def encode_compact(
     return header
 
 
-def _header(
+def table_header(
     selection: FeatureSelection, table: CodedTable, config: EncodeConfig, seconds: float | None
 ) -> dict[str, Any]:
     """Return what a header says beside the source and its coordinates, without the quality.
@@ -136,14 +137,14 @@ def _header(
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
-        "training": _training(trained, timings=config.timings),
+        "training": training_header(trained, timings=config.timings),
         "history": history_columns(
             brief_history(trained, timings=config.timings, most=HEAD_POINTS)
         ),
     }
 
 
-def _training(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
+def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
     """Return what a header says of the training of the best head, which has this history.
 
     The device is "none" where nothing was trained.

@@ -76,6 +76,13 @@ MAX_LABELS = 64
     "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
     "that may be chosen.",
 )
+@click.option(
+    "--part",
+    metavar="I/N",
+    help="Encode only the I-th of N parts, counted from 1: whole layers of tiles along time, such "
+    "as 3/16 for the third machine of 16. `fhash merge` joins the parts to the file that one "
+    "command would write with --no-timings. Needs --max-error or --max-error-rel.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -95,6 +102,7 @@ def command(
     quiet: bool,
     explain: bool,
     time_budget: float | None,
+    part: str | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -110,14 +118,14 @@ def command(
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
     """
-    import fhash_codec
-
+    if part is not None and (explain or time_budget is not None or report_folder is not None):
+        raise click.UsageError("--part goes without --explain, --time-budget and --report")
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, components, quiet=quiet)
     if several is not None:
-        if time_budget is not None or report_folder is not None or verbose:
-            raise click.UsageError("--time-budget, --report and -v are for one variable")
+        if time_budget is not None or report_folder is not None or verbose or part is not None:
+            raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
         encoded = _encode_several(data, output, several, settings, force, quiet)
         return _emit_several(encoded, explain, as_json)
     config = config_of(settings)
@@ -133,9 +141,8 @@ def command(
             config = choice.config
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = fhash_codec.encode(
-                series, output, config, force=force, progress=progress, predicted=predicted
-            )
+            options = {"force": force, "progress": progress, "predicted": predicted}
+            report = _encode(series, output, config, part, options)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
@@ -234,6 +241,20 @@ def _emit_several(
     for name, figures in variables.items():
         text += _explained(figures, explain, f"{name}\n")
     emit(report, text, as_json, missed)
+
+
+def _encode(
+    series: Series, output: str, config: EncodeConfig, part: str | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Encode a series, or one part of it such as "3/16"; the report, with its stages."""
+    import fhash_codec
+    from fhash_codec.appending.parts import Part, encode_part
+
+    if part is None:
+        return fhash_codec.encode(series, output, config, **options)
+    del options["predicted"]
+    report = encode_part(series, output, config, Part.parse(part), **options)
+    return {**report, "stages": []}
 
 
 def _choose(

@@ -140,7 +140,7 @@ def replacing_all(
             for output in outputs:
                 output.place(force, directory)
         for folder in {output.target.parent for output in outputs}:
-            _sync_folder(folder)
+            sync_folder(folder)
     except BaseException as error:
         with signals_held():
             for output in reversed(outputs):
@@ -297,10 +297,10 @@ def _sync(path: Path) -> None:
     for folder, _, names in os.walk(path):
         for name in names:
             _sync(Path(folder, name))
-        _sync_folder(Path(folder))
+        sync_folder(Path(folder))
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Write a folder's list of names to the disk itself.
 
     Some file systems and Windows cannot. The bytes of its files are safe nevertheless; only their
