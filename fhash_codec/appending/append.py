@@ -90,11 +90,11 @@ def _require_same(series: Series, volume: Volume) -> None:
     if series.units and volume.units and series.units != volume.units:
         raise InputError(f"{what} is in {series.units}, {path} in {volume.units}; convert one")
     for axis in AXES[1:]:
-        here, there = series.coords[axis].values, volume.coords[axis].values
-        if not np.array_equal(here, there) and not _is_index(here):
+        these, those = series.coords[axis].values, volume.coords[axis].values
+        if not np.array_equal(these, those) and not _is_index(these):
             raise InputError(
-                f"{what} has positions {here[0]:.9g} to {here[-1]:.9g} along {axis}, {path} has "
-                f"{there[0]:.9g} to {there[-1]:.9g}; they must be the same"
+                f"{what} has positions {these[0]:.9g} to {these[-1]:.9g} along {axis}, {path} has "
+                f"{those[0]:.9g} to {those[-1]:.9g}; they must be the same"
             )
     units = series.coords["t"].attributes.get("units")
     other = volume.coords["t"].attributes.get("units")

@@ -31,7 +31,7 @@ Its float may lie above the decimal number.
 class StepErrors(NamedTuple):
     """Errors of one step, scaled by the power of two of its `Figures`."""
 
-    count: int
+    number: int
     """Number of values."""
     squares: float
     """Sum of the squared errors."""
@@ -71,15 +71,15 @@ class Figures:
         count, errors = math.prod(frame), []
         for step in range(steps):
             figures = told[step] if step < len(told) else {}
-            pair = [figures.get(name) for name in ("rmse", "max_abs_error")]
-            if not all(isinstance(one, int | float) and one >= 0 for one in pair):
+            rmse, largest = (figures.get(name) for name in ("rmse", "max_abs_error"))
+            if not all(isinstance(one, int | float) and one >= 0 for one in (rmse, largest)):
                 raise InputError(
                     f"the file does not tell the errors of step {step}, and a longer one could not"
                 )
-            rmse, largest = (
-                float(one) * ROUNDED_ONCE * scale for one in (pair[0], min(pair[1], limit))
+            root, most_of_step = (
+                float(one) * ROUNDED_ONCE * scale for one in (rmse, min(largest, limit))
             )
-            errors.append(StepErrors(count, count * rmse * rmse, largest))
+            errors.append(StepErrors(count, count * root * root, most_of_step))
         return cls(scale, errors)
 
     def measure(self, original: Values, decoded: Values) -> StepErrors:
@@ -91,7 +91,7 @@ class Figures:
 
     def header(self, data_range: float) -> dict[str, Any]:
         """The header's `quality`. data_range: width of the header's value range."""
-        count = sum(step.count for step in self.steps)
+        count = sum(step.number for step in self.steps)
         squares = math.fsum(step.squares for step in self.steps)
         root = math.sqrt(squares / count)
         whole = {
@@ -101,13 +101,13 @@ class Figures:
         }
         per_step = [
             {
-                "rmse": self._figure(math.sqrt(step.squares / step.count)),
+                "rmse": self._figure(math.sqrt(step.squares / step.number)),
                 "max_abs_error": self._figure(step.largest),
             }
             for step in self.steps
         ]
         everywhere = {f"{name}_domain": value for name, value in whole.items()}
-        quality = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
+        quality: dict[str, Any] = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
         return brief_quality(quality, data_range, len(self.steps))
 
     def _figure(self, scaled: float) -> float | None:

@@ -72,7 +72,7 @@ class LayerCoder:
         decoded = np.empty_like(values)
         grid = [-(-n // length) for n, length in zip(values.shape[1:], self.tile[1:], strict=True)]
         streams, nonzero = [], 0
-        indices = list(product(*map(range, grid)))
+        indices: list[Index] = [(z, y, x) for z, y, x in product(*map(range, grid))]
         tiles = (self._tile(values, index) for index in indices)
         coded = map_ahead(workers, self._code, enumerate(tiles), 2 * usable_threads())
         for index, tile in zip(indices, coded, strict=True):

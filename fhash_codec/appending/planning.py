@@ -62,7 +62,7 @@ def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
             "(feature 'all')"
         )
     if config.max_error is not None:
-        return config.max_error
+        return float(config.max_error)
     if config.max_error_rel is None:
         raise InputError(
             "a file that grows promises a bound of the error, which holds step by step: give "

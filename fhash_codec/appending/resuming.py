@@ -68,7 +68,7 @@ def bound_of_file(header: Mapping[str, Any]) -> float | None:
     if isinstance(config.get("max_error"), int | float):
         return float(config["max_error"])
     if isinstance(config.get("max_error_rel"), int | float):
-        return float(config["max_error_rel"]) * (high - low)
+        return float(config["max_error_rel"]) * float(high - low)
     return None
 
 

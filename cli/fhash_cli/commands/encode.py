@@ -15,6 +15,7 @@ from click.core import ParameterSource
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.commands.cost import check_report_folder
+from fhash_cli.commands.merge import encode_all_or_part
 from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
@@ -80,8 +81,8 @@ MAX_LABELS = 64
     "--part",
     metavar="I/N",
     help="Encode only the I-th of N parts, counted from 1: whole layers of tiles along time, such "
-    "as 3/16 for the third machine of 16. `fhash merge` joins the parts to the file that one "
-    "command would write with --no-timings. Needs --max-error or --max-error-rel.",
+    "as 3/16. `fhash merge` joins the parts to what one command would write with --no-timings. "
+    "Needs --max-error or --max-error-rel.",
 )
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
@@ -141,8 +142,7 @@ def command(
             config = choice.config
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            options = {"force": force, "progress": progress, "predicted": predicted}
-            report = _encode(series, output, config, part, options)
+            report = encode_all_or_part(series, output, config, part, force, progress, predicted)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
@@ -241,20 +241,6 @@ def _emit_several(
     for name, figures in variables.items():
         text += _explained(figures, explain, f"{name}\n")
     emit(report, text, as_json, missed)
-
-
-def _encode(
-    series: Series, output: str, config: EncodeConfig, part: str | None, options: dict[str, Any]
-) -> dict[str, Any]:
-    """Encode a series, or one part of it such as "3/16"; the report, with its stages."""
-    import fhash_codec
-    from fhash_codec.appending.parts import Part, encode_part
-
-    if part is None:
-        return fhash_codec.encode(series, output, config, **options)
-    del options["predicted"]
-    report = encode_part(series, output, config, Part.parse(part), **options)
-    return {**report, "stages": []}
 
 
 def _choose(

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import force_option, json_option, quiet_option
 from fhash_cli.output import Progress, emit, number, size, table
+
+if TYPE_CHECKING:
+    from fhash_codec.config import EncodeConfig
+    from fhash_formats.series import Series
 
 
 @click.command("merge", cls=BaseCommand)
@@ -35,3 +41,25 @@ def command(parts: tuple[str, ...], output: str, force: bool, as_json: bool, qui
         ("largest error", number(report["max_abs_error"])),
     ]
     emit(report, table(rows), as_json)
+
+
+def encode_all_or_part(
+    series: Series,
+    output: str,
+    config: EncodeConfig,
+    part: str | None,
+    force: bool,
+    progress: Progress,
+    predicted: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Encode a series, or one part of it such as "3/16"; the report, with its stages."""
+    import fhash_codec
+    from fhash_codec.appending.parts import Part, encode_part
+
+    if part is None:
+        return fhash_codec.encode(
+            series, output, config, force=force, progress=progress, predicted=predicted
+        )
+    one = Part.parse(part)
+    report = encode_part(series, output, config, one, force=force, progress=progress)
+    return {**report, "stages": []}

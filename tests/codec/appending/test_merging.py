@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import DamagedFileError, EncodeConfig, InputError
+from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
 from fhash_codec.appending.merging import merge
 from fhash_codec.appending.parts import Part, encode_part
+from fhash_formats import open_series
 from fhash_formats.container import table_parts
 from fhash_formats.errors import OutputExistsError
 from fhash_formats.series import ArraySeries, Coordinate
@@ -133,3 +134,31 @@ def test_a_damaged_tile_is_found_and_nothing_is_written(tmp_path) -> None:
     with pytest.raises(DamagedFileError, match="part2"):
         merge(parts, tmp_path / "run.fhz")
     assert sorted(os.listdir(tmp_path)) == ["part1.fhz", "part2.fhz", "part3.fhz"]
+
+
+@pytest.mark.parametrize("kind", ["rotated", "calendar"])
+def test_what_belongs_to_the_variable_in_its_source_is_that_of_the_whole(tmp_path, kind) -> None:
+    pytest.importorskip("h5netcdf")
+    cf_files = pytest.importorskip("cf_files", exc_type=ImportError)
+    made = cf_files.KINDS[kind]()
+    made.dataset[made.variable].attrs["ancillary_variables"] = "long"
+    long = made.dataset.assign(long=(("n",), np.arange(400.0)))  # too many for the header
+    source = cf_files.Kind(long, made.variable, made.encoding).write(tmp_path / "source.nc")
+    config = settings(tile="1x9x9x9", max_error_rel=0.01, max_error=None)
+    with open_series(source, var=made.variable) as series:
+        fhash_codec.encode(series, tmp_path / "whole.fhz", config)
+        parts = parts_of(series, tmp_path, config, 2)
+    merge(parts, tmp_path / "run.fhz")
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        assert {"long"} <= {one.name for one in volume.metadata.variables}
+    message = "time_bnds of its source has a value for each step" if kind == "calendar" else None
+    if message is not None:
+        with pytest.raises(InputError, match=message):
+            Writer.resume(tmp_path / "run.fhz")
+    else:
+        with Writer.resume(tmp_path / "run.fhz") as writer:
+            writer.append(np.full(writer.shape, 280, "f8").astype(made.dataset["tas"].dtype))
+        with fhash_codec.open(tmp_path / "run.fhz") as volume:
+            assert {"long"} <= {one.name for one in volume.metadata.variables}
+            assert volume.metadata.digest is None
