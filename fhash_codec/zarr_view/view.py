@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.volume import Volume
-from fhash_codec.volume import open as open_file
 from fhash_codec.zarr_view.arrays import ViewArray, chunk_index, chunk_key
 from fhash_codec.zarr_view.chunking import view_chunks
 from fhash_codec.zarr_view.levels import Level, level_count
@@ -50,7 +49,10 @@ POSITIONS_CHUNK = 1 << 17
 
 def opened_view(path: str | Path, **options: Any) -> tuple[Any, ZarrView]:
     """A file, opened by `fhash_codec.open` with its options, and the view of it."""
-    opened: Any = open_file(path, **options)
+    # The public name: what it returns for several variables is a mapping of volumes.
+    import fhash_codec
+
+    opened: Any = fhash_codec.open(path, **options)
     try:
         return opened, ZarrView(opened if isinstance(opened, Mapping) else {opened.name: opened})
     except BaseException:
