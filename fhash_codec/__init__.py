@@ -34,27 +34,37 @@ from fhash_formats.errors import (
 )
 
 if TYPE_CHECKING:
+    from fhash_codec.appending.append import append
+    from fhash_codec.appending.merging import merge
+    from fhash_codec.appending.writer import Writer
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.dataset import Dataset, open
+    from fhash_codec.dataset_encoding import encode_dataset
     from fhash_codec.encoding import encode
     from fhash_codec.plain import export_plain
     from fhash_codec.rendering import render
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
-    from fhash_codec.volume import Volume, open
+    from fhash_codec.volume import Volume
     from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
 
 _MODULES = {
+    "Dataset": "dataset",
     "EncodeConfig": "config",
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
     "Volume": "volume",
+    "Writer": "appending.writer",
+    "append": "appending.append",
     "diff": "comparison",
     "encode": "encoding",
+    "encode_dataset": "dataset_encoding",
     "export_plain": "plain",
-    "open": "volume",
+    "merge": "appending.merging",
+    "open": "dataset",
     "render": "rendering",
     "zarr_store": "zarr_view.store",
 }
@@ -62,6 +72,7 @@ _MODULES = {
 
 __all__ = [
     "DamagedFileError",
+    "Dataset",
     "EncodeConfig",
     "FhashError",
     "FhashWarning",
@@ -78,9 +89,13 @@ __all__ = [
     "TrainingError",
     "UnsupportedFileError",
     "Volume",
+    "Writer",
+    "append",
     "diff",
     "encode",
+    "encode_dataset",
     "export_plain",
+    "merge",
     "open",
     "render",
     "zarr_store",

@@ -5,6 +5,8 @@ FORMAT.md, The model, defines these parts. `Volume` inherits them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cached_property
 from math import floor, prod
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +18,13 @@ from fhash_codec.coreset.occupancy import pack, packed_bytes
 from fhash_codec.header import full_config
 from fhash_codec.model_parts import Mlp, Table
 from fhash_codec.paper.model import PaperModel
+from fhash_codec.provenance import metadata_of
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
 from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES
+from fhash_formats.series import AXES, Coordinate
+from fhash_formats.source_metadata import SourceMetadata
 
 __all__ = ["Card"]
 
@@ -35,6 +39,9 @@ class Card:
 
     if TYPE_CHECKING:
 
+        @property
+        def coords(self) -> Mapping[str, Coordinate]: ...
+
         def sample(
             self, *, z: Any, y: Any, x: Any, t: Any = None, time: Any = None, gradient: bool = False
         ) -> Any: ...
@@ -45,6 +52,14 @@ class Card:
     def size(self) -> int:
         """Number of vertices over all steps."""
         return prod(self.shape)
+
+    @cached_property
+    def metadata(self) -> SourceMetadata | None:
+        """All that belongs to the variable in its source, with a line of history for the encoding.
+
+        None where the file says nothing of it: arrays, formats without such things, older files.
+        """
+        return metadata_of(self.container, self.coords)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -151,7 +166,7 @@ class Card:
             return {"path": "", "coding": otherwise, "bytes": 0}
         size = sum(array.nbytes_stored for array in arrays)
         return {
-            "path": name,
+            "path": name if name not in stored else stored[name].name,
             "coding": arrays[0].coding,
             "bytes": size + (0 if bias is None else bias.nbytes_stored),
         }

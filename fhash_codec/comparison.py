@@ -21,6 +21,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
+from fhash_formats.container import Place
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
 
@@ -35,14 +36,18 @@ def ssim_budget(config: EncodeConfig) -> int:
     return QUICK_SSIM_BUDGET if config.effort == 1 else SSIM_BUDGET
 
 
-def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
-    """Decode every step of the container `path` and measure it against the data.
+def diff(
+    source: Source, path: Place, *, variable: str | None = None, progress: Progress = silent
+) -> dict[str, Any]:
+    """Decode every step of the container `path`, or at a URL, and measure it against the data.
+
+    variable: which one of the container, where it has several.
 
     Returns the figures of `report` and, as "differences", the lines of `differences`. Raises
     InputError if the shapes differ, DamagedFileError for a damaged container.
     """
     begun = time.perf_counter()
-    with open_source(source) as series, open_volume(path) as volume:
+    with open_source(source) as series, open_volume(path, variable=variable) as volume:
         if series.shape != volume.shape:
             raise InputError(
                 f"{series.source} has shape {series.shape}, {path} has {volume.shape} "
@@ -88,11 +93,17 @@ def _is_index(positions: npt.NDArray[np.float64]) -> bool:
 
 
 def measure(
-    series: Series, volume: Volume, progress: Progress, *, ssim_budget: int = SSIM_BUDGET
+    series: Series,
+    volume: Volume,
+    progress: Progress,
+    *,
+    ssim_budget: int = SSIM_BUDGET,
+    **options: Any,
 ) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
-    ssim_budget: vertices whose SSIM is measured; with 0 it is None.
+    ssim_budget: vertices whose SSIM is measured; with 0 it is None. options: further ones of
+    `measure_quality`.
 
     The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
@@ -110,6 +121,7 @@ def measure(
         bulk=_bulk(series, volume),
         neighbours=_neighbours(series, volume),
         ssim_budget=ssim_budget,
+        **options,
     )
     series.check()
     return quality.to_dict()

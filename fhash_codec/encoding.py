@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -85,36 +86,82 @@ def encode(
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
     with recording() as clock, _opened(source, path, force, config) as series:
-        check_output(path, force, sources=[*series.files, *_mask_files(config)])
+        check_output(path, force, sources=[*series.files, *mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
-            measured = _Measured(writer, series, config, progress)
-            checkpoint, advice = None, ""
-            if config.profile == "compact":
-                header = encode_compact(writer, series, config, mask, progress, measured.complete)
-            else:
-                header, checkpoint, advice = encode_paper(
-                    writer, series, config, mask, path, progress
-                )
-                header = measured.complete(header)
-            missed = missed_promise(config, measured.figures(header))
-            if missed is not None and os.path.lexists(path):
+            encoded = encode_variable(writer, series, config, mask, path, progress)
+            if encoded.missed is not None and os.path.lexists(path):
                 writer.divert(missed_path(path))
             written = writer.path
             progress("writing", 0, 1, "")
             with stage("writing", "header, and the file takes its name"):
-                writer.commit(_with_prediction(header, predicted, config, begun))
+                writer.commit(_with_prediction(encoded.header, predicted, config, begun))
             progress("writing", 1, 1, "")
-        if checkpoint is not None:
-            checkpoint.unlink(missing_ok=True)
+        encoded.remove_checkpoint()
     with open_volume(written) as volume:
         seconds = time.perf_counter() - begun
-        figures = report(volume, measured.quality, seconds=seconds, files=series.files)
+        figures = report(volume, encoded.quality, seconds=seconds, files=series.files)
     figures["stages"] = clock.to_list()
-    if missed is not None:
-        raise QualityError(_told(path, written, missed, advice), figures)
+    if encoded.missed is not None:
+        raise QualityError(missed_text(path, written, encoded.missed, encoded.advice), figures)
     for remark in remarks(config, figures):
         warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodedVariable:
+    """A variable whose arrays are written.
+
+    Attributes:
+        header: complete, with the measured quality.
+        quality: `metrics.Quality` as JSON values.
+        ratio: of the bytes of the series to those by which the file grows by the variable.
+        checkpoint: of the training, to be removed once the file is complete.
+        missed: what was promised and is missed; None where the promise is kept.
+        advice: what may help where it is missed.
+    """
+
+    header: dict[str, Any]
+    quality: dict[str, Any]
+    ratio: float
+    checkpoint: Path | None
+    missed: str | None
+    advice: str
+
+    def remove_checkpoint(self) -> None:
+        """Remove the checkpoint, whose file is complete."""
+        if self.checkpoint is not None:
+            self.checkpoint.unlink(missing_ok=True)
+
+
+def encode_variable(
+    writer: ContainerWriter,
+    series: Series,
+    config: EncodeConfig,
+    mask: npt.ArrayLike | None,
+    path: Path,
+    progress: Progress,
+) -> EncodedVariable:
+    """Write the arrays of one variable, and measure them as they decode.
+
+    mask: as in `encode`. path: of the file, beside which checkpoints lie.
+    """
+    measured = _Measured(writer, series, config, progress)
+    checkpoint, advice = None, ""
+    if config.profile == "compact":
+        header = encode_compact(writer, series, config, mask, progress, measured.complete)
+    else:
+        header, checkpoint, advice = encode_paper(writer, series, config, mask, path, progress)
+        header = measured.complete(header)
+    figures = measured.figures(header)
+    return EncodedVariable(
+        header=header,
+        quality=measured.quality,
+        ratio=figures["ratio"],
+        checkpoint=checkpoint,
+        missed=missed_promise(config, figures),
+        advice=advice,
+    )
 
 
 @contextmanager
@@ -224,7 +271,7 @@ def missed_path(path: Path) -> Path:
         number += 1
 
 
-def _told(path: Path, written: Path, missed: str, advice: str) -> str:
+def missed_text(path: Path, written: Path, missed: str, advice: str) -> str:
     """The message of a missed promise: what was missed, where the file is, and what may help."""
     where = "the file is written" if written == path else f"it is kept, the new file is {written}"
     return f"{path}: {missed}; {where}" + (f". {advice}" if advice else "")
@@ -238,7 +285,7 @@ def check_name(path: Path) -> None:
         )
 
 
-def _mask_files(config: EncodeConfig) -> list[str]:
+def mask_files(config: EncodeConfig) -> list[str]:
     """Paths of the masks among the features."""
     prefix = "mask:"
     return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.container import Container
+from fhash_formats.container import Container, Place
 from fhash_formats.errors import InputError
 
 __all__ = ["FeatureVolume", "feature_names", "holds_features_apart", "only_features"]
@@ -44,8 +43,9 @@ class FeatureVolume(Volume):
         first, last = int(np.floor(key)), int(np.ceil(key))
         return self._model.occupied_by(self.numbers, first, last, region)
 
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(_reopen, self.numbers, self._asked_fill), (self.path.absolute(),)
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
+        again = partial(_reopen, self.numbers, self.variable, self._asked_fill)
+        return again, (self.container.reopening(),)
 
 
 def only_features(volume: Volume, features: Sequence[str]) -> Volume:
@@ -112,6 +112,9 @@ def _names(volume: Volume) -> list[str]:
     return [str(name) for name in volume.container.header["features"]]
 
 
-def _reopen(numbers: Sequence[int], fill: int | float | None, path: Path) -> Volume:
-    """A volume of some features of the file at a path."""
-    return FeatureVolume(open_volume(path, fill=fill).container, numbers, fill=fill)
+def _reopen(
+    numbers: Sequence[int], variable: str | None, fill: int | float | None, path: Place
+) -> Volume:
+    """A volume of some features of the file at a place."""
+    container = open_volume(path, variable=variable, fill=fill).container
+    return FeatureVolume(container, numbers, fill=fill)

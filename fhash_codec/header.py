@@ -12,7 +12,6 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from itertools import zip_longest
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,13 @@ from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_codec.provenance import date_of, source_parts
+from fhash_formats.container import (
+    SOURCE,
+    Container,
+    ContainerWriter,
+    describe_coordinates,
+)
 from fhash_formats.container.header import MISSING
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
@@ -49,7 +54,7 @@ STEP_DIGITS = 5
 def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
-    """Header entries of a series: variable, shape and range, and a quality to be filled in."""
+    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
     variable: dict[str, Any] = {
         "name": str(series.name),
         "units": str(series.units),
@@ -58,7 +63,9 @@ def describe_source(
     }
     if series.fill is not None and math.isfinite(series.fill):
         variable["fill"] = series.fill
+    source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
     return {
+        **({} if source is None else {SOURCE: source | date_of(config)}),
         "encoder": {"version": version("fhash"), "seed": config.seed},
         "variable": variable,
         "domain": {"shape": list(series.shape)},
@@ -80,11 +87,14 @@ def write_series(
     """Write coordinates, key frames, and masks of the values that are not finite.
 
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows. everything: all finite values are in the coreset of every step, so that its mask says
+    allows, but for the coordinates of one of several variables, which share their arrays.
+    everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
-    coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
-    described = describe_coordinates(coords) if brief else {}
+    coords = _storable_coords(series)
+    for name, array in source_parts(series, coords, {})[1].items():
+        writer.add_whole(name, array)
+    described = describe_coordinates(coords) if brief and not writer.one_of_several else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -101,6 +111,11 @@ def write_series(
         return {"coordinates": described, "missing": OUTSIDE}
     _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
+
+
+def _storable_coords(series: Series) -> dict[str, Coordinate]:
+    """The coordinates of a series as a container holds them."""
+    return {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
 
 
 def _storable(coordinate: Coordinate) -> Coordinate:
@@ -311,17 +326,17 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
-def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -> dict[str, Any]:
+def describe_file(container: Container, path: object, key_frames: Sequence[int]) -> dict[str, Any]:
     """The header of a container, and what follows from it; see `Volume.info`."""
     header = container.header
     raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
     arrays = {
-        name: {
+        array.name: {
             "shape": list(array.shape),
             "dtype": str(array.dtype),
             "bytes": array.nbytes_stored,
         }
-        for name, array in container.arrays.items()
+        for array in container.arrays.values()
     }
     return {
         **full_header(header),

@@ -112,3 +112,15 @@ def coarse_vertices(box: Box, region: Box, lod: int, path: str) -> tuple[range, 
         vertices.append(along)
     z, y, x = vertices
     return z, y, x
+
+
+def shared_part(box: Box, region: Box) -> tuple[Box, Box] | None:
+    """The vertices that a region shares with a box; None if there are none.
+
+    They are returned twice: in vertices of the region, and in vertices of the box.
+    """
+    common = box.intersect(region)
+    if common is None:
+        return None
+    in_region = common.shift(-first for first in region.first)
+    return in_region, common.shift(-first for first in box.first)

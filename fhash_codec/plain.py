@@ -29,6 +29,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
@@ -65,7 +66,7 @@ def export_plain(
     """
     path = Path(os.path.normpath(path))
     check_name(path)
-    check_output(path, force, sources=[Path(source)])
+    check_output(path, force, sources=[source])
     with open_volume(source) as volume, ContainerWriter(path, force=force) as writer:
         export = _Export(volume, writer, progress)
         if volume.profile == "paper":
@@ -237,7 +238,7 @@ class _Export:
         return array.decode_table(index)[tuple(slice(0, a.stop - a.start) for a in region)]
 
     def _write_axes(self) -> None:
-        """Write positions and key frames as arrays, and the mask of missing values."""
+        """Write positions and key frames as arrays, and arrays of the source beside the values."""
         for axis, stored in AXIS_NAMES.items():
             coordinate = self._volume.coords[axis]
             self._writer.add_whole(
@@ -247,9 +248,11 @@ class _Export:
             )
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
-        if "missing/bits" in self._arrays:
-            self._total += prod(self._arrays["missing/bits"].grid)
-            self._copy(self._arrays["missing/bits"])
+        for name, array in self._arrays.items():
+            # the mask of missing values, and what belongs to the variable in its source
+            if name == "missing/bits" or name.startswith(AUXILIARY):
+                self._total += prod(array.grid)
+                self._copy(array)
 
     def _write_head(self, head: NeighbourHead | None) -> None:
         """Write weights and biases as the numbers that they are; `scale` is their unit."""

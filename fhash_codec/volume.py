@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, partial
-from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from fhash_codec.indexing import (
     coarse_vertices,
     expand_index,
     index_ranges,
+    shared_part,
     slice_of,
 )
 from fhash_codec.measure.value_range import ValueRange
@@ -30,7 +29,7 @@ from fhash_codec.sampling import interpolable
 from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
-from fhash_formats.container import Container
+from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
@@ -41,14 +40,28 @@ CLIPPED_SINCE = (1, 2)
 """Format version since which values between vertices and steps are clipped to the range, too."""
 
 
-def open(path: str | Path, *, fill: int | float | None = None) -> Volume:
-    """Open a `.fhz` file for reading; nothing is decoded yet.
+def open(
+    path: Place,
+    *,
+    variable: str | None = None,
+    fill: int | float | None = None,
+    storage_options: StorageOptions = None,
+) -> Volume:
+    """Open one variable of a `.fhz` file for reading, a URL or an open binary file.
 
+    variable: its name; None for the only one of the file.
     fill: what `volume[...]` gives at vertices without a value, see `Volume`.
+    storage_options: options of a URL's file system in fsspec.
 
-    Raises MissingInputError, DamagedFileError or UnsupportedFileError.
+    Nothing is decoded yet. Raises what `Container.open` raises, and InputError where the file does
+    not hold the variable, or holds several and none is named.
     """
-    return Volume(Container.open(path), fill=fill)
+    container = Container.open(path, storage_options=storage_options)
+    try:
+        return Volume(container.select(variable), fill=fill)
+    except BaseException:
+        container.close()
+        raise
 
 
 class Volume(Card):
@@ -70,7 +83,8 @@ class Volume(Card):
         name, units, attrs: of the variable.
         coords: a Coordinate for each of "t", "z", "y", "x".
         box: the feature bounding box, in vertices of the domain.
-        path: of the file.
+        path: of the file; a URL is text.
+        variable: name among several variables of the file; None where it is the only one.
         info: everything the file says of itself, as JSON values.
         config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
             `model`.
@@ -87,7 +101,8 @@ class Volume(Card):
         """
         header = container.header
         self.container = container
-        self.path = Path(container.path)
+        self.path = container.path
+        self.variable = container.variable
         self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
         self.value_type = ValueType.of(container)
         self.float_dtype = self.value_type.floats
@@ -151,7 +166,7 @@ class Volume(Card):
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        common = self._within_box(region)
+        common = shared_part(self.box, region)
         if common is None:
             result: npt.NDArray[Any] = np.full(region.shape, np.nan, dtype=self.float_dtype)
         else:
@@ -182,7 +197,7 @@ class Volume(Card):
         read = self.read(t, region, outside=outside)
         gaps = np.isnan(read)
         result: npt.NDArray[Any] = rounded(read, self.dtype)
-        common = self._within_box(self._checked(region))
+        common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             # float64 has not every integer of 64 bits.
             in_region, in_box = common
@@ -314,7 +329,7 @@ class Volume(Card):
         key = self._key_index(t)
         region = self._checked(region)
         result = np.zeros(region.shape, dtype=bool)
-        common = self._within_box(region)
+        common = shared_part(self.box, region)
         if common is not None:
             in_region, in_box = common
             result[in_region.slices()] = self._occupied(key, in_box)
@@ -354,17 +369,6 @@ class Volume(Card):
     def _checked(self, region: Spans | None) -> Box:
         return checked_region(region, self.shape[1:], str(self.path))
 
-    def _within_box(self, region: Box) -> tuple[Box, Box] | None:
-        """The vertices that a region shares with the feature bounding box; None if there are none.
-
-        They are returned twice: in vertices of the region, and in vertices of the box.
-        """
-        common = self.box.intersect(region)
-        if common is None:
-            return None
-        in_region = common.shift(-first for first in region.first)
-        return in_region, common.shift(-first for first in self.box.first)
-
     def _occupied(self, key: float, region: Box) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the coreset at a key index; the region is in vertices of the box."""
         return self._model.occupied(int(np.floor(key)), int(np.ceil(key)), region)
@@ -382,16 +386,12 @@ class Volume(Card):
     def __enter__(self) -> Volume:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return partial(open, fill=self._asked_fill), (self.path.absolute(),)
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
+        again = partial(open, variable=self.variable, fill=self._asked_fill)
+        return again, (self.container.reopening(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from range_server import RangeServer
+
+sys.path.insert(0, str(Path(__file__).parent / "serving"))
 
 # The tests' models are tiny: a second thread costs more than it brings, above all where several
 # test runs share a machine.
@@ -36,3 +44,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return len(SLOW_ROOMS) + (item.path.name not in SLOW_FILES)
 
     items.sort(key=rank)
+
+
+@pytest.fixture
+def range_server() -> Iterator[RangeServer]:
+    """A local HTTP server that counts what is asked of it."""
+    from range_server import RangeServer
+
+    with RangeServer() as server:
+        yield server

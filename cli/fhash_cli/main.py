@@ -24,6 +24,8 @@ from fhash_formats.errors import InterruptedEncodingError
 
 COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
+    "merge": "join the parts that `fhash encode --part` wrote",
+    "append": "code further steps behind those of RUN.fhz",
     "decode": "rebuild a region of RUN.fhz, at any time",
     "render": "draw a picture of RUN.fhz",
     "info": "say what RUN.fhz holds and how good it is",

@@ -28,6 +28,9 @@ feature_option = click.option(
     metavar="F",
     help="Only this feature of the file, as `fhash info` names it; repeat for several.",
 )
+variable_option = click.option(
+    "--var", "variable", metavar="NAME", help="Which variable of a file of several."
+)
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 
 
@@ -81,6 +84,24 @@ class RealRange(click.FloatRange):
         if math.isnan(number):
             self.fail(f"'{value}' is not a number", param, ctx)
         return number
+
+
+class NumberByVariable(RealRange):
+    """A number within limits, or one for each of some variables: `u=0.1,v=0.2`."""
+
+    def convert(  # type: ignore[override]
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | dict[str, float]:
+        """The number, or numbers by name; fails for a name that is given twice."""
+        if not isinstance(value, str) or "=" not in value:
+            return super().convert(value, param, ctx)
+        numbers: dict[str, float] = {}
+        for part in value.split(","):
+            name, _, number = (word.strip() for word in part.rpartition("="))
+            if not name or name in numbers:
+                self.fail(f"'{value}' is not NAME={self.name}, for each name once", param, ctx)
+            numbers[name] = super().convert(number, param, ctx)
+        return numbers
 
 
 class SelectType(click.ParamType[tuple[str, str]]):
@@ -137,8 +158,12 @@ class SourceOptions:
         return list_variables(path, steps=self.t, **self._wishes())
 
     def refuse(self, path: str) -> None:
-        """Raise InputError if any option is given, for a path that is no data."""
-        given = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        """Raise InputError if any option but --var is given, for a path that is no data."""
+        given = [
+            field.name
+            for field in dataclasses.fields(self)
+            if field.name != "var" and getattr(self, field.name)
+        ]
         if given:
             raise InputError(
                 f"{path} is encoded already; --{given[0].replace('_', '-')} is for data that are"
@@ -253,12 +278,14 @@ def config_options(*names: str, profile: str | None = None) -> Callable[[Command
     return decorate
 
 
-def setting_options(*names: str) -> Callable[[Command], Command]:
+def setting_options(*names: str, by_variable: bool = False) -> Callable[[Command], Command]:
     """Add options as `config_options` does; the command gets a dict of them as `settings`.
 
     It serves commands whose settings are for several profiles.
+
+    by_variable: whether a promise may be given for each variable, as a dict of numbers by name.
     """
-    from fhash_codec.config import EncodeConfig
+    from fhash_codec.config import PROMISES, EncodeConfig
 
     fields = [
         field for field in dataclasses.fields(EncodeConfig) if not names or field.name in names
@@ -273,13 +300,16 @@ def setting_options(*names: str) -> Callable[[Command], Command]:
 
         decorated: Command = collected
         for field in reversed(fields):
-            decorated = _setting(field, hints[field.name])(decorated)
+            each = by_variable and field.name in PROMISES
+            decorated = _setting(field, hints[field.name], by_variable=each)(decorated)
         return decorated
 
     return decorate
 
 
-def _setting(field: dataclasses.Field[Any], hint: Any) -> Callable[[Command], Command]:
+def _setting(
+    field: dataclasses.Field[Any], hint: Any, *, by_variable: bool = False
+) -> Callable[[Command], Command]:
     """The click option of one field of EncodeConfig."""
     limits = field.metadata
     flag = "--" + (limits["option"] or field.name).replace("_", "-")
@@ -304,7 +334,7 @@ def _setting(field: dataclasses.Field[Any], hint: Any) -> Callable[[Command], Co
         kind = (
             click.IntRange(int(limits["low"]), int(limits["high"]))
             if kind is int
-            else RealRange(limits["low"], limits["high"])
+            else (NumberByVariable if by_variable else RealRange)(limits["low"], limits["high"])
         )
     return click.option(
         flag,

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fhash_cli.intervals import written
 from fhash_formats.errors import RegionError
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from fhash_codec import Volume
     from fhash_formats.series import Coordinate
+    from fhash_formats.source_metadata import SourceMetadata
 
 Span = tuple[int, int]
 
@@ -131,6 +134,34 @@ def coordinates(
     }
 
 
+def count_inside(
+    volume: Volume,
+    step: float,
+    region: tuple[Span, Span, Span],
+    frame: npt.NDArray[Any],
+    outside: str,
+) -> int:
+    """Number of vertices of a decoded frame that are in the coreset."""
+    import numpy as np
+
+    if outside == "nan":
+        return frame.size - int(np.isnan(frame).sum())
+    return int(volume.occupancy(step, region).sum())
+
+
+def metadata(
+    volume: Volume, steps: Sequence[float], vertices: Sequence[range]
+) -> SourceMetadata | None:
+    """All that belongs to the variable in its source, at some (fractional) steps and vertices."""
+    if volume.metadata is None:
+        return None
+    whole = all(float(step).is_integer() for step in steps)
+    places = dict(zip("zyx", map(list, vertices), strict=True))
+    # between two steps nothing but the values and the time is known
+    times = {"t": [int(step) for step in steps] if whole else None}
+    return volume.metadata.cut({**times, **places})
+
+
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:
     """Ends of low:high among `count` as Python means them, but without its clipping."""
     first = 0 if low is None else low + count if low < 0 else low
@@ -145,12 +176,18 @@ def _span(what: str, low: int | None, high: int | None, count: int, allowed: str
     raise RegionError(f"{what} is {written(low, high)}, {reason}; {allowed}")
 
 
-def opened(run: str, fill: float | None, features: Sequence[str]) -> Volume:
-    """An open container, with some of its features alone if any are named; see `only_features`."""
+def opened(
+    run: str, fill: float | None, features: Sequence[str], variable: str | None = None
+) -> Volume:
+    """An open container, with some of its features alone if any are named; see `only_features`.
+
+    variable: which one, where the container has several.
+    """
     import fhash_codec
     from fhash_codec.feature_volume import only_features
+    from fhash_codec.volume import open as open_volume
 
-    volume = fhash_codec.open(run, fill=fill)
+    volume = open_volume(run, variable=variable, fill=fill)
     try:
         return only_features(volume, features) if features else volume
     except fhash_codec.InputError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -90,10 +91,15 @@ def encode_compact(
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
+        parts = table.parts
+        if writer.one_of_several:
+            # A library that shows the array decodes it by what the array itself says.
+            parts = replace(parts, apart=False)
         with stage("writing", "tiles"):
-            table.parts.write(writer)
+            parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
-        own = _header(selection, table, config, seconds)
+        own = table_header(selection, table, config, seconds)
+        own["required_features"] = list(parts.features)
         own["required_features"] += coordinate_features(described["coordinates"])
         header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
@@ -107,7 +113,7 @@ def encode_compact(
     return header
 
 
-def _header(
+def table_header(
     selection: FeatureSelection, table: CodedTable, config: EncodeConfig, seconds: float | None
 ) -> dict[str, Any]:
     """Return what a header says beside the source and its coordinates, without the quality.
@@ -123,7 +129,6 @@ def _header(
             "seed": config.seed,
             **({} if seconds is None else {"seconds": seconds}),
         },
-        "required_features": table.parts.features,
         "background": extent.background,
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],
@@ -132,14 +137,14 @@ def _header(
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
-        "training": _training(trained, timings=config.timings),
+        "training": training_header(trained, timings=config.timings),
         "history": history_columns(
             brief_history(trained, timings=config.timings, most=HEAD_POINTS)
         ),
     }
 
 
-def _training(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
+def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
     """Return what a header says of the training of the best head, which has this history.
 
     The device is "none" where nothing was trained.

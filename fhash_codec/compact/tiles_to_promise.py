@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import prod
+from typing import Any
 
 from fhash_codec.compact.choices.head_prospects import head_bytes
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE
 from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
-from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.goal import Goal, goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
 from fhash_codec.compact.tiles.coding import (
@@ -34,12 +35,13 @@ from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.measure.bulk import bulk_of_ranks, find_bulk
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
-__all__ = ["code_series", "resized"]
+__all__ = ["all_tiles", "code_layers", "code_series", "plan_series", "resized"]
 
 OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles, for the sizes after each stage."""
@@ -84,20 +86,10 @@ def code_series(
 
     Raises InputError for a promise that is seen to be out of reach.
     """
-    value_range = selection.scanned.value_range
-    raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
     begun = time.perf_counter()
-    blocks = Blocks(series, selection.extent, series.shape)
-    integers = blocks.dtype.kind in "iu"
-    with stage("bulk", "range of the middle 98 % of the values, which has a promise of its own"):
-        if blocks.in_memory or selection.ranks is None:
-            bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
-        else:  # the series was too long to be read for this alone
-            bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
-    goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
     with thread_pool() as workers:
-        coding_plan = plan(
-            blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
+        coding_plan, goal, bulk = plan_series(
+            series, selection, config, workers, progress, overhead=overhead
         )
         if goal.psnr is None or goal.data_range == 0:
             table = _code_all(coding_plan, workers, progress)
@@ -107,13 +99,53 @@ def code_series(
         else:
             aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, quick=config.effort == 1)
             table = _code_to_psnr(coding_plan, aim, workers, progress)
-    gain = {
-        "what": "all tiles",
-        "bytes": table.outcome.size + OVERHEAD_BYTES,
-        "seconds": round(time.perf_counter() - begun, 3),
-    }
+    gain = {**all_tiles(table.outcome.size), "seconds": round(time.perf_counter() - begun, 3)}
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
+
+
+def plan_series(
+    series: Series,
+    selection: FeatureSelection,
+    config: EncodeConfig,
+    workers: ThreadPoolExecutor,
+    progress: Progress,
+    *,
+    overhead: int = OVERHEAD_BYTES,
+) -> tuple[CodingPlan, Goal, ValueRange | None]:
+    """Return the plan of a series, its promise, and the bulk of its values; None without one.
+
+    Arguments and errors are those of `code_series`.
+    """
+    value_range = selection.scanned.value_range
+    raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
+    blocks = Blocks(series, selection.extent, series.shape)
+    integers = blocks.dtype.kind in "iu"
+    with stage("bulk", "range of the middle 98 % of the values, which has a promise of its own"):
+        if blocks.in_memory or selection.ranks is None:
+            bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+        else:  # the series was too long to be read for this alone
+            bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
+    goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
+    coding_plan = plan(
+        blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
+    )
+    return coding_plan, goal, bulk
+
+
+def all_tiles(size: int) -> dict[str, Any]:
+    """Return the last entry of a header's gains: tiles of so many bytes."""
+    return {"what": "all tiles", "bytes": size + OVERHEAD_BYTES}
+
+
+def code_layers(
+    coding_plan: CodingPlan, layers: range, workers: ThreadPoolExecutor, progress: Progress
+) -> CodedTable:
+    """Code some layers of tiles along time, and no others, with the same bytes as in a whole table.
+
+    They keep a bound; other promises ask for all tiles.
+    """
+    return _code_all(coding_plan, workers, progress, layers=layers)
 
 
 def resized(table: CodedTable, overhead: int, progress: Progress) -> CodedTable:
@@ -284,11 +316,15 @@ def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:
 
 
 def _code_all(
-    coding_plan: CodingPlan, workers: ThreadPoolExecutor, progress: Progress, note: str = ""
+    coding_plan: CodingPlan,
+    workers: ThreadPoolExecutor,
+    progress: Progress,
+    note: str = "",
+    layers: range | None = None,
 ) -> CodedTable:
     """Code every tile; few tiles are worked on at a time, so that memory stays bounded.
 
-    note: for the progress.
+    note: for the progress. layers: of tiles along time that are coded; all if None.
     """
     blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
@@ -302,7 +338,8 @@ def _code_all(
     streams: list[bytes] = []
     decoded_tiles: list[Values | None] = []
     outcomes: list[Outcome] = []
-    sources = _sources(coding_plan)
+    indices = [index for index in blocks.indices() if layers is None or index[0] in layers]
+    sources = _sources(coding_plan, indices)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
@@ -310,8 +347,8 @@ def _code_all(
             streams.append(data)
             outcomes.append(outcome)
             decoded_tiles.append(values)
-            progress("coding", len(streams), prod(blocks.grid), note)
-    kept = zip(blocks.indices(), decoded_tiles, strict=True)
+            progress("coding", len(streams), len(indices), note)
+    kept = zip(indices, decoded_tiles, strict=True)
     return CodedTable(
         plan=coding_plan,
         streams=streams,
@@ -320,7 +357,7 @@ def _code_all(
     )
 
 
-def _sources(coding_plan: CodingPlan) -> Iterator[Index | Tile | TileRun]:
+def _sources(coding_plan: CodingPlan, indices: Sequence[Index]) -> Iterator[Index | Tile | TileRun]:
     """Yield what each tile is made of, in C order: its stream, where the search has coded it so.
 
     Else it is the tile that the search has filled, or one that is read here, or its index where the
@@ -333,7 +370,7 @@ def _sources(coding_plan: CodingPlan) -> Iterator[Index | Tile | TileRun]:
         filled = dict(zip(sample.indices, sample.tiles, strict=True))
         if not coding_plan.keeps_decoded:
             known = sample.coded(coding_plan.settings, coding_plan.coding)
-    for index in blocks.indices():
+    for index in indices:
         if index in known:
             yield known[index]
         elif index in filled:

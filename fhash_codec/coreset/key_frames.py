@@ -74,7 +74,14 @@ class KeyTimes:
         between two steps. Steps before the first key frame or after the last one take its index; a
         single key frame gives 0. Raises RegionError for a step outside the series.
         """
-        return float(self.key_indices(step))
+        last = self.times.size - 1
+        if not 0 <= step <= last:
+            raise RegionError(f"step {step:g} is outside 0..{last}")
+        before = int(step)
+        indices = self._key_indices_of_steps
+        low, high = indices.item(before), indices.item(min(before + 1, last))
+        between = low + (high - low) * (step - before)
+        return float(min(max(between, 0.0), len(self.key_frames) - 1))
 
     def key_indices(self, steps: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """`key_index` of an array of steps of any shape."""
@@ -83,13 +90,13 @@ class KeyTimes:
         outside = ~((steps >= 0) & (steps <= last))
         if outside.any():
             raise RegionError(f"step {steps[outside].flat[0]:g} is outside 0..{last}")
-        return np.asarray(
-            np.clip(
-                np.interp(steps, np.arange(last + 1), self._key_indices_of_steps),
-                0,
-                len(self.key_frames) - 1,
-            )
-        )
+        # Linear between neighbours, found by their number: a search through all steps for each
+        # of them would make reading a long series quadratic.
+        before = np.floor(steps).astype(np.int64)
+        indices = self._key_indices_of_steps
+        low, high = indices[before], indices[np.minimum(before + 1, last)]
+        between = low + (high - low) * (steps - before)
+        return np.asarray(np.clip(between, 0, len(self.key_frames) - 1))
 
     def keys_per_step(self, steps: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The derivative of the key index by the step, at steps of any shape.

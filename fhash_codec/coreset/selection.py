@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,19 +15,18 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.extent import Extent, find_extent
 from fhash_codec.coreset.features import Feature, Mask, resolve_features
 from fhash_codec.coreset.key_frames import select_key_frames, time_axis
+from fhash_codec.coreset.labelled import array_series
 from fhash_codec.coreset.scan import Scan, scan
 from fhash_codec.measure.ranks import Ranks
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.layout import Dimension, must_select
-from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate
-from fhash_formats.series import AXES, ArraySeries, Coordinate, Series
-from fhash_formats.support.attributes import json_attributes
+from fhash_formats.series import Series
 
 Source = str | Path | Series | npt.ArrayLike
-"""Data to encode: a file, a Series, or an array (t, z, y, x) or (z, y, x), labelled or not."""
+"""Data to encode: a file, a Series, an array (t, z, y, x) or (z, y, x), labelled or not, or a
+Dataset of xarray with one variable that can be encoded."""
 
 
 @contextmanager
@@ -42,61 +40,7 @@ def open_source(source: Source) -> Iterator[Series]:
         with open_series(source) as series:
             yield series
     else:
-        yield source if isinstance(source, Series) else _array_series(source)
-
-
-def _array_series(source: npt.ArrayLike) -> Series:
-    """The series of an array; a labelled array (xarray.DataArray) keeps its labels.
-
-    Labels are the name, units, attributes and coordinates. The axes of the array are what the names
-    and attributes of its dimensions say, else (t, z, y, x) in this order.
-    """
-    dims, labels = getattr(source, "dims", None), getattr(source, "coords", None)
-    if dims is None or labels is None or len(dims) < 3:
-        return ArraySeries(source)
-    name = str(getattr(source, "name", None) or "values")
-    values = np.asarray(source)
-    axes = _axes(name, [str(dim) for dim in dims], values.shape, labels)
-    coords = {
-        axis: _coordinate(str(dim), labels[dim])
-        for axis, dim in zip(axes, dims, strict=True)
-        if dim in labels and labels[dim].dtype.kind in "iufM"
-    }
-    attributes = json_attributes(source.attrs)  # type: ignore[union-attr]
-    present = [axis for axis in AXES if axis in axes]
-    ordered = values.transpose([axes.index(axis) for axis in present])
-    if "t" in axes:
-        absent = tuple(place for place, axis in enumerate(AXES) if axis not in axes)
-        ordered = np.expand_dims(ordered, absent)
-    return ArraySeries(ordered, name=name, units=str(attributes.get("units", "")), coords=coords)
-
-
-def _axes(name: str, dims: list[str], shape: tuple[int, ...], labels: Any) -> tuple[str, ...]:
-    """The axis of each dimension of a labelled array; raises InputError where it has others."""
-    roles = [role_of_coordinate(dim, labels[dim].attrs if dim in labels else {}) for dim in dims]
-    if not any(roles) and len(dims) <= len(AXES):
-        return AXES[-len(dims) :]
-    known = [
-        Dimension(name=dim, length=length, role=role)
-        for dim, length, role in zip(dims, shape, roles, strict=True)
-    ]
-    open_dims = [dims[place] for place in must_select(known, {})]
-    if open_dims:
-        choice = ", ".join(f"{dim}=0" for dim in open_dims)
-        raise InputError(
-            f"array '{name}' has the dimensions {', '.join(dims)}, and a series only t, z, y and"
-            f" x; select one index of the others, such as array.isel({choice})"
-        )
-    return assign_axes(f"array '{name}'", shape, roles, dims, None)
-
-
-def _coordinate(name: str, label: Any) -> Coordinate:
-    """The coordinate of a labelled axis; dates become seconds since 1970."""
-    values, attributes = np.asarray(label), json_attributes(label.attrs)
-    if values.dtype.kind == "M":
-        values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-        attributes = {"units": "seconds since 1970-01-01", "calendar": "proleptic_gregorian"}
-    return Coordinate(name=name, values=values.astype(np.float64), attributes=attributes)
+        yield source if isinstance(source, Series) else array_series(source)
 
 
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -29,6 +29,8 @@ from fhash_formats.support.threads import usable_threads
 
 __all__ = [
     "BetweenQuality",
+    "Comparer",
+    "Comparison",
     "Errors",
     "Quality",
     "StepQuality",
@@ -81,7 +83,7 @@ class Quality:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Comparison:
+class Comparison:
     """Comparison of one step.
 
     Attributes:
@@ -100,7 +102,7 @@ class _Comparison:
     ssim_seconds: float
 
 
-class _Comparer:
+class Comparer:
     """Comparison of decoded steps with the original, a few steps at a time in threads.
 
     The figures are added up in the order of the steps, whatever the number of threads.
@@ -123,7 +125,7 @@ class _Comparer:
         *,
         with_ssim: bool,
         threads: int,
-    ) -> _Comparison:
+    ) -> Comparison:
         """Compare one step; safe in any thread.
 
         neighbours: the key frames around the step; None for a key frame. threads: of the SSIM.
@@ -143,7 +145,7 @@ class _Comparer:
         between = None
         if neighbours is not None:
             between = self.between.compare(step, original, decoded, in_coreset, neighbours)
-        return _Comparison(
+        return Comparison(
             step=step,
             coreset=coreset,
             domain=domain,
@@ -153,7 +155,7 @@ class _Comparer:
             ssim_seconds=ssim_seconds,
         )
 
-    def add(self, comparison: _Comparison) -> StepQuality:
+    def add(self, comparison: Comparison) -> StepQuality:
         """Add a step to the figures of the series; the steps come in order."""
         figures = self.coreset.take(comparison.step, comparison.coreset)
         self.domain.take(comparison.step, comparison.domain)
@@ -210,6 +212,8 @@ def measure_quality(
     bulk: ValueRange | None = None,
     neighbours: NeighboursOf | None = None,
     ssim_budget: int = BUDGET,
+    ssim_measured: Sequence[int] | None = None,
+    observe: Callable[[Comparison], None] = lambda comparison: None,
 ) -> Quality:
     """Compare all steps of a decoded series with the original.
 
@@ -220,18 +224,22 @@ def measure_quality(
     bulk: of the original series, in data units (`find_bulk`); no figures of it if None.
     neighbours: of the key frames, see `neighbours_of`; None if every step is a key frame.
     ssim_budget: vertices whose SSIM is measured (`ssim_steps`); with 0 it is None, of no step.
+    ssim_measured: steps whose SSIM is measured, in place of those of a budget.
+    observe: called with the comparison of each step, in their order.
 
     At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
     of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
     Progress stage: "measuring".
     """
-    comparer = _Comparer(data_range, background, bulk)
+    comparer = Comparer(data_range, background, bulk)
     measured, begun = [-1], time.perf_counter()
-    threads, waiting = usable_threads(), deque[Future[_Comparison]]()
+    threads, waiting = usable_threads(), deque[Future[Comparison]]()
 
     def collect() -> None:
         """Wait for the first step under way, and add it."""
-        figures = comparer.add(waiting.popleft().result())
+        comparison = waiting.popleft().result()
+        figures = comparer.add(comparison)
+        observe(comparison)
         # The figure of all steps so far: those of single steps would go up and down.
         psnr = comparer.coreset.psnr
         note = "" if psnr is None else f"{psnr:.1f} dB so far"
@@ -244,6 +252,7 @@ def measure_quality(
             comparer.seconds += time.perf_counter() - reading
             if step == 0:
                 measured = ssim_steps(steps, original.size, ssim_budget) if ssim_budget else []
+                measured = measured if ssim_measured is None else list(ssim_measured)
             at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
             while len(waiting) >= at_once:
                 collect()

@@ -34,6 +34,7 @@ from fhash_codec.rendering.task.units import Units
 from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashError
+from fhash_formats.support.locations import file_name
 
 __all__ = ["Renderer", "decoded_frame"]
 
@@ -207,7 +208,7 @@ class Renderer:
             normal=None if marched.normal is None else _placed(marched.normal, layout, 0.0),
             counters=complete(marched.counters, more),
             scene=plan.scene.to_dict(),
-            source=volume.path.name,
+            source=file_name(volume.path),
             digest=volume.container.digest,
         )
         label = time_text(plan.step, plan.time, volume.coords["t"])

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from fhash_codec.dataset import open as open_file
 from fhash_codec.volume import Volume
 from fhash_codec.zarr_view.arrays import ViewArray, chunk_index, chunk_key
 from fhash_codec.zarr_view.chunking import view_chunks

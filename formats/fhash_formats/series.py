@@ -12,7 +12,7 @@ The contract of every reader:
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, RegionError
+from fhash_formats.source_metadata import SourceMetadata
 
 AXES = ("t", "z", "y", "x")
 AXIS_NAMES = {"t": "time", "z": "z", "y": "y", "x": "x"}
@@ -85,6 +86,21 @@ class Series(ABC):
     occurring: AbstractSet[float] = frozenset()
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
+    _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
+
+    @property
+    def metadata(self) -> SourceMetadata | None:
+        """All that belongs to the variable in its source; None where nothing is known.
+
+        It is read at the first use. Warns (FhashWarning) of what is left out.
+        """
+        if callable(self._metadata):
+            self._metadata = self._metadata()
+        return self._metadata
+
+    @metadata.setter
+    def metadata(self, metadata: SourceMetadata | Callable[[], SourceMetadata | None]) -> None:
+        self._metadata = metadata
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -154,12 +170,17 @@ class StepsSeries(Series):
         self.source, self.name, self.units = series.source, series.name, series.units
         self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
         self.inherit(series)
+        self.metadata = self._metadata_of_steps
         self.shape = (len(self.steps), *series.shape[1:])
         time = series.coords["t"]
         self.coords = {
             **series.coords,
             "t": replace(time, values=time.values[list(self.steps)]),
         }
+
+    def _metadata_of_steps(self) -> SourceMetadata | None:
+        metadata = self.series.metadata
+        return None if metadata is None else metadata.cut({"t": self.steps})
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)

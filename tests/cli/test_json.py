@@ -188,6 +188,22 @@ def test_verify_and_decode(fhash: Fhash, run: Path) -> None:
     check("export", parsed(fhash(*words)))
 
 
+def test_append(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run.fhz"
+    words = ("--max-error", "0.1", "--tile", "1x6x7x8", "--effort", "1", "-q")
+    assert fhash("encode", data, "-o", run, *words, "--t", "0:2").exit_code == 0
+    check("append", parsed(fhash("append", run, data, "--t", "2:3", "--json", "-q")))
+
+
+def test_merge(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ("--max-error", "0.1", "--tile", "2x6x7x8", "--effort", "1", "-q", "--json")
+    parts = [tmp_path / f"{number}.fhz" for number in (1, 2)]
+    for number, part in enumerate(parts, start=1):
+        encoded = parsed(fhash("encode", data, "-o", part, *words, "--part", f"{number}/2"))
+        assert encoded["path"] == str(part)
+    check("merge", parsed(fhash("merge", *parts, "-o", tmp_path / "a.fhz", "--json", "-q")))
+
+
 def test_render(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     words = ["render", run, "--size", "16x16", "--json", "-q", "-o", tmp_path / "a.png"]
     check(

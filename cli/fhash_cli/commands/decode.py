@@ -18,12 +18,15 @@ from fhash_cli.options import (
     json_option,
     quiet_option,
     run_argument,
+    variable_option,
 )
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, say, spans, table
 from fhash_cli.selection import (
     Span,
     coordinates,
+    count_inside,
     dates_of,
+    metadata,
     opened,
     region_of,
     region_of_box,
@@ -45,6 +48,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 
 @click.command("decode", cls=BaseCommand)
 @run_argument
+@variable_option
 @click.option(
     "--t",
     "steps",
@@ -114,6 +118,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @quiet_option
 def command(
     run: str,
+    variable: str | None,
     features: tuple[str, ...],
     steps: slice | None,
     times: tuple[str, ...],
@@ -139,7 +144,7 @@ def command(
     _check_output(output, isosurface, dtype, force, run)
     if isosurface is not None and fill is not None:
         raise click.UsageError("--isosurface has no fill value; leave out --fill")
-    with opened(run, fill, features) as volume, Progress(quiet=quiet) as progress:
+    with opened(run, fill, features, variable) as volume, Progress(quiet=quiet) as progress:
         if isosurface is not None:
             dtype = volume.float_dtype.name
         selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype, fill)
@@ -270,7 +275,7 @@ class Selection:
                 if self.lod is None
                 else volume.read_lod(step, self.lod, self.region)
             )
-            statistics.add(frame, _inside(volume, step, self.region, frame, self.outside))
+            statistics.add(frame, count_inside(volume, step, self.region, frame, self.outside))
             if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
                 # float64 has not every integer of 64 bits.
                 frame = volume.values(step, self.region, outside=self.outside)
@@ -298,8 +303,7 @@ def _save_surface(
         )
     coords = coordinates(volume, selection.steps, selection.vertices)
     (frame,) = frames
-    time = float(coords["t"].values[0])
-    mesh = surface(frame, isosurface, coords, name=volume.name, time=time)
+    mesh = surface(frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0]))
     return [str(save_mesh(output, mesh, force=force, sources=[run]))]
 
 
@@ -322,9 +326,9 @@ def _save_region(
         shape=selection.shape,
         coords=coordinates(volume, selection.steps, selection.vertices),
         attributes=volume.attrs,
+        metadata=metadata(volume, selection.steps, selection.vertices),
     )
-    paths = save_region(output, region, frames, force=force, sources=[run])
-    return [str(path) for path in paths]
+    return [str(path) for path in save_region(output, region, frames, force=force, sources=[run])]
 
 
 class Statistics:
@@ -365,21 +369,6 @@ class Statistics:
             "mean": self.mean.value() if defined else None,
             "inside_fraction": self.inside / self.all,
         }
-
-
-def _inside(
-    volume: Volume,
-    step: float,
-    region: tuple[Span, Span, Span],
-    frame: npt.NDArray[Any],
-    outside: str,
-) -> int:
-    """Number of vertices of a decoded frame that are in the coreset."""
-    import numpy as np
-
-    if outside == "nan":
-        return frame.size - int(np.isnan(frame).sum())
-    return int(volume.occupancy(step, region).sum())
 
 
 def _rows(result: dict[str, Any], volume: Volume) -> list[tuple[str, str]]:

@@ -50,16 +50,20 @@ def command(
 ) -> None:
     """Compare RUN.fhz with the DATA it was made from, over all steps.
 
-    Where DATA has several variables, it is the one that RUN.fhz has the name of. Other differences
-    than of values, such as of units or positions, are told on stderr.
+    Where DATA has several variables, it is the one that RUN.fhz has the name of; where RUN.fhz has
+    several, --var chooses one of both. Other differences than of values, such as of units or
+    positions, are told on stderr.
     """
     import fhash_codec
 
     if data.endswith(".fhz") and not run.endswith(".fhz"):
         raise click.UsageError(f"the data come first: fhash diff {run} {data}")
+    variable = _variable_of(run, source)
     with Progress(quiet=quiet) as progress, _open(source, data, run, progress) as series:
-        report = fhash_codec.diff(series, run, progress=progress)
-        fill = None if source.missing or series.fill is not None else _missing_of(run)
+        report = fhash_codec.diff(series, run, variable=variable, progress=progress)
+        fill = None
+        if not source.missing and series.fill is None:
+            fill = _missing_of(run, variable)
     if fill is not None and not quiet:
         say(f"{run} was encoded with --missing {fill:.9g}; add it here, or it counts as a value")
     for line in report["differences"]:
@@ -76,13 +80,13 @@ def _open(
     source: SourceOptions, data: str, run: str, progress: Callable[[str, int, int, str], None]
 ) -> Any:
     """The series of the data: of several variables, the one that the container has the name of."""
-    import fhash_codec
+    from fhash_codec.volume import open as open_volume
     from fhash_formats.readers.common.variables import SeveralVariablesError
 
     try:
         return source.open(data, progress)
     except SeveralVariablesError as error:
-        with fhash_codec.open(run) as volume:
+        with open_volume(run) as volume:
             name = volume.name
         alike = [full for full in error.names if f"/{full}".endswith((f"/{name}", f".{name}"))]
         if len(alike) != 1:
@@ -90,11 +94,31 @@ def _open(
         return dataclasses.replace(source, var=alike[0]).open(data, progress)
 
 
-def _missing_of(run: str) -> float | None:
-    """The number that stood for a missing value in the source of a container, if any."""
-    import fhash_codec
+def _variable_of(run: str, source: SourceOptions) -> str | None:
+    """The variable of a container of several that is compared; None where it has one.
 
-    with fhash_codec.open(run) as volume:
+    Raises InputError where it has several and `--var` names none of them.
+    """
+    from fhash_codec.volume import open as open_volume
+    from fhash_formats.container import Container
+
+    with Container.open(run) as container:
+        if not container.variables:
+            return None
+        # A component of a vector: --var velocity --select component=0 is velocity_0.
+        components = [f"{source.var}_{index}" for _, index in source.select]
+        for name in (source.var, *components):
+            if name in container.variables:
+                return name
+    with open_volume(run, variable=source.var) as volume:
+        return volume.variable
+
+
+def _missing_of(run: str, variable: str | None) -> float | None:
+    """The number that stood for a missing value in the source of a container, if any."""
+    from fhash_codec.volume import open as open_volume
+
+    with open_volume(run, variable=variable) as volume:
         return volume.value_type.fill
 
 

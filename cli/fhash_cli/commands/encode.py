@@ -19,11 +19,11 @@ from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
-    config_options,
     force_option,
     json_option,
     quiet_option,
     series_options,
+    setting_options,
 )
 from fhash_cli.output import (
     Progress,
@@ -38,6 +38,7 @@ from fhash_cli.output import (
     spans,
     table,
 )
+from fhash_cli.variables import config_of, configs_of, report_table, variables_to_encode
 from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
@@ -55,7 +56,13 @@ MAX_LABELS = 64
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
 )
 @series_options
-@config_options()
+@setting_options(by_variable=True)
+@click.option(
+    "--components",
+    metavar="DIM",
+    help="Dimension of vectors, each component of which becomes a variable of its own, such as "
+    "velocity_0.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -69,6 +76,13 @@ MAX_LABELS = 64
     "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
     "that may be chosen.",
 )
+@click.option(
+    "--part",
+    metavar="I/N",
+    help="Encode only the I-th of N parts, counted from 1: whole layers of tiles along time, such "
+    "as 3/16 for the third machine of 16. `fhash merge` joins the parts to the file that one "
+    "command would write with --no-timings. Needs --max-error or --max-error-rel.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -81,12 +95,14 @@ def command(
     data: str,
     output: str,
     source: SourceOptions,
-    config: EncodeConfig,
+    settings: dict[str, Any],
+    components: str | None,
     force: bool,
     as_json: bool,
     quiet: bool,
     explain: bool,
     time_budget: float | None,
+    part: str | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -95,15 +111,24 @@ def command(
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files
     in quotes ('step_*.raw').
 
+    --var u,v,w or --var all encodes several variables into one file, each with its own promise if
+    wished: --max-error u=0.1,v=0.2.
+
     Ctrl-C leaves no file, and an older RUN.fhz as it was. With --profile paper it saves a
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
     """
-    import fhash_codec
-    from fhash_codec.promises import decided_by_bulk
-
+    if part is not None and (explain or time_budget is not None or report_folder is not None):
+        raise click.UsageError("--part goes without --explain, --time-budget and --report")
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
+    several = variables_to_encode(source, data, components, quiet=quiet)
+    if several is not None:
+        if time_budget is not None or report_folder is not None or verbose or part is not None:
+            raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
+        encoded = _encode_several(data, output, several, settings, force, quiet)
+        return _emit_several(encoded, explain, as_json)
+    config = config_of(settings)
     if report_folder is not None:
         check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
@@ -116,9 +141,8 @@ def command(
             config = choice.config
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = fhash_codec.encode(
-                series, output, config, force=force, progress=progress, predicted=predicted
-            )
+            options = {"force": force, "progress": progress, "predicted": predicted}
+            report = _encode(series, output, config, part, options)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
@@ -128,23 +152,109 @@ def command(
             stopped = _write_report(
                 series, report, config, Path(report_folder), force, missed, progress
             )
-    _say_unmet(source, series, quiet)
-    integers = (series.source_dtype or series.dtype).kind in "iu"
-    if integers and not quiet and looks_categorical(report):
-        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
-    if not quiet and missed is None and (line := decided_by_bulk(config, report)) is not None:
-        say(line)
+    if not quiet:
+        _say_remarks(source, series, config, report, promise_kept=missed is None)
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))
-    text = table(rows)
-    stages = report.pop("stages")
-    if explain:
-        report["stages"] = stages
-        text += f"\n\n{stage_table(stages)}"
+    text = table(rows) + _explained(report, explain)
     if choice is not None:
         report["time_budget"] = choice.to_dict()
-    emit(report, text, as_json, missed or stopped)
+    return emit(report, text, as_json, missed or stopped)
+
+
+def _explained(figures: dict[str, Any], explain: bool, title: str = "") -> str:
+    """The table of the stages of a report, which keeps them only where they are asked for."""
+    stages = figures.pop("stages")
+    if not explain:
+        return ""
+    figures["stages"] = stages
+    return f"\n\n{title}{stage_table(stages)}"
+
+
+def _say_remarks(
+    source: SourceOptions,
+    series: Series,
+    config: EncodeConfig,
+    report: Mapping[str, Any],
+    *,
+    promise_kept: bool,
+) -> None:
+    """Lines on what may be a slip in the command, or decided the size."""
+    from fhash_codec.promises import decided_by_bulk
+
+    for value in source.missing:
+        if value == value and value not in series.occurring:
+            say(f"--missing {value:.9g}: {series.source} holds no such value")
+    integers = (series.source_dtype or series.dtype).kind in "iu"
+    if integers and looks_categorical(report):
+        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
+    if promise_kept and (line := decided_by_bulk(config, report)) is not None:
+        say(line)
+
+
+def _encode_several(
+    data: str,
+    output: str,
+    several: Mapping[str, SourceOptions],
+    settings: Mapping[str, Any],
+    force: bool,
+    quiet: bool,
+) -> tuple[dict[str, Any], QualityError | None]:
+    """Encode several variables into one file: its figures, and the promises that it misses.
+
+    several: how each is opened, by its name.
+    """
+    from fhash_codec.dataset_encoding import encode_dataset
+
+    before, names = _stamp(output), list(several)
+    with Progress(quiet=quiet) as progress:
+        try:
+            figures = encode_dataset(
+                data,
+                output,
+                configs_of(settings, names),
+                variables=names,
+                open_variable=lambda name: several[name].open(data, progress),
+                force=force,
+                progress=progress,
+            )
+        except QualityError as error:
+            return error.figures, error
+        except KeyboardInterrupt:
+            raise InterruptedEncodingError(_after_interruption(output, before)) from None
+    return figures, None
+
+
+def _emit_several(
+    encoded: tuple[dict[str, Any], QualityError | None], explain: bool, as_json: bool
+) -> None:
+    """Print the figures of a file of several variables, and raise what it misses."""
+    report, missed = encoded
+    variables = report["variables"]
+    rows = [
+        ("written", str(report["path"])),
+        ("size", compared(report)),
+        ("time", duration(report["seconds"])),
+    ]
+    text = f"{table(rows)}\n\n{table(report_table(variables))}"
+    for name, figures in variables.items():
+        text += _explained(figures, explain, f"{name}\n")
+    emit(report, text, as_json, missed)
+
+
+def _encode(
+    series: Series, output: str, config: EncodeConfig, part: str | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Encode a series, or one part of it such as "3/16"; the report, with its stages."""
+    import fhash_codec
+    from fhash_codec.appending.parts import Part, encode_part
+
+    if part is None:
+        return fhash_codec.encode(series, output, config, **options)
+    del options["predicted"]
+    report = encode_part(series, output, config, Part.parse(part), **options)
+    return {**report, "stages": []}
 
 
 def _choose(
@@ -213,13 +323,6 @@ def _write_report(
     return InterruptedEncodingError(
         f"interrupted; {figures['path']} is complete, {page} has what was measured until then"
     )
-
-
-def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:
-    """One line for each `--missing V` that occurs nowhere: it may be a slip."""
-    for value in source.missing:
-        if value == value and value not in series.occurring and not quiet:
-            say(f"--missing {value:.9g}: {series.source} holds no such value")
 
 
 def looks_categorical(report: Mapping[str, Any]) -> bool:

@@ -24,9 +24,10 @@ from fhash_cli.output import (
     table,
 )
 from fhash_cli.source_listing import details, details_rows, listing, positions
+from fhash_cli.variables import info_table
 
 if TYPE_CHECKING:
-    from fhash_codec import Volume
+    from fhash_codec import Dataset, Volume
 
 
 @click.command("info", cls=BaseCommand)
@@ -42,7 +43,7 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
 
     Of DATA, any source that `fhash encode` reads: the variables with shape, type, units and axes,
     and the command that encodes each. The options but -v are those of `fhash encode`; --var and
-    --t choose what is told in detail.
+    --t choose what is told in detail. Of several variables in RUN.fhz, --var chooses one.
     """
     if not _is_run(path):
         from fhash_codec.progress import silent
@@ -65,16 +66,43 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
     import fhash_codec
 
     source.refuse(path)
-    with fhash_codec.open(path) as volume:
-        info = {**volume.info, "config": volume.config, "card": volume.describe()}
-        rows = [*_rows(volume, info), *card_rows(info, verbose=verbose)]
+    with fhash_codec.open(path, variable=source.var) as opened:
+        if isinstance(opened, fhash_codec.Dataset):
+            _emit_dataset(opened, as_json)
+            return
+        info = {**opened.info, "config": opened.config, "card": opened.describe()}
+        rows = [*_rows(opened, info), *card_rows(info, verbose=verbose)]
         emit(info, table(rows), as_json)
+
+
+def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
+    """Print what a file of several variables holds: a line for each."""
+    infos = {name: volume.info for name, volume in dataset.items()}
+    version, container = dataset.container.header["format_version"], dataset.container
+    raw = sum(info["raw_bytes"] for info in infos.values())
+    result = {
+        "path": str(dataset.path),
+        "format_version": version,
+        "bytes": container.size,
+        "raw_bytes": raw,
+        "ratio": raw / container.size,
+        "variables": infos,
+    }
+    rows = [
+        ("file", f"{dataset.path}, format {'.'.join(map(str, version))}"),
+        ("size", compared(result)),
+    ]
+    more = f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one"
+    emit(result, f"{table(rows)}\n\n{table(info_table(infos))}\n\n{more}", as_json)
 
 
 def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
     from fhash_formats.container import is_container
+    from fhash_formats.support.locations import is_url
 
+    if is_url(path):
+        return True
     place = Path(path)
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
 

@@ -15,10 +15,18 @@ from fhash_cli.animation_options import (
     tracking,
 )
 from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import check_writable, force_option, json_option, quiet_option, run_argument
+from fhash_cli.options import (
+    check_writable,
+    force_option,
+    json_option,
+    quiet_option,
+    run_argument,
+    variable_option,
+)
 from fhash_cli.output import Progress, emit, extent, number, table
 from fhash_cli.scene_options import SceneOptions, scene_options
 from fhash_formats.errors import InputError
+from fhash_formats.support.locations import file_name
 
 if TYPE_CHECKING:
     from fhash_codec.rendering.picture.image import Image
@@ -28,6 +36,7 @@ if TYPE_CHECKING:
 
 @click.command("render", cls=BaseCommand)
 @run_argument
+@variable_option
 @click.option(
     "-o",
     "output",
@@ -50,6 +59,7 @@ if TYPE_CHECKING:
 @quiet_option
 def command(
     run: str,
+    variable: str | None,
     output: str | None,
     options: SceneOptions,
     several: AnimationOptions,
@@ -65,12 +75,12 @@ def command(
     With --animate the output is NAME.png for numbered pictures, of which only missing ones are
     drawn, or a film NAME.mp4 or NAME.gif.
     """
-    import fhash_codec
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.times import time_text
+    from fhash_codec.volume import open as open_volume
 
-    path = Path(output) if output is not None else Path(Path(run).stem + ".png")
-    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+    path = Path(output) if output is not None else Path(Path(file_name(run)).stem + ".png")
+    with open_volume(run, variable=variable) as volume, Progress(quiet=quiet) as progress:
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):
             if explain or save_scene is not None:

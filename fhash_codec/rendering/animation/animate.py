@@ -28,6 +28,7 @@ from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.leftovers import clear
+from fhash_formats.support.locations import without_secrets
 
 __all__ = ["Animated", "animate", "numbered"]
 
@@ -229,7 +230,7 @@ def _made(
             image = dataclasses.replace(
                 image,
                 scene=frame.scene.to_dict(),
-                source=str(volume.path),
+                source=without_secrets(volume.path),
                 digest=volume.container.digest,
             )
             if frame.path is not None:

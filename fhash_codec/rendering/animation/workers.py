@@ -17,13 +17,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
+from fhash_formats.container import Location
 from fhash_formats.errors import FhashError, FhashWarning, InputError
 from fhash_formats.support.threads import usable_threads
 
@@ -38,13 +38,15 @@ class _Job:
     """The work of one process.
 
     Attributes:
-        path: of the container.
+        place: of the container, to be opened again.
+        variable: which one of it, where it has several.
         digest: `Container.digest` of it, so that no other file is rendered.
         scenes: of its pictures, in order.
         threads: that it may use.
     """
 
-    path: Path
+    place: Location
+    variable: str | None
     digest: str
     scenes: tuple[Scene, ...]
     threads: int
@@ -65,12 +67,7 @@ def rendered_by_workers(
     try:
         for first in range(processes):
             here, there = context.Pipe(duplex=False)
-            job = _Job(
-                path=volume.path.absolute(),
-                digest=volume.container.digest,
-                scenes=tuple(scenes[first::processes]),
-                threads=threads,
-            )
+            job = _job(volume, scenes[first::processes], threads)
             worker = context.Process(target=_work, args=(there, job), daemon=True)
             with _interrupts_ignored():
                 worker.start()
@@ -89,6 +86,17 @@ def rendered_by_workers(
                 worker.join()
         for end in ends:
             end.close()
+
+
+def _job(volume: Volume, scenes: Sequence[Scene], threads: int) -> _Job:
+    """The work of a process that draws scenes; raises InputError for a volume of an open file."""
+    return _Job(
+        place=dataclasses.replace(volume.container.reopening(), digest=None),
+        variable=volume.variable,
+        digest=volume.container.digest,
+        scenes=tuple(scenes),
+        threads=threads,
+    )
 
 
 @contextmanager
@@ -142,9 +150,11 @@ def _work(end: Connection, job: _Job) -> None:
 
 def _images(job: _Job) -> Generator[Image, None, None]:
     """Render the scenes of a job; raises InputError where the container is another one now."""
-    with open_volume(job.path) as volume:
+    with open_volume(job.place, variable=job.variable) as volume:
         if volume.container.digest != job.digest:
-            raise InputError(f"{job.path}: the file changed while it was rendered; render it again")
+            raise InputError(
+                f"{volume.path}: the file changed while it was rendered; render it again"
+            )
         renderer = Renderer(volume)
         for scene, upcoming in zip(job.scenes, (*job.scenes[1:], None), strict=True):
             image = renderer.render(scene, upcoming=upcoming)

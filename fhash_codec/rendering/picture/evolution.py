@@ -14,6 +14,7 @@ from fhash_codec.rendering.picture.image import Draw, Image
 from fhash_codec.rendering.scene.scene import MAX_SIDE, Scene
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.locations import without_secrets
 
 __all__ = ["evolution"]
 
@@ -53,7 +54,7 @@ def evolution(volume: Volume, scene: Scene, *, draw: Draw, progress: Progress = 
         rgba=rgba,
         counters=dict(counters),
         scene=scene.to_dict(),
-        source=str(volume.path),
+        source=without_secrets(volume.path),
         digest=volume.container.digest,
         seconds=seconds,
     )

@@ -11,7 +11,11 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
+    ranges           ranges of bytes that are asked for together
     source           bytes at offsets of a file
+    remote           bytes of a file elsewhere, in few requests
+    fsspec_file      requests to any file system of fsspec
+    location         paths, URLs and open files -> sources
     layout           bytes of the ZIP
     zip_checked      safe opening of the ZIP
     strict_json      metadata documents as JSON
@@ -20,31 +24,49 @@ The tests prove that the zarr library reads every array equal.
     header           checks of the header
     expected_arrays  arrays that a header asks for
     coordinates      positions in the header
+    source_described what belongs to the variable in its source -> header and arrays
+    source_entry     and back, checked
+    typed_values     attributes and small arrays as JSON that keeps their type
     array            metadata of one array
     coding           values of a chunk <-> bytes
     chunks           arrays cut into chunks
     sharding         many chunks in one member
+    shard_places     where they lie in it
     cache            decoded chunks
     stored           StoredArray: one array, read region by region
     reader           Container: a file for reading
     writer           ContainerWriter: a file for writing
+    variables        names and headers of several variables in a file
+    several          SeveralWriter: several variables, one after the other
 """
 
 from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
+from fhash_formats.container.location import Location, Place, StorageOptions
 from fhash_formats.container.reader import Container, is_container
+from fhash_formats.container.several import SeveralWriter, VariableWriter
 from fhash_formats.container.sharding import shard_order, shard_shape
+from fhash_formats.container.source_described import describe_metadata
+from fhash_formats.container.source_entry import SOURCE, read_metadata
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
 
 __all__ = [
     "FORMAT_VERSION",
+    "SOURCE",
     "Container",
     "ContainerWriter",
+    "Location",
+    "Place",
+    "SeveralWriter",
+    "StorageOptions",
     "StoredArray",
+    "VariableWriter",
     "coordinate_features",
     "describe_coordinates",
+    "describe_metadata",
     "is_container",
+    "read_metadata",
     "shard_order",
     "shard_shape",
     "validate_header",

@@ -29,6 +29,7 @@ from fhash_formats.container.header import (
     TRANSFORM_FEATURE,
 )
 from fhash_formats.container.record import Record
+from fhash_formats.container.source_entry import check_source
 from fhash_formats.container.sparse import SPARSE, check_occupancy, sparse_shape
 from fhash_formats.errors import DamagedFileError
 
@@ -71,6 +72,7 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
             Record(arrays[name].attributes, f"array {name} attribute ").text("name")
+    check_source(header, arrays)
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:

@@ -19,7 +19,7 @@ from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 6)
+FORMAT_VERSION = (1, 7)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -41,6 +41,7 @@ KNOWN_FEATURES = frozenset(
         SPARSE_FEATURE,
         "trellis",
         ULPS_FEATURE,
+        "variables",
     }
 )
 """Names in `required_features` that this version understands."""
@@ -93,7 +94,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
     that is missing or has a wrong value.
     """
     top = Record(header, "header key ")
-    _check_format(top)
+    check_format(top)
     dtype = _check_source(top)
     shape = top.record("domain").integers("shape", 4, 1, MAX_LENGTH)
     _check_values(top, dtype)
@@ -132,7 +133,8 @@ def _check_bulk(quality: Record) -> None:
     bulk.need(low <= high, "range", "two numbers, the lower first")
 
 
-def _check_format(top: Record) -> None:
+def check_format(top: Record) -> None:
+    """Check the format of a header; raises UnsupportedFileError for a newer one."""
     if top.get("format") != FORMAT:
         raise DamagedFileError(
             f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed"

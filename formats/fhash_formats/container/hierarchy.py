@@ -8,17 +8,25 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any
 
 from fhash_formats.container import strict_json
-from fhash_formats.container.apart import inline
+from fhash_formats.container.apart import HEAD_ARRAY, inline
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.header import validate_header
 from fhash_formats.container.layout import Member
 from fhash_formats.container.source import Source
+from fhash_formats.container.variables import (
+    CONSOLIDATED,
+    VariablePlaces,
+    consolidated,
+    is_several,
+    read_variables,
+    variable_named,
+)
 from fhash_formats.container.zip_checked import DOCUMENT, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
@@ -39,11 +47,15 @@ class Hierarchy:
         header: attribute "fhash" of the root, checked by `validate_header`.
         arrays: metadata by name of the array.
         chunks: members by name of the array and index of the chunk.
+        variables: of a file of several; none in others.
+        attributes: of the root beside the header.
     """
 
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
     chunks: dict[str, dict[tuple[int, ...], Member]]
+    variables: tuple[VariablePlaces, ...] = ()
+    attributes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
@@ -53,7 +65,15 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     """
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
+    if source.gap:
+        heads = (f"{HEAD_ARRAY}/c/0",)
+        source.prefetch(
+            (member.offset, member.header_size + member.size)
+            for name, member in members.items()
+            if name.rpartition("/")[2] == DOCUMENT or name in heads
+        )
     groups: dict[str, Mapping[str, Any]] = {}
+    group_documents: dict[str, Mapping[str, Any]] = {}
     documents: dict[str, Mapping[str, Any]] = {}
     chunk_members: list[tuple[str, str, Member]] = []
     for name, member in members.items():
@@ -64,6 +84,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
                 documents[node] = document
             else:
                 groups[node] = document.get("attributes", {})
+                group_documents[node] = document
         elif match := _CHUNK.fullmatch(name):
             chunk_members.append((match[1], match[2], member))
         else:
@@ -74,11 +95,46 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
         if node and node.rpartition("/")[0] not in groups:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
     # A newer format says so in its header, and may have arrays of which nothing is known here.
-    validate_header(groups[""]["fhash"])
-    arrays = _read_arrays(source, members, documents)
+    header = groups[""]["fhash"]
+    attributes = {name: value for name, value in groups[""].items() if name != "fhash"}
+    if not is_several(header):
+        validate_header(header)
+        arrays = _read_arrays(source, members, documents)
+        return Hierarchy(
+            header=header,
+            arrays=arrays,
+            chunks=_place_chunks(arrays, chunk_members),
+            attributes=attributes,
+        )
+    variables, others = read_variables(header, documents.keys())
+    _check_consolidated(group_documents, documents)
+    arrays = _read_arrays(source, members, {name: documents[name] for name in others})
+    for variable in variables:
+        with variable_named(variable.name):
+            arrays |= _read_arrays(source, members, documents, variable.places)
     return Hierarchy(
-        header=groups[""]["fhash"], arrays=arrays, chunks=_place_chunks(arrays, chunk_members)
+        header=header,
+        arrays={name: arrays[name] for name in documents},
+        chunks=_place_chunks(arrays, chunk_members),
+        variables=tuple(variables),
+        attributes=attributes,
     )
+
+
+def _check_consolidated(
+    groups: Mapping[str, Mapping[str, Any]], arrays: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Refuse a root that repeats other documents than the file has.
+
+    A library that takes them from the root would show other values than this one.
+    """
+    repeated = groups[""].get(CONSOLIDATED)
+    if repeated is not None:
+        own = {name: document for name, document in groups.items() if name}
+        if repeated != consolidated({**own, **arrays}):
+            raise DamagedFileError(
+                f"member {DOCUMENT}: {CONSOLIDATED} has other documents than the file"
+            )
 
 
 def _read_document(source: Source, member: Member) -> Mapping[str, Any]:
@@ -101,12 +157,21 @@ def _read_document(source: Source, member: Member) -> Mapping[str, Any]:
 
 
 def _read_arrays(
-    source: Source, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
+    source: Source,
+    members: Mapping[str, Member],
+    documents: Mapping[str, Mapping[str, Any]],
+    places: Mapping[str, str] | None = None,
 ) -> dict[str, ArrayMetadata]:
-    """The metadata of all arrays by name. Raises errors that name the member."""
+    """The metadata of arrays by path. Raises errors that name the member.
+
+    places: path by the name that the array has in a file of one variable; None where that is the
+        path of each.
+    """
+    if places is None:
+        places = {name: name for name in documents}
 
     def only_chunk(name: str) -> bytes:
-        chunk = f"{name}/c/0"
+        chunk = f"{places[name]}/c/0"
         if chunk not in members:
             raise DamagedFileError(f"member {chunk} is missing")
         if members[chunk].size > MAX_HEAD_BYTES:
@@ -117,10 +182,11 @@ def _read_arrays(
         with member_named(chunk):
             return bytes(without_crc32c(read_member(source, members[chunk])))
 
+    own = {name: documents[place] for name, place in places.items()}
     arrays = {}
-    for name, document in inline(documents, only_chunk).items():
-        with member_named(f"{name}/{DOCUMENT}"):
-            arrays[name] = ArrayMetadata.from_dict(document)
+    for name, document in inline(own, only_chunk).items():
+        with member_named(f"{places[name]}/{DOCUMENT}"):
+            arrays[places[name]] = ArrayMetadata.from_dict(document)
     return arrays
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from hashlib import sha256
+from itertools import chain
 from math import prod
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -17,16 +20,19 @@ from fhash_formats.container.coordinates import described_coordinate
 from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
 from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
+from fhash_formats.container.layout import Member, directory_entry
+from fhash_formats.container.location import Location, Place, StorageOptions, located
 from fhash_formats.container.mask_array import MaskArray
 from fhash_formats.container.source import CountedSource, FileSource, Source, damage_named
 from fhash_formats.container.stored import StoredArray
+from fhash_formats.container.variables import VariablePlaces, variable_named
 from fhash_formats.container.zip_checked import (
     DOCUMENT,
     check_member,
     find_signature,
     read_members,
 )
-from fhash_formats.errors import FhashError
+from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import Coordinate
 
 CACHE_BYTES = 256 << 20
@@ -54,32 +60,41 @@ class Container:
     """A container for reading; a context manager, safe for several threads.
 
     Attributes:
-        path: as given.
+        path: as given; text of a URL; name of an open file.
+        location: from which it can be opened again; None for an open file.
         size: bytes of the file.
         digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
             everything, so that files of different content have different digests.
         header: attribute "fhash" of the root (FORMAT.md).
+        attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
         arrays: StoredArray by name, in the order of the file.
+        variables: of a file of several, by name in the order of its list; each is a container as
+            if it were alone in the file. None in a file of one variable.
+        variable: name of the variable where the container is one of those; else None.
     """
 
-    path: Path
+    path: Path | str
+    location: Location | None = None
     size: int
     digest: str
     header: dict[str, Any]
+    attributes: Mapping[str, Any]
     header_bytes: int
     arrays: Mapping[str, StoredArray]
+    variables: Mapping[str, VariableContainer] = MappingProxyType({})
+    variable: str | None = None
 
-    def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
+    def __init__(self, path: Path | str, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Read a container from an open source, which `close` closes; `open` is for files.
 
         Raises DamagedFileError, or UnsupportedFileError for a newer format.
         """
-        self.path, self.size = path, source.size
+        self.path, self.size, self.location = path, source.size, None
         self._source = source = CountedSource(source)
         self._cache = ChunkCache(cache_bytes)
         try:
-            with damage_named(path):
+            with damage_named(path, source):
                 members = read_members(source)
                 signature = find_signature(source)
                 assert signature is not None
@@ -88,41 +103,89 @@ class Container:
                     member.name.endswith("zarr.json") for member in members.values()
                 )
                 tree = read_hierarchy(source, members)
-                check_arrays(tree.header, tree.arrays)
+                if not tree.variables:
+                    check_arrays(tree.header, tree.arrays)
             self.header, self.header_bytes = tree.header, members[DOCUMENT].size
+            self.attributes = MappingProxyType(dict(tree.attributes))
             self.arrays = MappingProxyType(self._stored_arrays(tree))
-            if "key_frames" in self.arrays:
-                key_frames = self.arrays["key_frames"].read()
-                with damage_named(path):
-                    check_key_frames(tree.header, key_frames)
+            if tree.variables:
+                self.variables = MappingProxyType(self._variables(tree, members))
+            else:
+                _attach_masks(self.arrays)
+                _check_key_frames(self)
         except BaseException:
             source.close()
             raise
 
     @classmethod
-    def open(cls, path: str | Path, *, cache_bytes: int = CACHE_BYTES) -> Container:
-        """Open a file; `cache_bytes` bounds the decoded chunks that are kept.
+    def open(
+        cls,
+        place: Place,
+        *,
+        cache_bytes: int = CACHE_BYTES,
+        storage_options: StorageOptions = None,
+    ) -> Container:
+        """Open a path, a URL, a binary file that is open, or a `Location`.
+
+        Args:
+            place: an open file is neither closed here nor may it change.
+            cache_bytes: most bytes of decoded chunks that are kept.
+            storage_options: options of a URL's file system in fsspec.
 
         Raises:
             MissingInputError: for no such file.
-            InputError: for a folder, or a file without permission.
+            MissingDependencyError: for a URL whose package is not installed.
+            InputError: for a folder, a file without permission, a server that does not answer, or
+                a location whose file is another one now.
             DamagedFileError: for a file that is no container, or a damaged one.
             UnsupportedFileError: for a newer format.
         """
-        return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
+        location, name, source = located(place, storage_options)
+        container = cls(name, source, cache_bytes=cache_bytes)
+        container.location = location
+        if isinstance(place, Location) and place.digest not in (None, container.digest):
+            container.close()
+            raise InputError(f"{name}: another file is there than was opened before; open it again")
+        return container
+
+    def reopening(self) -> Location:
+        """The location, digest included, to open this file again, in another process as well.
+
+        Raises InputError for an open file.
+        """
+        if self.location is None:
+            raise InputError(
+                f"{self.path}: a volume of an open file cannot be opened again elsewhere;"
+                " open it by its path or URL"
+            )
+        place = self.location.place
+        return replace(
+            self.location,
+            place=place.absolute() if isinstance(place, Path) else place,
+            digest=self.digest,
+        )
 
     def _stored_arrays(self, tree: Hierarchy) -> dict[str, StoredArray]:
-        """The arrays by name; a table knows the array of its masks."""
+        """The arrays by path."""
         arrays = {}
         for name, metadata in tree.arrays.items():
             kind = MaskArray if metadata.coding == MASK else StoredArray
             arrays[name] = kind(
                 self.path, name, metadata, tree.chunks[name], self._source, self._cache
             )
-        masks = arrays.get(MASK_ARRAY)
-        if isinstance(masks, MaskArray):
-            masks.attach(arrays[TABLE])
         return arrays
+
+    def _variables(
+        self, tree: Hierarchy, members: Mapping[str, Member]
+    ) -> dict[str, VariableContainer]:
+        """The variables of a file of several, checked as files of their own are."""
+        found = {}
+        for variable in tree.variables:
+            own = {name: tree.arrays[place] for name, place in variable.places.items()}
+            with damage_named(self.path, self._source), variable_named(variable.name):
+                check_arrays(variable.header, own)
+            found[variable.name] = VariableContainer(self, variable, members)
+        return found
 
     @property
     def bytes_read(self) -> int:
@@ -141,9 +204,12 @@ class Container:
             )
         array = self.arrays[f"coords/{stored}"]
         attributes = dict(array.attributes)
-        return Coordinate(
-            name=attributes.pop("name", stored), values=array.read(), attributes=attributes
-        )
+        name = attributes.pop("name", self._usual_name(array, stored))
+        return Coordinate(name=name, values=array.read(), attributes=attributes)
+
+    def _usual_name(self, array: StoredArray, stored: str) -> str:
+        """The name of a coordinate whose array has no attribute that says it."""
+        return stored
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Read and decode every chunk; the number of arrays. Metadata were read at opening.
@@ -160,7 +226,7 @@ class Container:
             if progress is not None:
                 progress(done, total)
 
-        with damage_named(self.path):
+        with damage_named(self.path, self._source):
             for array in self.arrays.values():
                 array.verify(count)
         return len(self.arrays)
@@ -171,16 +237,33 @@ class Container:
         The array is checked by the checksums of its members, and no chunk is decoded. The chunks
         become read-only. Raises DamagedFileError for a member that is not what was written.
         """
-        with damage_named(self.path):
+        with damage_named(self.path, self._source):
             for member in self.arrays[name].chunks.values():
                 check_member(self._source, member)
         for index, values in chunks.items():
             values.flags.writeable = False
-            self._cache.put((name, index, 0), values)
+            self._cache.put((self.arrays[name].name, index, 0), values)
 
     def overhead(self) -> int:
         """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
+
+    def select(self, variable: str | None) -> Container:
+        """The container of one variable, whose `close` closes the file.
+
+        variable: its name; None for the only one of the file. Raises InputError where the file
+        does not hold it, or holds several and none is named.
+        """
+        names = list(self.variables) or [self.header["variable"]["name"]]
+        listed = ", ".join(names)[:400]
+        if variable is None and len(names) > 1:
+            raise InputError(
+                f"{self.path} holds several variables, {listed}; choose one, such as"
+                f" --var {names[0]} (in Python: variable={names[0]!r})"
+            )
+        if variable is not None and variable not in names:
+            raise InputError(f"{self.path} has no variable {variable[:80]!r}; it holds {listed}")
+        return self.variables[variable or names[0]].closing_file() if self.variables else self
 
     def close(self) -> None:
         """Release the file and the cache."""
@@ -197,3 +280,77 @@ class Container:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class VariableContainer(Container):
+    """One variable of a container of several: what a container of this variable alone would be.
+
+    It reads from the file of the others, and shares their cache.
+
+    Attributes:
+        size: bytes of the arrays of this variable alone, with their places in the ZIP.
+        digest: of the file and the variable.
+        arrays: StoredArray by the name that it has in a file of one variable. The shared
+            coordinates are among them.
+    """
+
+    def __init__(
+        self, file: Container, variable: VariablePlaces, members: Mapping[str, Member]
+    ) -> None:
+        """Take the arrays of a variable from an open file. Raises DamagedFileError."""
+        self.path, self.variable, self.header = file.path, variable.name, variable.header
+        self.header_bytes, self.attributes = file.header_bytes, file.attributes
+        self.arrays = MappingProxyType(
+            {name: file.arrays[place] for name, place in variable.places.items()}
+        )
+        self.digest = sha256(f"{file.digest}/{variable.name}".encode()).hexdigest()
+        self._file, self._source, self._cache = file, file._source, file._cache
+        self._closes_file = False
+        own = [f"{place}/" for name, place in variable.places.items() if name[:7] != "coords/"]
+        documents = [f"{place}{DOCUMENT}" for place in own]
+        chunks = (member for place in own for member in file.arrays[place[:-1]].chunks.values())
+        self.size = sum(
+            member.end - member.offset + len(directory_entry(member))
+            for member in chain(chunks, (members[name] for name in documents))
+        )
+        self._documents = len(documents)
+        _attach_masks(self.arrays)
+        with variable_named(variable.name):
+            _check_key_frames(self)
+
+    def closing_file(self) -> VariableContainer:
+        """Itself, from now on with a `close` that closes the file, and so all variables."""
+        self._closes_file = True
+        return self
+
+    def reopening(self) -> Location:
+        """The location of the file that holds the variable, with the digest of the whole."""
+        return self._file.reopening()
+
+    def _usual_name(self, array: StoredArray, stored: str) -> str:
+        return array.name
+
+    def overhead(self) -> int:
+        """Bytes of the variable's arrays that are no data of chunks."""
+        own = (array for name, array in self.arrays.items() if name[:7] != "coords/")
+        return self.size - sum(array.nbytes_stored for array in own)
+
+    def close(self) -> None:
+        """Release the file after `closing_file`, else nothing: other variables need it."""
+        if self._closes_file:
+            self._file.close()
+
+
+def _attach_masks(arrays: Mapping[str, StoredArray]) -> None:
+    """Let a table know the array of its masks."""
+    masks = arrays.get(MASK_ARRAY)
+    if isinstance(masks, MaskArray):
+        masks.attach(arrays[TABLE])
+
+
+def _check_key_frames(container: Container) -> None:
+    """Raise DamagedFileError for key frames that do not fit the header."""
+    if "key_frames" in container.arrays:
+        key_frames = container.arrays["key_frames"].read()
+        with damage_named(container.path, container._source):
+            check_key_frames(container.header, key_frames)

@@ -1,21 +1,28 @@
-"""Sources of bytes at offsets: a file on disk, or the beginning of a file with an unwritten end."""
+"""Sources of bytes at offsets: a file on disk or an open one, or a file with an unwritten end."""
 
 from __future__ import annotations
 
+import io
 import stat
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
+from fhash_formats.container.ranges import Range
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
+
+CHANGED = "the file changed since it was opened; open it again"
+"""Told of a file that another took the place of."""
 
 
 @contextmanager
-def damage_named(path: object) -> Iterator[None]:
+def damage_named(path: object, source: Source | None = None) -> Iterator[None]:
     """A block whose errors about a file begin with its path.
+
+    source: of the file; where its bytes are damaged because it changed meanwhile, that is told.
 
     Other errors that a hostile or unreadable file provokes become DamagedFileError. MemoryError
     passes: the coders refuse sizes that the bytes of a chunk cannot hold, so that only a machine
@@ -25,6 +32,8 @@ def damage_named(path: object) -> Iterator[None]:
     try:
         yield
     except DamagedFileError as error:
+        if source is not None and source.changed():
+            raise InputError(f"{path}: {CHANGED}") from error
         raise type(error)(f"{path}: {error}") from error
     except (RecursionError, OverflowError, UnicodeError, struct.error) as error:
         raise DamagedFileError(f"{path}: the file is damaged: {type(error).__name__}") from error
@@ -35,21 +44,45 @@ def damage_named(path: object) -> Iterator[None]:
 
 
 class Source(Protocol):
-    """A source that a container is read from; several threads may call `read`.
+    """A source that a container is read from; several threads may call its methods.
 
-    `size` is the number of bytes.
+    Classes derive from it for what has a default here, which suits files at hand.
+
+    Attributes:
+        size: number of bytes.
+        gap: bytes that are better read than left out by another request; 0 where a read of its own
+            costs nothing. Only with a gap does `prefetch` do anything.
     """
 
     size: int
+    gap: int = 0
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
+        ...
+
+    def prefetch(self, ranges: Iterable[Range]) -> None:
+        """Begin to fetch ranges that will be read soon, each as it stands here; waits for none."""
+        return None
+
+    def changed(self) -> bool:
+        """Whether the file is known to be another one than was opened."""
+        return False
 
     def close(self) -> None:
         """Release the file."""
+        ...
 
 
-class FileSource:
+def check_range(source: Source, offset: int, size: int) -> None:
+    """Raise DamagedFileError for a range that reaches beyond a source."""
+    if offset < 0 or size < 0 or offset + size > source.size:
+        raise DamagedFileError(
+            f"{size} bytes at offset {offset} are outside the file of {source.size} bytes"
+        )
+
+
+class FileSource(Source):
     """A regular file on disk; raises MissingInputError or InputError if it cannot be opened."""
 
     def __init__(self, path: Path) -> None:
@@ -67,27 +100,12 @@ class FileSource:
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
-        if offset < 0 or size < 0 or offset + size > self.size:
-            raise DamagedFileError(
-                f"{size} bytes at offset {offset} are outside the file of {self.size} bytes"
-            )
-        pieces = []
+        check_range(self, offset, size)
         # Windows lacks os.pread, so a lock is needed. Decoding takes longer, and is outside it.
         with self._lock:
             if self._file.closed:
                 raise InputError("the container is closed")
-            self._file.seek(offset)
-            while size > 0:
-                piece = self._file.read(size)
-                if not piece:
-                    raise DamagedFileError(
-                        "the file was cut short while it was read, "
-                        f"{size} bytes from offset {offset} are missing"
-                    )
-                pieces.append(piece)
-                size -= len(piece)
-                offset += len(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+            return _read_fully(self._file, offset, size)
 
     def close(self) -> None:
         """Release the file, once no other thread reads it."""
@@ -95,13 +113,65 @@ class FileSource:
             self._file.close()
 
 
-class CountedSource:
+class OpenFileSource(Source):
+    """A binary file that the caller opened, and closes after the container: `open(...)`, BytesIO.
+
+    Raises InputError for a file of text, one that is closed, not for reading or cannot seek.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._lock = threading.Lock()
+        self._closed = False
+        try:
+            self.size = file.seek(0, 2)
+            text = not isinstance(file.read(0), bytes)
+        except (OSError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"{file!r}: cannot seek and read ({error}); give a file opened with 'rb', or"
+                " io.BytesIO of its bytes"
+            ) from error
+        if text:
+            raise InputError(f"{file!r}: a file of text; open it with 'rb'")
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
+        check_range(self, offset, size)
+        with self._lock:
+            if self._closed or getattr(self._file, "closed", False):
+                raise InputError("the container is closed, or the file that it was opened from")
+            return _read_fully(self._file, offset, size)
+
+    def close(self) -> None:
+        """Read no more; the file stays open."""
+        with self._lock:
+            self._closed = True
+
+
+def _read_fully(file: BinaryIO | io.RawIOBase, offset: int, size: int) -> bytes:
+    """Exactly `size` bytes of a file; raises DamagedFileError where it ends before."""
+    pieces = []
+    file.seek(offset)
+    while size > 0:
+        piece = file.read(size)
+        if not piece:
+            raise DamagedFileError(
+                "the file was cut short while it was read, "
+                f"{size} bytes from offset {offset} are missing"
+            )
+        pieces.append(piece)
+        size -= len(piece)
+        offset += len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+class CountedSource(Source):
     """A source that counts in `bytes_read` how many bytes were read from it."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._lock = threading.Lock()
-        self.size = source.size
+        self.size, self.gap = source.size, source.gap
         self.bytes_read = 0
 
     def read(self, offset: int, size: int) -> bytes:
@@ -111,12 +181,20 @@ class CountedSource:
             self.bytes_read += size
         return data
 
+    def prefetch(self, ranges: Iterable[Range]) -> None:
+        """Begin to fetch ranges that will be read soon; they count once they are read."""
+        self._source.prefetch(ranges)
+
+    def changed(self) -> bool:
+        """Whether the file is known to be another one than was opened."""
+        return self._source.changed()
+
     def close(self) -> None:
         """Release the file."""
         self._source.close()
 
 
-class PreviewSource:
+class PreviewSource(Source):
     """A container as it will be once its end is written.
 
     Its bytes are the first `length` bytes of a file, followed by `tail`.
@@ -130,10 +208,7 @@ class PreviewSource:
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
-        if offset < 0 or size < 0 or offset + size > self.size:
-            raise DamagedFileError(
-                f"{size} bytes at offset {offset} are outside the file of {self.size} bytes"
-            )
+        check_range(self, offset, size)
         from_file = max(0, min(offset + size, self._length) - offset)
         begin = self._begin.read(offset, from_file) if from_file else b""
         start = offset + from_file - self._length

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import product
-from math import prod
 from typing import Any
 
 import numpy as np
@@ -18,15 +16,13 @@ from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.layout import Member
-from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry, parse_index
+from fhash_formats.container.shard_places import ShardPlaces
 from fhash_formats.container.source import Source, damage_named
 from fhash_formats.container.zip_checked import check_member, read_member
-from fhash_formats.errors import DamagedFileError, RegionError
+from fhash_formats.errors import DamagedFileError, FhashError, RegionError
 from fhash_formats.support.slabs import common_part, region_bounds
 from fhash_formats.support.threads import in_threads
 
-SPARSE_SHARE = 4
-"""Index entries are read one by one for fewer than one in SPARSE_SHARE inner chunks of a shard."""
 MASK = ":mask"
 """Suffix of an array's name for its masks in the cache."""
 TABLE = ":table"
@@ -80,9 +76,10 @@ class StoredArray:
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
         self.masks: StoredArray | None = None
-        self._indices: dict[ChunkIndex, npt.NDArray[np.int64]] = {}
-        self._entries: dict[tuple[ChunkIndex, int], tuple[int, int]] = {}
-        self._lock = threading.Lock()
+        sharding = metadata.sharding
+        self._shards = (
+            None if sharding is None else ShardPlaces(sharding, self.shape, chunks, source)
+        )
         self._ahead = Ahead()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
@@ -123,7 +120,7 @@ class StoredArray:
     ) -> npt.NDArray[Any]:
         """A region, gathered from the parts that `read` returns of each of its chunks."""
         bounds = self._bounds(region)
-        with damage_named(self._path):
+        with damage_named(self._path, self._source):
             lengths = [stop - start for start, stop in bounds]
             if 0 in lengths:
                 return np.empty(lengths, dtype=dtype)
@@ -159,14 +156,14 @@ class StoredArray:
             DamagedFileError: for a damaged chunk; the message names the member of the file.
         """
         self._check_index(index)
-        with damage_named(self._path):
+        with damage_named(self._path, self._source):
             return self._chunk(tuple(index), lod, keep=True)
 
     def decode_table(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
         """A full chunk before the corrections that its coder makes; else as `decode_chunk`."""
         self._check_index(index)
         place = (self.name + TABLE, tuple(index), lod)
-        with damage_named(self._path):
+        with damage_named(self._path, self._source):
             values = self._cache.get(place)
             if values is None:
                 values = self._decode(tuple(index), lod, table=True)[0]
@@ -217,40 +214,73 @@ class StoredArray:
         ahead: whether threads without work may decode the chunks that a reader who goes along the
             first axis will want next.
         """
-        sharding = self._metadata.sharding
-        if sharding is None:
-            return map(work, product(*spans))
-        # The indices are read once for all chunks of a shard, before threads that all need them.
-        self._read_indices(sharding, spans)
-        indices = list(product(*spans))
 
         def cached(index: ChunkIndex) -> bool:
             return self._cache.get((self.name, index, 0)) is not None
 
+        if self._shards is None:
+            self._announce(product(*spans))
+            return map(work, product(*spans))
+        # The indices are read once for all chunks of a shard, before threads that all need them.
+        self._read_places(spans)
+        indices = list(product(*spans))
         missing = sum(not cached(index) for index in indices)
         after: list[ChunkIndex] = []
         if ahead and (layers := self._ahead.layers(spans)):
             room = self._cache.limit // self._metadata.chunk_bytes
             after = chunks_after(spans, self.grid, layers, missing, room, cached)
+        self._announce([*indices, *after])
         if missing + len(after) < 2:
             return map(work, indices)
 
         def decode(index: ChunkIndex) -> None:
             # What fails now fails again once it is wanted.
-            with suppress(DamagedFileError, MemoryError):
+            with suppress(FhashError, MemoryError):
                 self._decoded(index, 0, keep=True)
 
         wanted = [partial(work, index) for index in indices]
         return in_threads(lambda do: do(), wanted + [partial(decode, index) for index in after])
 
-    def _read_indices(self, sharding: Sharding, spans: Sequence[range]) -> None:
-        """Read what the chunks of `spans` need of each shard's index: all of it, or entries."""
-        for shard, in_shard in sharding.parts(spans):
-            if SPARSE_SHARE * prod(map(len, in_shard)) >= prod(sharding.counts):
-                self._shard_index(sharding, shard)
-            else:
-                for index in product(*in_shard):
-                    self._entry(sharding, *sharding.place(index))
+    def prefetch(self, spans: Sequence[range], lod: int = 0) -> None:
+        """Let a source elsewhere fetch chunks that `decode_chunk` or `decode_table` is asked for.
+
+        spans: of chunks along each axis. Raises DamagedFileError for a damaged index.
+        """
+        if self._source.gap:
+            with damage_named(self._path, self._source):
+                self._read_places(spans)
+                self._announce(product(*spans), (self.name, self.name + TABLE), lod)
+
+    def _read_places(self, spans: Sequence[range]) -> None:
+        """Read where chunks lie in their shards; of masks only if that saves requests."""
+        if self._shards is not None:
+            self._shards.read(spans)
+        if self._source.gap and self.masks is not None:
+            self.masks._read_places(spans)
+
+    def _announce(
+        self, indices: Iterable[ChunkIndex], names: Sequence[str] = (), lod: int = 0
+    ) -> None:
+        """Let a source elsewhere fetch chunks, with their masks, that are not in the cache.
+
+        names: of the cache, under which they may be there.
+        """
+        if self._source.gap:
+            names = names or (self.name, self.name + UNCORRECTED)
+            parts = [self] if self.masks is None or lod else [self, self.masks]
+            places = []
+            for index in indices:
+                if all(self._cache.get((name, index, lod)) is None for name in names):
+                    places += [array._place(index) for array in parts]
+            self._source.prefetch(places)
+
+    def _place(self, index: ChunkIndex) -> tuple[int, int]:
+        """Offset in the file and bytes of what `_stored_chunk` reads of an inner chunk."""
+        if self._shards is None:
+            member = self.chunks[index]
+            return member.offset, member.header_size + member.size
+        shard, _, offset, size = self._shards.place(index)
+        return self.chunks[shard].data_offset + offset, size
 
     def _chunk(self, index: ChunkIndex, lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
         """The values of a chunk, from the cache or decoded; `keep` puts them into the cache."""
@@ -326,69 +356,18 @@ class StoredArray:
     @contextmanager
     def _stored_chunk(self, index: ChunkIndex) -> Iterator[memoryview]:
         """The bytes of an inner chunk, for a block whose errors name where it lies."""
-        sharding = self._metadata.sharding
-        if sharding is None:
+        shards = self._shards
+        if shards is None:
             member, place = self.chunks[index], ""
             data = read_member(self._source, member)
         else:
-            shard, number = sharding.place(index)
+            shard, number, offset, size = shards.place(index)
             member, place = self.chunks[shard], f"inner chunk {number}: "
-            offset, size = self._entry(sharding, shard, number)
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:
             yield data
         except DamagedFileError as error:
             raise type(error)(f"member {member.name}: {place}{error}") from error
-
-    def _entry(self, sharding: Sharding, shard: ChunkIndex, number: int) -> tuple[int, int]:
-        """(offset in the member, bytes) of one inner chunk of a shard.
-
-        They come from the shard's index if that was read, else from the entry alone, read once.
-        """
-        with self._lock:
-            shard_index = self._indices.get(shard)
-            if shard_index is not None:
-                return int(shard_index[number, 0]), int(shard_index[number, 1])
-            entry = self._entries.get((shard, number))
-            if entry is None:
-                with self._index_place(sharding, shard) as (start, data_bytes):
-                    entry = parse_entry(
-                        self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes
-                    )
-                self._entries[shard, number] = entry
-        return entry
-
-    def _shard_index(self, sharding: Sharding, shard: ChunkIndex) -> npt.NDArray[np.int64]:
-        """(offset in the member, bytes) of each inner chunk of a shard, (chunks, 2); read once."""
-        with self._lock:
-            shard_index = self._indices.get(shard)
-            if shard_index is None:
-                with self._index_place(sharding, shard) as (start, data_bytes):
-                    shard_index = parse_index(
-                        self._source.read(start, sharding.index_bytes),
-                        sharding.present(shard, self.shape),
-                        data_bytes,
-                    )
-                self._indices[shard] = shard_index
-        return shard_index
-
-    @contextmanager
-    def _index_place(self, sharding: Sharding, shard: ChunkIndex) -> Iterator[tuple[int, int]]:
-        """A block that reads a shard's index; its errors name the member.
-
-        Yields the offset of the index in the file, and the number of bytes in the shard before it.
-        """
-        member = self.chunks[shard]
-        data_bytes = member.size - sharding.index_bytes
-        try:
-            if data_bytes < 0:
-                raise DamagedFileError(
-                    f"{member.size} bytes are too few for the index of a shard, "
-                    f"{sharding.index_bytes}"
-                )
-            yield member.data_offset + data_bytes, data_bytes
-        except DamagedFileError as error:
-            raise type(error)(f"member {member.name}: {error}") from error
 
     def _bounds(self, region: tuple[slice, ...] | None) -> list[tuple[int, int]]:
         """(start, stop) of a region along each axis; raises RegionError."""

@@ -24,6 +24,7 @@ from fhash_formats.container.layout import Member, document_member, ending, loca
 from fhash_formats.container.reader import Container
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
+from fhash_formats.container.variables import CONSOLIDATED, consolidated, is_several
 from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.atomic import replacing
@@ -53,7 +54,14 @@ class ContainerWriter:
     written once, in this order: for each array its metadata and its chunks, then the groups, then
     the root. Identical calls give identical bytes. Entering raises OutputExistsError or
     OutputError.
+
+    Attributes:
+        path: name that the file takes.
+        attributes: of the root beside the header, JSON values; they may be set until `commit`.
+        one_of_several: whether the arrays are those of one variable among several in the file.
     """
+
+    one_of_several = False
 
     def __init__(self, path: str | Path, *, force: bool = False) -> None:
         """Prepare a writer; `force` allows it to replace an existing file."""
@@ -61,8 +69,9 @@ class ContainerWriter:
         self._force = force
         self._stack = ExitStack()
         self._members: list[Member] = []
-        self._arrays: set[str] = set()
+        self._arrays: dict[str, dict[str, Any]] = {}
         self._position = 0
+        self.attributes: Mapping[str, Any] = {}
 
     def __enter__(self) -> ContainerWriter:
         with ExitStack() as stack:
@@ -228,7 +237,7 @@ class ContainerWriter:
         except DamagedFileError as error:
             raise InputError(f"array {name} cannot be stored: {error}") from error
         self._check_name(name)
-        self._arrays.add(name)
+        self._arrays[name] = metadata.to_dict()
         member, data = document_member(f"{name}/{DOCUMENT}", self._position, document)
         self._write(member, [data])
         return metadata
@@ -275,7 +284,8 @@ class ContainerWriter:
         self._file.seek(mark.position)
         self._file.truncate()
         del self._members[mark.members :]
-        self._arrays, self._position = set(mark.arrays), mark.position
+        self._arrays = {name: self._arrays[name] for name in self._arrays if name in mark.arrays}
+        self._position = mark.position
 
     def divert(self, path: Path) -> None:
         """Let the container take another name in the same folder, which must be free.
@@ -319,9 +329,12 @@ class ContainerWriter:
             "format": FORMAT,
             "format_version": list(FORMAT_VERSION),
         }
-        documents[DOCUMENT] = strict_json.dumps(
-            {**GROUP, "attributes": {"fhash": complete}}, "the header"
-        )
+        attributes = {**plain_json(self.attributes), "fhash": complete}
+        root: dict[str, Any] = {**GROUP, "attributes": attributes}
+        if is_several(complete):
+            others = {**dict.fromkeys(groups, GROUP), **self._arrays}
+            root[CONSOLIDATED] = consolidated(others)
+        documents[DOCUMENT] = strict_json.dumps(root, "the header")
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)

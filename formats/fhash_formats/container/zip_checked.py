@@ -115,13 +115,16 @@ def check_member(source: Source, member: Member) -> None:
     if member.full_size is not None:
         read_member(source, member)
         return
+    pieces = [
+        (member.data_offset + start, min(_PIECE, member.size - start))
+        for start in range(0, member.size, _PIECE)
+    ]
+    source.prefetch([(member.offset, member.header_size), *pieces])
     if source.read(member.offset, member.header_size) != local_header(member):
         raise DamagedFileError(f"member {member.name}: its header differs from the directory")
     crc = 0
-    for start in range(0, member.size, _PIECE):
-        crc = zlib.crc32(
-            source.read(member.data_offset + start, min(_PIECE, member.size - start)), crc
-        )
+    for offset, size in pieces:
+        crc = zlib.crc32(source.read(offset, size), crc)
     if crc != member.crc:
         raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
 

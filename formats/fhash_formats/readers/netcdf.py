@@ -30,6 +30,7 @@ from fhash_formats.readers.common.netcdf_store import (
     open_groups,
     quietly,
 )
+from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
@@ -251,7 +252,7 @@ def _series(
 
     try:
         chunks = array.encoding.get("chunksizes")
-        return FileSeries(
+        series = FileSeries(
             source=source,
             name=variable.handle[1],
             shape=layout.shape,
@@ -268,6 +269,20 @@ def _series(
     except BaseException:
         close()
         raise
+    if not variable.members and not any(str(name).startswith(MADE_UP) for name in array.dims):
+        used = [coordinate.name for coordinate in series.coords.values()]
+        scope = _upwards(variable.handle[0])
+        series.metadata = netcdf_metadata(
+            path,
+            variable.handle,
+            scope,
+            layout,
+            request,
+            used,
+            packed,
+            without if request.raw_values else (),
+        )
+    return series
 
 
 def list_netcdf(path: Path, request: Request) -> list[Listed]:

@@ -19,6 +19,7 @@ from fhash_formats.errors import FhashError, InputError, OutputError, OutputExis
 from fhash_formats.support import leftovers
 from fhash_formats.support.interrupts import signals_held
 from fhash_formats.support.leftovers import remove
+from fhash_formats.support.locations import local_path
 
 ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray")
 """Files by which a folder is recognised as a Zarr store, which `force` may replace."""
@@ -82,7 +83,10 @@ def check_output(
 
 def _check_source(path: Path, target: Path, source: str | Path) -> None:
     """Refuse an output `path`, resolved to `target`, that would replace or contain a source."""
-    resolved = Path(os.path.realpath(source))
+    local = local_path(source)
+    if local is None:
+        return
+    resolved = Path(os.path.realpath(local))
     if _same(target, resolved):
         raise InputError(f"{path} is the input itself; choose another name")
     if resolved.is_dir() and any(_same(folder, resolved) for folder in target.parents):
@@ -136,7 +140,7 @@ def replacing_all(
             for output in outputs:
                 output.place(force, directory)
         for folder in {output.target.parent for output in outputs}:
-            _sync_folder(folder)
+            sync_folder(folder)
     except BaseException as error:
         with signals_held():
             for output in reversed(outputs):
@@ -293,10 +297,10 @@ def _sync(path: Path) -> None:
     for folder, _, names in os.walk(path):
         for name in names:
             _sync(Path(folder, name))
-        _sync_folder(Path(folder))
+        sync_folder(Path(folder))
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Write a folder's list of names to the disk itself.
 
     Some file systems and Windows cannot. The bytes of its files are safe nevertheless; only their

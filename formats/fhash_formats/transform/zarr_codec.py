@@ -46,7 +46,7 @@ NAME = "fhash.transform"
 """Name of the codec in Zarr metadata."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class TransformCodec(ArrayBytesCodec):
     """The codec for arrays of float16 to float64 and integers, with any number of axes.
 
@@ -140,6 +140,20 @@ class TransformCodec(ArrayBytesCodec):
     ) -> None:
         """Raises InputError for a type that is not coded."""
         supported(dtype.to_native_dtype())
+
+    def __repr__(self) -> str:
+        """One line: the settings of tiles hold a base64 text of all weights of a head."""
+        shared = self.apart if self.settings is None else self.settings.to_dict()
+        given = {
+            "max_error": self.max_error,
+            "max_error_rel": self.max_error_rel,
+            "step": self.step if shared is None else shared["step"],
+            "head": None if shared is None else "head" in shared or None,
+            "mask": None if shared is None else "mask" in shared or None,
+            "reading": self.reading or None,
+        }
+        told = (f"{name}={value!r}" for name, value in given.items() if value is not None)
+        return f"TransformCodec({', '.join(told)})"
 
     def evolve_from_array_spec(self, array_spec: ArraySpec) -> Self:
         """The codec itself: no option depends on the array.

@@ -1,4 +1,4 @@
-"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: a variable with four coordinates.
+"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: a variable and all beside it.
 
 NaN, or the region's fill value, is declared as `_FillValue`. NetCDF has no float16; it is stored as
 float32, exactly.
@@ -7,21 +7,18 @@ Chunks and compression are those of `hdf5`, for the same reasons.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fhash_formats.series import AXES
+from fhash_formats.source_metadata import SourceVariable
+from fhash_formats.support.attributes import PLUMBING
 from fhash_formats.writers.common.held_file import held_hdf5
-from fhash_formats.writers.common.labels import (
-    coordinate_attributes,
-    hdf5_value,
-    safe_names,
-    variable_attributes,
-)
+from fhash_formats.writers.common.labels import hdf5_value
+from fhash_formats.writers.common.outline import Outline
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import (
     Frame,
@@ -33,6 +30,8 @@ from fhash_formats.writers.common.writer import (
 )
 from fhash_formats.writers.hdf5 import COMPRESSION
 
+FILL = "_FillValue"
+
 
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
@@ -41,36 +40,54 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
     dtype = little_endian(region.dtype)
     with held_hdf5(temporaries[0], lambda file: h5netcdf.File(file, "w")) as (file, root):
         with file.calling():
-            values = _create(root, region, dtype)
+            outline = Outline.of(region)
+            values = _create(root, region, outline, dtype)
 
         def put(step: int, frame: Frame) -> None:
             with file.calling():
-                values[step] = frame.astype(dtype, copy=False)
+                place, ordered = outline.place(step, frame)
+                values[place] = ordered.astype(dtype, copy=False)
 
         yield put
 
 
-def _create(root: Any, region: Region, dtype: np.dtype[Any]) -> Any:
-    """Create the empty variable in `root`, with its attributes, dimensions and coordinates."""
-    variable, names = safe_names(region)
-    root.attrs["Conventions"] = "CF-1.8"
-    root.dimensions = {names[axis]: length for axis, length in zip(AXES, region.shape, strict=True)}
-    for axis in AXES:
-        coordinate = region.coords[axis]
-        scale = root.create_variable(
-            names[axis], (names[axis],), data=coordinate.values.astype("<f8")
-        )
-        for key, value in coordinate_attributes(axis, coordinate).items():
-            scale.attrs[key] = hdf5_value(value)
+def _create(root: Any, region: Region, outline: Outline, dtype: np.dtype[Any]) -> Any:
+    """Create the empty variable in `root`, with its attributes, dimensions and all beside it."""
+    _set_attributes(root, {"Conventions": "CF-1.8", **outline.file_attributes})
+    root.dimensions = dict(outline.lengths)
+    for each in outline.variables:
+        _add(root, each)
     fill = np.nan if dtype.kind == "f" else None
     fill = fill if region.fill is None else dtype.type(region.fill)
-    dimensions = tuple(names[axis] for axis in AXES)
     values = root.create_variable(
-        variable, dimensions, dtype, chunks=chunk_shape(region), fillvalue=fill, **COMPRESSION
+        outline.name,
+        tuple(outline.dimensions),
+        dtype,
+        chunks=outline.ordered(chunk_shape(region)),
+        fillvalue=fill,
+        **COMPRESSION,
     )
-    for key, value in variable_attributes(region).items():
-        values.attrs[key] = hdf5_value(value)
+    _set_attributes(values, outline.attributes)
     return values
+
+
+def _add(root: Any, beside: SourceVariable) -> None:
+    """Write an array beside the values."""
+    import h5py
+
+    values = beside.values
+    dtype: Any = h5py.string_dtype() if values.dtype.kind in "OTU" else little_endian(values.dtype)
+    fill = beside.attributes.get(FILL) if values.dtype.kind in "iuf" else None
+    variable = root.create_variable(
+        beside.name, beside.dimensions, dtype, data=values.astype(dtype), fillvalue=fill
+    )
+    kept = {key: value for key, value in beside.attributes.items() if key not in (FILL, *PLUMBING)}
+    _set_attributes(variable, kept)
+
+
+def _set_attributes(place: Any, attributes: Mapping[str, Any]) -> None:
+    for key, value in attributes.items():
+        place.attrs[key] = hdf5_value(value)
 
 
 NETCDF = Writer(name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open)

@@ -1,4 +1,4 @@
-"""Writer of a Zarr v3 group: the variable and its coordinates as arrays with dimension names.
+"""Writer of a Zarr v3 group: the variable and all beside it as arrays with dimension names.
 
 xarray opens it as a dataset. There is one chunk per step (see `chunk_shape`), in zarr's default
 compression. zarr writes into memory, and each frame's chunks go from there to plain files: zarr's
@@ -8,6 +8,8 @@ just removed.
 
 from __future__ import annotations
 
+import base64
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,14 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.series import AXES
-from fhash_formats.writers.common.labels import (
-    coordinate_attributes,
-    safe_names,
-    variable_attributes,
-)
+from fhash_formats.source_metadata import SourceVariable
+from fhash_formats.support.attributes import json_attributes
+from fhash_formats.writers.common.outline import Outline
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape, one_output
+
+FILL = "_FillValue"
 
 
 def _flush(memory: dict[str, Any], folder: Path) -> None:
@@ -42,12 +43,27 @@ def _fill_value(region: Region) -> Any:
     return np.nan if region.dtype.kind == "f" else 0
 
 
-def _attributes(region: Region) -> dict[str, Any]:
+def _attributes(region: Region, outline: Outline) -> dict[str, Any]:
     """The attributes of the variable; an integer that stands for no value is among them."""
-    attributes = dict(variable_attributes(region))
+    attributes = json_attributes(outline.attributes)
     if region.fill is not None and region.dtype.kind in "iu":
-        attributes["_FillValue"] = int(region.fill)
+        attributes[FILL] = int(region.fill)
     return attributes
+
+
+def _add(root: Any, beside: SourceVariable) -> None:
+    """Write an array beside the values."""
+    values = beside.values
+    if values.dtype.kind in "OU":
+        values = values.astype(np.dtypes.StringDType())
+    attributes = json_attributes(beside.attributes)
+    fill = beside.attributes.get(FILL)
+    if fill is not None and values.dtype.kind == "f":
+        # as xarray writes and reads it
+        attributes[FILL] = base64.standard_b64encode(struct.pack("<d", float(fill))).decode()
+    root.create_array(
+        beside.name, data=values, dimension_names=list(beside.dimensions), attributes=attributes
+    )
 
 
 @contextmanager
@@ -58,26 +74,23 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
     memory: dict[str, Any] = {}
     folder = temporaries[0]
     folder.mkdir()
-    variable, names = safe_names(region)
+    outline = Outline.of(region)
     store = MemoryStore(memory)
-    root = zarr.create_group(store=store, zarr_format=3)
-    for axis in AXES:
-        coordinate = region.coords[axis]
-        attributes = coordinate_attributes(axis, coordinate)
-        root.create_array(
-            names[axis],
-            data=coordinate.values,
-            dimension_names=[names[axis]],
-            attributes=attributes,
-        )
+    file_attributes = json_attributes(outline.file_attributes)
+    root = zarr.create_group(store=store, zarr_format=3, attributes=file_attributes)
+    with warnings.catch_warnings():
+        # types of texts are not yet in Zarr's specification
+        warnings.simplefilter("ignore")
+        for each in outline.variables:
+            _add(root, each)
     values = root.create_array(
-        variable,
-        shape=region.shape,
+        outline.name,
+        shape=outline.shape,
         dtype=region.dtype,
-        chunks=chunk_shape(region),
+        chunks=outline.ordered(chunk_shape(region)),
         fill_value=_fill_value(region),
-        dimension_names=[names[axis] for axis in AXES],
-        attributes=_attributes(region),
+        dimension_names=list(outline.dimensions),
+        attributes=_attributes(region, outline),
         config={
             "write_empty_chunks": True
         },  # a chunk that is missing is then always a fault, not a frame of fill values
@@ -89,7 +102,8 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
     _flush(memory, folder)
 
     def put(step: int, frame: Frame) -> None:
-        values[step] = frame
+        place, ordered = outline.place(step, frame)
+        values[place] = ordered
         _flush(memory, folder)
 
     yield put

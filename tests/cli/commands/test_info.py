@@ -149,8 +149,9 @@ def test_info_of_no_data_is_refused(refused: Callable[..., str], tmp_path: Path)
 
 
 def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:
-    for words, name in ((["--var", "q"], "--var"), (["--missing", "-9"], "--missing")):
-        assert f"is encoded already; {name} is for data" in refused(2, "info", run, *words)
+    refusal = refused(2, "info", run, "--missing", "-9")
+    assert "is encoded already; --missing is for data" in refusal
+    assert "no variable 'q'; it holds density" in refused(2, "info", run, "--var", "q")
     assert "--raw-values is for data" in refused(2, "info", run, "--raw-values")
 
 

@@ -252,3 +252,14 @@ def test_what_lies_outside_is_refused() -> None:
             keys.key_index(step)
     with pytest.raises(InputError, match="step numbers"):
         KeyTimes(times=np.array([0.0, 0.0]), key_frames=(0,))
+
+
+@pytest.mark.parametrize("key_frames", [(0, 3, 7), (2, 5), (4,)])
+def test_one_step_has_the_bits_of_the_same_step_among_many(key_frames) -> None:
+    times = KeyTimes(times=UNEVEN, key_frames=key_frames)
+    steps = np.linspace(0, 7, 57)
+    assert [times.key_index(step) for step in steps] == times.key_indices(steps).tolist()
+    with pytest.raises(RegionError):
+        times.key_index(7.5)
+    with pytest.raises(RegionError):
+        times.key_index(float("nan"))

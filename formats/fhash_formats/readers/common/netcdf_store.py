@@ -48,9 +48,13 @@ def quietly() -> Iterator[None]:
 
 
 def open_groups(
-    source: str, path: Path, head: bytes, *, raw: bool = False
+    source: str, path: Path, head: bytes, *, raw: bool = False, decoded: bool = True
 ) -> Mapping[str, xr.Dataset]:
-    """Datasets of all groups by path, "/" first; `raw` leaves values packed."""
+    """Datasets of all groups by path, "/" first.
+
+    raw: leave values packed. decoded: whether attributes that name variables are taken out, and
+    these made coordinates; if not, everything is as it is stored.
+    """
     if head == CLASSIC_64:
         raise InputError(
             f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
@@ -66,6 +70,8 @@ def open_groups(
         "chunks": None,
         "mask_and_scale": not raw,
     }
+    if not decoded:
+        options |= {"decode_coords": False, "concat_characters": False, "mask_and_scale": False}
     if head in CLASSIC:
         return {"/": _open_classic(source, path, options)}
     # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too

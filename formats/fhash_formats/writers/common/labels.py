@@ -91,6 +91,8 @@ def hdf5_value(value: Any) -> Any:
         return np.float64(value)
     if isinstance(value, int) and -(2**63) <= value < 2**63:
         return np.int64(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value if value.dtype.kind in "iufSU" else hdf5_value(value.tolist())
     if isinstance(value, list) and value and len(value) * 8 <= ATTRIBUTE_BYTES:
         kinds = {type(item) for item in value}
         if kinds == {str}:

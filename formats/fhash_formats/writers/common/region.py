@@ -10,6 +10,7 @@ import numpy as np
 
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate, Series, check_coords, check_values
+from fhash_formats.source_metadata import SourceMetadata
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,6 +28,8 @@ class Region:
         attributes: attributes of the variable, JSON values.
         fill: number of `dtype` that stands where there is no value; None where every vertex has one
             or NaN stands there.
+        metadata: what belongs to the variable in its source, cut to the region; None where that is
+            unknown. NetCDF and Zarr give it back.
 
     Raises:
         InputError: one of these does not hold.
@@ -39,6 +42,7 @@ class Region:
     units: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
     fill: int | float | None = None
+    metadata: SourceMetadata | None = None
 
     @classmethod
     def of(cls, series: Series) -> Self:
@@ -50,6 +54,7 @@ class Region:
             shape=series.shape,
             coords=series.coords,
             attributes=series.attributes,
+            metadata=series.metadata,
         )
 
     def __post_init__(self) -> None:

@@ -1,0 +1,133 @@
+"""Coding of one layer of tiles: some steps of the whole domain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.appending.figures import Figures, StepErrors
+from fhash_codec.compact.tiles.blocks import Tile
+from fhash_codec.compact.tiles.coding import Coding, code
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.support.slabs import chunk_region
+from fhash_formats.support.threads import map_ahead, usable_threads
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import CodedTile
+from fhash_formats.transform.tile.settings import TileSettings
+
+__all__ = ["CodedLayer", "LayerCoder"]
+
+DECODED_AGAIN = 8
+"""Tiles of which one is decoded from its bytes, as a reader does it."""
+Index = tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodedLayer:
+    """A layer of tiles, coded.
+
+    Attributes:
+        streams: bytes of each tile, in C order.
+        errors: of each step.
+        nonzero: number of coefficients that are not 0.
+        value_range: of the values, in data units.
+    """
+
+    streams: list[bytes]
+    errors: list[StepErrors]
+    nonzero: int
+    value_range: ValueRange
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerCoder:
+    """Coder of the layers of a file; its tiles keep a strict bound of the error.
+
+    Attributes:
+        tile: shape (t, z, y, x) of a tile.
+        settings: that all tiles share.
+        coding: options of the encoder, the bound among them.
+        dtype: number type of the values.
+    """
+
+    tile: tuple[int, int, int, int]
+    settings: TileSettings
+    coding: Coding
+    dtype: np.dtype[Any]
+
+    def code(
+        self, frames: Sequence[npt.NDArray[Any]], figures: Figures, workers: ThreadPoolExecutor
+    ) -> CodedLayer:
+        """Code some steps, at most those of a tile; a shorter layer is padded by its last step.
+
+        frames: finite values (z, y, x) of each step. figures: measures the errors.
+        """
+        values = np.stack(frames)
+        decoded = np.empty_like(values)
+        grid = [-(-n // length) for n, length in zip(values.shape[1:], self.tile[1:], strict=True)]
+        streams, nonzero = [], 0
+        indices = list(product(*map(range, grid)))
+        tiles = (self._tile(values, index) for index in indices)
+        coded = map_ahead(workers, self._code, enumerate(tiles), 2 * usable_threads())
+        for index, tile in zip(indices, coded, strict=True):
+            region = chunk_region(index, self.tile[1:], values.shape[1:])
+            part = decoded[(slice(None), *region)]
+            part[...] = tile.decoded[tuple(slice(0, n) for n in part.shape)]
+            streams.append(tile.data)
+            nonzero += tile.nonzero
+        errors = [figures.measure(*pair) for pair in zip(values, decoded, strict=True)]
+        value_range = ValueRange(float(values.min()), float(values.max()))
+        return CodedLayer(streams=streams, errors=errors, nonzero=nonzero, value_range=value_range)
+
+    def _tile(self, values: npt.NDArray[Any], index: Index) -> Tile:
+        """A tile of a layer; beyond the end of an axis border values are repeated and not counted.
+
+        As `Blocks.read` makes it.
+        """
+        region = (slice(None), *chunk_region(index, self.tile[1:], values.shape[1:]))
+        part = values[region]
+        padding = [(0, n - m) for n, m in zip(self.tile, part.shape, strict=True)]
+        if not any(after for _, after in padding):
+            return Tile(np.ascontiguousarray(part), None)
+        counted = np.pad(np.ones(part.shape, bool), padding)
+        return Tile(np.pad(part, padding, mode="edge"), counted)
+
+    def _code(self, job: tuple[int, Tile]) -> CodedTile:
+        """Code a tile, by settings of its own where its values leave the range of the shared ones.
+
+        The bound holds either way. The shared ones clip such values, and the residual then has to
+        bring them back; of the two codings the one with fewer bytes is taken.
+        """
+        number, tile = job
+        coded = code(tile, self.settings, self.coding)[0]
+        settings = self.settings
+        for other in self._wider(tile):
+            own = code(tile, other, replace(self.coding, own_settings=True))[0]
+            if len(own.data) < len(coded.data):
+                coded, settings = own, other
+        if number % DECODED_AGAIN == 0:
+            again = decode_tile(coded.data, self.tile, self.dtype, settings)
+            if not np.array_equal(again, coded.decoded):
+                raise RuntimeError(f"tile {number} decodes to other values than its encoder found")
+        return coded
+
+    def _wider(self, tile: Tile) -> Iterator[TileSettings]:
+        """Yield settings with a wider range for a tile whose values leave that of the file."""
+        low, high = float(tile.values.min()), float(tile.values.max())
+        shared = self.settings
+        if self.coding.exact or (shared.low <= low and high <= shared.high):
+            return
+        yield replace(
+            shared,
+            low=min(low, shared.low),
+            high=max(high, shared.high),
+            head=None,
+            predictor=None,
+            clip=False,
+        )

@@ -1,0 +1,342 @@
+"""`Writer`: frames of a running simulation in, a file out that is complete after every layer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.appending.figures import Figures
+from fhash_codec.appending.growing import GrowingFile
+from fhash_codec.appending.planning import bound_of, plan_layers
+from fhash_codec.appending.resuming import continued
+from fhash_codec.compact.tiles.tiling import parse_tile
+from fhash_codec.config import EncodeConfig
+from fhash_codec.encoding import check_name
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, check_values, index_coordinate
+from fhash_formats.support.atomic import check_output
+from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.threads import thread_pool
+
+__all__ = ["Writer"]
+
+WINDOW_STEPS = 8
+"""Steps on which tiles and settings are chosen where the tile does not say how many."""
+WINDOW_BYTES = 512 << 20
+"""Bytes of these steps together, at most; a single larger frame is allowed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """The labels and settings of a new file."""
+
+    path: Path
+    shape: tuple[int, int, int]
+    config: EncodeConfig
+    bound: float
+    value_range: ValueRange | None
+    variable: Mapping[str, Any]
+    coords: Mapping[str, Coordinate]
+    force: bool
+
+
+class Writer:
+    """A file that grows step by step; a context manager.
+
+        with fhash_codec.Writer("run.fhz", shape=(64, 64, 128), max_error=1e-3) as writer:
+            while running:
+                writer.append(frame, time=now)
+
+    Some steps are coded together, a *layer*: as many as the tiles have. The frames of one layer are
+    in memory at a time, at first those of the steps on which tiles and settings are chosen. After
+    every layer the file is complete under its name, and anybody may read it; a process that is
+    killed loses the frames of the layer under way and nothing else. `close`, which leaving the
+    block calls, writes a last layer that may be shorter; `Writer.resume` goes on after a whole one.
+
+    Attributes:
+        path: of the file.
+        shape: (z, y, x) of a frame.
+        steps: frames that were appended.
+        steps_written: those of them that are in the file.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        shape: Sequence[int],
+        max_error: float | None = None,
+        max_error_rel: float | None = None,
+        value_range: tuple[float, float] | None = None,
+        config: EncodeConfig | None = None,
+        coords: Mapping[str, Coordinate | npt.ArrayLike] | None = None,
+        name: str = "values",
+        units: str = "",
+        attributes: Mapping[str, Any] | None = None,
+        time_units: str = "",
+        force: bool = False,
+    ) -> None:
+        """Begin a file; it is there after the first layer.
+
+        shape: vertices (z, y, x) of a frame.
+        max_error: strict bound of the error of each value, in data units; 0 for none.
+        max_error_rel: the same as a fraction of `value_range`.
+        value_range: values that are expected in the whole run, in data units. Others are kept as
+            precisely, in a few more bytes.
+        config: further settings, such as effort and tile. It may have the promise, too.
+        coords: positions of "z", "y" and "x": a Coordinate or an array of one dimension. A
+            Coordinate of "t" gives name and attributes of the times.
+        name, units, attributes: of the variable.
+        time_units: of the times, such as "s" or "days since 2000-01-01".
+        force: replace a file that exists, once the first layer is written.
+
+        Raises InputError for settings that do not fit, OutputExistsError or OutputError for the
+        path.
+        """
+        path = Path(path)
+        check_name(path)
+        check_output(path, force)
+        frame = _frame_shape(shape)
+        settings = _settings(config, max_error, max_error_rel)
+        known = None if value_range is None else ValueRange(*map(float, value_range))
+        self._source: _Source | None = _Source(
+            path=path,
+            shape=frame,
+            config=settings,
+            bound=bound_of(settings, known),
+            value_range=known,
+            variable={
+                "name": str(name),
+                "units": str(units),
+                "attributes": json_attributes(dict(attributes or {}), without=frozenset()),
+            },
+            coords=_positions(coords or {}, frame, time_units),
+            force=force,
+        )
+        self._begin(path, frame)
+
+    @classmethod
+    def resume(cls, path: str | Path, *, steps: int | None = None) -> Writer:
+        """Go on with an existing file, in its tiles and settings and to its bound of the error.
+
+        steps: number of steps to keep, such as those before the checkpoint from which a simulation
+            starts again; all if None. They must be whole layers.
+
+        The file stays as it is until the first layer is added. Raises InputError for a file that
+        cannot grow, MissingInputError and DamagedFileError as `open`.
+        """
+        self = cls.__new__(cls)
+        self._source = None
+        stack = ExitStack()
+        growing = stack.enter_context(continued(Path(path), steps))
+        z, y, x = growing.shape
+        self._begin(Path(path), (z, y, x))
+        self._stack, self._file = stack, growing
+        self._dtype = growing.coder.dtype
+        self._last = growing.times[-1]
+        return self
+
+    def _begin(self, path: Path, shape: tuple[int, int, int]) -> None:
+        self.path, self.shape = path, shape
+        self._stack = ExitStack()
+        self._file: GrowingFile | None = None
+        self._dtype: np.dtype[Any] | None = None
+        self._frames: list[npt.NDArray[Any]] = []
+        self._times: list[float] = []
+        self._last: float | None = None
+        self._workers: ThreadPoolExecutor | None = None
+        self._is_closed = False
+
+    @property
+    def steps_written(self) -> int:
+        """Steps that are in the file."""
+        return 0 if self._file is None else self._file.steps
+
+    @property
+    def steps(self) -> int:
+        """Steps that were appended, those that wait for their layer included."""
+        return self.steps_written + len(self._frames)
+
+    def append(self, frame: npt.ArrayLike, time: float | None = None) -> None:
+        """Append the next step; the layer that it fills is written before this returns.
+
+        frame: finite values (z, y, x), each time of the same number type. It is copied.
+        time: of the step, later than that of the step before; by default one more than that, from 0
+            on.
+
+        Raises InputError for a frame or a time that does not fit, which is then left out, and
+        OutputError if the file cannot be written; it then keeps the layers before.
+        """
+        if self._is_closed:
+            raise InputError(f"{self.path}: the writer is closed; Writer.resume goes on with it")
+        values = self._checked(np.asarray(frame))
+        when = self._checked_time(time)
+        self._dtype, self._last = values.dtype, when
+        self._frames.append(values)
+        self._times.append(when)
+        if self._file is None and len(self._frames) >= self._window(values):
+            self._plan()
+        while self._file is not None and len(self._frames) >= self._file.coder.tile[0]:
+            self._write(self._file, self._file.coder.tile[0])
+
+    def close(self) -> None:
+        """Write the steps that wait for their layer, and release the file."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        with self._stack:
+            if self._frames and self._file is None:
+                self._plan()
+            while self._file is not None and self._frames:
+                self._write(self._file, min(self._file.coder.tile[0], len(self._frames)))
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file, also where the block failed: what was appended is kept."""
+        self.close()
+
+    def _checked(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """A copy of a frame; raises InputError for one that does not fit."""
+        step = self.steps
+        if values.shape != self.shape:
+            raise InputError(
+                f"step {step}: the frame has shape {values.shape}; {self.shape} in (z, y, x) is "
+                "needed"
+            )
+        check_values(f"step {step}", (1, *values.shape), values.dtype)
+        dtype = values.dtype.newbyteorder("=")
+        if self._dtype is not None and dtype != self._dtype:
+            raise InputError(
+                f"step {step}: the frame is {dtype}, those before are {self._dtype}; convert it"
+            )
+        if dtype.kind == "f" and not np.isfinite(values).all():
+            count = int(np.count_nonzero(~np.isfinite(values)))
+            raise InputError(
+                f"step {step}: {count} of its values are NaN or infinite; a file that grows has "
+                "none: put a number in their place"
+            )
+        return np.array(values, dtype=dtype, order="C")
+
+    def _checked_time(self, time: float | None) -> float:
+        """The time of the next step; raises InputError for one that is not later than the last."""
+        if time is None:
+            return 0.0 if self._last is None else self._last + 1.0
+        try:
+            when = float(time)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"step {self.steps}: its time is {time!r:.40}; a number in the units of the run is "
+                "needed"
+            ) from error
+        if not math.isfinite(when) or (self._last is not None and when <= self._last):
+            raise InputError(
+                f"step {self.steps}: its time is {when:.9g}, the one before has {self._last}; "
+                "times must be finite and ascend"
+            )
+        return when
+
+    def _window(self, frame: npt.NDArray[Any]) -> int:
+        """Number of steps on which tiles and settings are chosen."""
+        assert self._source is not None
+        room = max(1, WINDOW_BYTES // frame.nbytes)
+        most = 1 << 20
+        tile = parse_tile(self._source.config.tile, (most, *self.shape))
+        return min(WINDOW_STEPS, room) if tile is None or tile[0] == most else tile[0]
+
+    def _plan(self) -> None:
+        """Choose tiles and settings on the steps that wait, and begin the file."""
+        source = self._source
+        assert source is not None
+        found = plan_layers(self._frames, source.config, source.bound, source.value_range)
+        low, high = found.coder.settings.low, found.coder.settings.high
+        variable = {**source.variable, "dtype": found.coder.dtype.name}
+        growing = GrowingFile(
+            source.path,
+            found.coder,
+            {**found.header, "variable": variable},
+            source.coords,
+            Figures(Figures.scale_of(ValueRange(low, high))),
+            force=source.force,
+        )
+        self._file = self._stack.enter_context(growing)
+
+    def _write(self, growing: GrowingFile, count: int) -> None:
+        """Code and write the layer of the first steps that wait."""
+        if self._workers is None:
+            self._workers = self._stack.enter_context(thread_pool())
+        layer = growing.coder.code(self._frames[:count], growing.figures, self._workers)
+        try:
+            growing.add(layer, self._times[:count])
+        except BaseException:
+            # What could not be written now is not tried again: the file may have fallen behind.
+            self._is_closed = True
+            self._stack.close()
+            raise
+        del self._frames[:count], self._times[:count]
+
+
+def _frame_shape(shape: Sequence[int]) -> tuple[int, int, int]:
+    """The shape of a frame; raises InputError for another than three lengths."""
+    lengths = tuple(int(n) for n in shape)
+    if len(lengths) != 3 or min(lengths) < 1:
+        raise InputError(f"shape is {tuple(shape)}; three lengths (z, y, x) from 1 on are needed")
+    return lengths
+
+
+def _settings(
+    config: EncodeConfig | None, max_error: float | None, max_error_rel: float | None
+) -> EncodeConfig:
+    """The settings with the promise of the arguments."""
+    values = {} if config is None else config.to_dict()
+    for name, value in (("max_error", max_error), ("max_error_rel", max_error_rel)):
+        if value is not None:
+            values[name] = value
+    return EncodeConfig.from_dict(values)
+
+
+def _positions(
+    coords: Mapping[str, Coordinate | npt.ArrayLike], shape: tuple[int, int, int], time_units: str
+) -> dict[str, Coordinate]:
+    """The coordinates of z, y and x, and name and attributes of t; raises InputError."""
+    unknown = sorted(set(coords) - set(AXES))
+    if unknown:
+        raise InputError(f"coords names '{unknown[0]}'; allowed: z, y, x, and t for its attributes")
+    result = {axis: index_coordinate(axis, n) for axis, n in zip(AXES, (1, *shape), strict=True)}
+    if time_units:
+        result["t"] = Coordinate(
+            name=AXIS_NAMES["t"], values=np.zeros(1), attributes={"units": str(time_units)}
+        )
+    for axis, given in coords.items():
+        known = isinstance(given, Coordinate)
+        name = str(given.name) if isinstance(given, Coordinate) else AXIS_NAMES[axis]
+        attributes = dict(given.attributes) if isinstance(given, Coordinate) else {}
+        values = np.array(given.values if isinstance(given, Coordinate) else given, dtype=float)
+        if axis != "t" and values.shape != result[axis].values.shape:
+            raise InputError(
+                f"the coordinate of {axis} has shape {values.shape}; "
+                f"{result[axis].values.shape} is needed"
+            )
+        if axis != "t" or known:
+            result[axis] = Coordinate(
+                name=name,
+                values=values,
+                attributes=json_attributes(attributes, without=frozenset()),
+            )
+    return result

@@ -1,0 +1,293 @@
+"""xarray's engine `fhash`: `xr.open_dataset("run.fhz")` gives what it gives of the source.
+
+The dataset is lazy: values are decoded when they are asked for, tile by tile. The engine hands
+xarray an undecoded dataset, of the values and of all that belongs to them (`Volume.metadata`), and
+xarray decodes it by CF as it does any file. docs/xarray.md is for users.
+
+Importing this module registers `Dataset.fhash` and `DataArray.fhash`, whose `encode` writes a
+container.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Hashable, Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from xarray.backends import BackendEntrypoint
+from xarray.core import indexing
+
+from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.labelled import labelled_series
+from fhash_codec.encoding import encode
+from fhash_codec.lazy_array import FhashArray, Form
+from fhash_codec.provenance import history_line
+from fhash_codec.shared_volumes import acquire, place_of
+from fhash_codec.volume import OUTSIDE, Volume
+from fhash_formats.container import is_container
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXES
+from fhash_formats.source_metadata import SourceVariable, with_history
+from fhash_formats.support.attributes import PACKING
+
+__all__ = ["FhashBackend"]
+
+SUFFIX = ".fhz"
+FILLS = ("_FillValue", "missing_value")
+"""Attributes that say which number stands for a missing value."""
+VALID = ("valid_min", "valid_max", "valid_range")
+"""Attributes that xarray leaves where they are."""
+FIGURES = {"fhash_max_error": "max_abs_error", "fhash_psnr": "psnr"}
+"""Attributes of a variable that say how well the file holds it, and their names in its header."""
+
+
+class FhashBackend(BackendEntrypoint):
+    """xarray's engine `fhash`."""
+
+    description = "fhash containers (.fhz) of time-varying volumes"
+    url = "https://pypi.org/project/fhash"
+
+    def guess_can_open(self, filename_or_obj: Any) -> bool:
+        """Whether this is a container, by its suffix or its signature."""
+        if not isinstance(filename_or_obj, str | os.PathLike):
+            return False
+        place = os.fspath(filename_or_obj)
+        return isinstance(place, str) and (
+            place.lower().endswith(SUFFIX) or ("://" not in place and is_container(place))
+        )
+
+    def open_dataset(  # type: ignore[override]
+        self,
+        filename_or_obj: Any,
+        *,
+        mask_and_scale: bool | Mapping[str, bool] = True,
+        decode_times: Any = True,
+        concat_characters: bool | Mapping[str, bool] = True,
+        decode_coords: bool | str = True,
+        drop_variables: str | Iterable[str] | None = None,
+        use_cftime: bool | Mapping[str, bool] | None = None,
+        decode_timedelta: Any = None,
+        lod: int | None = None,
+        outside: str = "nan",
+        variable: str | None = None,
+        storage_options: Mapping[str, Any] | None = None,
+    ) -> xr.Dataset:
+        """Open a container as a lazy dataset; the options of CF are xarray's own.
+
+        lod: level of detail, every 2^lod-th vertex of the feature bounding box (profile compact).
+        outside: "nan", or "background" for the mean of the values outside the coreset.
+        variable: the only one wanted; all by default.
+        storage_options: of a URL.
+
+        Raises InputError for other values of these, and as `fhash_codec.open` does.
+        """
+        if outside not in OUTSIDE or (lod is not None and outside != OUTSIDE[0]):
+            allowed = ", ".join(OUTSIDE) if lod is None else f"{OUTSIDE[0]} with lod"
+            raise InputError(f"outside is {outside!r}; allowed: {allowed}")
+        place = place_of(filename_or_obj)
+        handle = acquire(place, storage_options)
+        names = list(handle.volumes)
+        if variable is not None and variable not in names:
+            raise InputError(f"{place} has no variable {variable!r}; it has {', '.join(names)}")
+        dataset = xr.Dataset()
+        coordinates: set[str] = set()
+        arrays: list[FhashArray] = []
+        packed: dict[str, dict[str, Any]] = {}
+        for name in names if variable is None else [variable]:
+            volume = handle.volumes[name]
+            shown = Shown(volume, lod, outside)
+            array = FhashArray(place, name, shown.form, storage_options)
+            dataset = dataset.merge(shown.dataset(array, place), join="exact", compat="override")
+            dataset.attrs = shown.attributes()
+            coordinates |= shown.coordinates
+            packed[name] = shown.packing()
+            arrays.append(array)
+        decoded = xr.conventions.decode_cf(
+            dataset,
+            concat_characters=concat_characters,  # type: ignore[arg-type]
+            mask_and_scale=mask_and_scale,  # type: ignore[arg-type]
+            decode_times=decode_times,
+            decode_coords=decode_coords,  # type: ignore[arg-type]
+            drop_variables=drop_variables,
+            use_cftime=use_cftime,  # type: ignore[arg-type]
+            decode_timedelta=decode_timedelta,
+        )
+        if decode_coords:
+            decoded = decoded.set_coords([name for name in coordinates if name in decoded])
+        for name, encoding in packed.items():
+            if name in decoded:
+                decoded[name].encoding |= encoding
+        decoded.set_close(partial(_release, arrays))
+        return decoded
+
+
+def _release(arrays: Iterable[FhashArray]) -> None:
+    for array in arrays:
+        array.release()
+
+
+class Shown:
+    """A volume as an undecoded dataset.
+
+    Attributes:
+        form: the dimensions and the options.
+        coordinates: names of the arrays beside the values that are coordinates.
+    """
+
+    def __init__(self, volume: Volume, lod: int | None, outside: str) -> None:
+        self._volume = volume
+        self._metadata = volume.metadata
+        dimensions = _invented(volume) if self._metadata is None else self._metadata.dimensions
+        self.form = Form(dimensions=dimensions, lod=lod, outside=outside)
+        self._beside = self._variables()
+        self.coordinates = {each.name for each in self._beside if each.is_coordinate}
+
+    def dataset(self, array: FhashArray, place: str) -> xr.Dataset:
+        """The values and what belongs to them, not decoded."""
+        volume = self._volume
+        encoding = {
+            "preferred_chunks": self.form.chunks(volume),
+            "source": place,
+        }
+        lazy = indexing.LazilyIndexedArray(array)
+        values = xr.Variable(
+            tuple(self.form.dimensions), lazy, self._variable_attributes(), encoding=encoding
+        )
+        beside = {
+            each.name: xr.Variable(each.dimensions, each.values, dict(each.attributes))
+            for each in self._beside
+        }
+        return xr.Dataset({volume.name: values, **beside})
+
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the file: those of the source, its name and digest, and the history."""
+        metadata, volume = self._metadata, self._volume
+        if metadata is None:
+            return with_history({}, history_line(volume.container.header))
+        named = {"fhash_source": metadata.file, "fhash_source_digest": metadata.digest}
+        return {**metadata.attributes, **{key: text for key, text in named.items() if text}}
+
+    def packing(self) -> dict[str, Any]:
+        """The packing of the source, for `encoding`.
+
+        It is left out where a vertex without a value would then be written as some number.
+        """
+        if self._metadata is None or self._volume.dtype.kind != "f":
+            return {}
+        raw = self._metadata.variable_attributes
+        found = {key: value for key, value in raw.items() if key in PACKING and key not in VALID}
+        stored = self._metadata.stored
+        if stored is not None:
+            if self._volume.value_type.has_gaps and not set(FILLS) & set(found):
+                return {}
+            found["dtype"] = np.dtype(stored)
+        return found
+
+    def _variables(self) -> tuple[SourceVariable, ...]:
+        """The arrays beside the values, cut to the vertices that are shown."""
+        volume, metadata = self._volume, self._metadata
+        places = self.form.vertices(volume)
+        if metadata is not None:
+            return (
+                metadata.cut(places).variables
+                if self.form.lod is not None
+                else (metadata.variables)
+            )
+        return tuple(
+            SourceVariable(
+                name=name,
+                dimensions=(name,),
+                values=volume.coords[axis].values[list(places[axis])],
+                attributes=volume.coords[axis].attributes,
+                is_coordinate=True,
+            )
+            for name, axis in self.form.dimensions.items()
+        )
+
+    def _variable_attributes(self) -> dict[str, Any]:
+        """Attributes of the values as a file without packing has them, and how good they are."""
+        volume = self._volume
+        if self._metadata is None:
+            raw = {**volume.attrs, **({"units": volume.units} if volume.units else {})}
+        else:
+            raw = dict(self._metadata.variable_attributes)
+        found = {key: value for key, value in raw.items() if key not in PACKING or key in VALID}
+        if volume.dtype.kind in "iu" and self.form.lod is None:
+            fills = {key: raw[key] for key in FILLS if key in raw}
+            if not fills and volume.value_type.has_gaps and volume.fill is not None:
+                fills = {FILLS[0]: volume.dtype.type(volume.fill)}
+            found |= fills
+        quality = volume.container.header["quality"]
+        figures = {key: quality.get(name) for key, name in FIGURES.items()}
+        return found | {key: value for key, value in figures.items() if value is not None}
+
+
+def _invented(volume: Volume) -> dict[str, str]:
+    """Dimensions of a file that does not say those of its source: all four axes."""
+    names: dict[str, str] = {}
+    for axis in AXES:
+        name = volume.coords[axis].name or axis
+        while name in names or name == volume.name:
+            name += "_"
+        names[name] = axis
+    return names
+
+
+def _encode(
+    data: xr.Dataset | xr.DataArray,
+    path: str | Path,
+    variable: Hashable | None,
+    config: EncodeConfig | None,
+    force: bool,
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    if config is not None and settings:
+        raise InputError(f"give either config or single settings, not both: {', '.join(settings)}")
+    chosen = config or EncodeConfig.from_dict(dict(settings))
+    return encode(labelled_series(data, variable), path, chosen, force=force)
+
+
+@xr.register_dataset_accessor("fhash")
+class DatasetAccessor:
+    """`Dataset.fhash`: write a variable as a container."""
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self._dataset = dataset
+
+    def encode(
+        self,
+        path: str | Path,
+        *,
+        variable: Hashable | None = None,
+        config: EncodeConfig | None = None,
+        force: bool = False,
+        **settings: Any,
+    ) -> dict[str, Any]:
+        """Encode a variable, the only one that can be by default; as `fhash_codec.encode` does.
+
+        settings: fields of `EncodeConfig`, such as psnr=45.
+        """
+        return _encode(self._dataset, path, variable, config, force, settings)
+
+
+@xr.register_dataarray_accessor("fhash")
+class DataArrayAccessor:
+    """`DataArray.fhash`: write the array as a container."""
+
+    def __init__(self, array: xr.DataArray) -> None:
+        self._array = array
+
+    def encode(
+        self,
+        path: str | Path,
+        *,
+        config: EncodeConfig | None = None,
+        force: bool = False,
+        **settings: Any,
+    ) -> dict[str, Any]:
+        """Encode the array as `fhash_codec.encode` does; settings: fields of `EncodeConfig`."""
+        return _encode(self._array, path, None, config, force, settings)

@@ -1,0 +1,291 @@
+"""`GrowingContainer`: a container that takes further layers while it can be read all the time.
+
+Two files take turns. One has the container's name and is complete. The other is hidden, and gets
+the next layer and a new end; it is synced to the disk and takes the name by a rename, which happens
+wholly or not at all. The file that had the name is hidden from then on. It lacks one layer, which
+is copied into it before the next one. So each layer is written twice and never read as a whole, and
+at every moment, also after `kill -9`, a plain complete container has the name: no reader needs to
+know that it grows. A reader that has an older state open can go on, because the arrays that it
+knows stay where they are in both files.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.coding import Codec, with_crc32c
+from fhash_formats.container.layout import Member
+from fhash_formats.container.sharding import pack_index, sharding_codecs
+from fhash_formats.container.writer import ContainerWriter, Mark
+from fhash_formats.errors import FhashError, OutputError
+from fhash_formats.support import leftovers
+from fhash_formats.support.atomic import check_output, explained, replacing, sync_folder
+from fhash_formats.support.interrupts import signals_held
+
+__all__ = ["GrowingArray", "GrowingContainer"]
+
+PIECE = 8 << 20
+"""Bytes that are copied from one file into the other at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrowingArray:
+    """An array (t, z, y, x) of tiles that grows along its first axis by layers of tiles.
+
+    Attributes:
+        name: path in the hierarchy.
+        frame: lengths (z, y, x) of the other axes.
+        dtype: number type of the array.
+        tile: shape (t, z, y, x) of a tile.
+        codecs: of the tiles.
+        dimension_names: names of the axes.
+    """
+
+    name: str
+    frame: tuple[int, ...]
+    dtype: np.dtype[Any]
+    tile: tuple[int, ...]
+    codecs: Sequence[Codec]
+    dimension_names: Sequence[str | None] = ("t", "z", "y", "x")
+
+    @property
+    def layer_grid(self) -> tuple[int, ...]:
+        """Tiles of a layer along (z, y, x)."""
+        return tuple(-(-n // length) for n, length in zip(self.frame, self.tile[1:], strict=True))
+
+    @property
+    def chunk_shape(self) -> tuple[int, ...]:
+        """Shape of a member's chunk: a shard of a whole layer, or the only tile of a layer."""
+        parts = zip(self.layer_grid, self.tile[1:], strict=True)
+        return (self.tile[0], *(count * length for count, length in parts))
+
+    @property
+    def is_sharded(self) -> bool:
+        """Whether a layer has several tiles, and so needs a shard."""
+        return prod(self.layer_grid) > 1
+
+
+class GrowingContainer(ContainerWriter):
+    """A container that is complete after each `publish`; a context manager.
+
+    Members are added as to a `ContainerWriter`. `publish` writes what follows them and gives the
+    file its name; leaving the block leaves the last published state. Entering raises
+    OutputExistsError or OutputError.
+    """
+
+    def __init__(
+        self, path: str | Path, *, force: bool = False, continues: os.stat_result | None = None
+    ) -> None:
+        """Prepare a container; `force` allows it to replace an existing file when it publishes.
+
+        continues: state of the file that this one goes on from and replaces; no other one is.
+        """
+        super().__init__(path, force=force or continues is not None)
+        self._continues = continues
+        self._target = Path(os.path.realpath(self.path))
+        self._awake = False
+        # The file that has the name, and how many bytes from its beginning are lasting members.
+        self._ours: tuple[int, int] | None = None
+        self._lasting = 0
+        # The file that had the name before, and how many of its bytes are those of the other.
+        self._spare: Path | None = None
+        self._common = 0
+
+    def __enter__(self) -> GrowingContainer:
+        leftovers.clear([self._target])
+        check_output(self.path, self._force)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove the hidden file; what was published stays."""
+        if self._awake:
+            with suppress(OSError):  # a full disk must not hide the first error
+                self._file.close()
+            leftovers.remove(self._temporary)
+        if self._spare is not None:
+            leftovers.remove(self._spare)
+        self._awake, self._spare = False, None
+
+    def add_layer(self, array: GrowingArray, number: int, streams: Sequence[bytes]) -> None:
+        """Write a layer of an array.
+
+        number: of the layer, from 0. streams: the bytes that the coder made of the tiles, in C
+        order, without CRC-32C. Raises InputError for a layer that takes too many bytes.
+        """
+        assert len(streams) == prod(array.layer_grid)
+        parts = [with_crc32c(stream) for stream in streams]
+        if array.is_sharded:
+            present = np.ones(len(parts), dtype=bool)
+            parts.append(pack_index([len(part) for part in parts], present))
+        self._add(f"{array.name}/c/{number}/0/0/0", parts)
+
+    def describe(self, array: GrowingArray, steps: int) -> ArrayMetadata:
+        """Write the metadata of an array of so many steps, whose layers were added before."""
+        codecs = sharding_codecs(array.tile, array.codecs) if array.is_sharded else array.codecs
+        return self._begin(
+            array.name,
+            (steps, *array.frame),
+            array.dtype,
+            array.chunk_shape,
+            codecs,
+            array.dimension_names,
+            None,
+        )
+
+    def publish(self, header: Mapping[str, Any], mark: Mark) -> int:
+        """Write the groups, the header and the directory, and let the file take its name.
+
+        mark: the members behind it are of this state alone, as metadata are; the next state has
+        others in their place.
+
+        Returns the number of bytes of the file. Raises InputError for a header that does not fit
+        the arrays, and OutputError for a full disk or if another process took the name; the state
+        that was published last then stays.
+        """
+        tail = self._tail(header)
+        # A file that fhash's reader would refuse is not written.
+        self._open(tail).close()
+        size = self._position + len(tail)
+        try:
+            self._file.write(tail)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            if self._ours is None:
+                self._take_name()
+            else:
+                self._swap()
+        except OSError as error:
+            raise self._explained(error) from error
+        self._common, self._lasting = self._lasting, mark.position
+        self._ours, self._awake = self._identity(), False
+        self.rewind(mark)
+        return size
+
+    def rewind(self, mark: Mark) -> None:
+        """Drop the members that were written after a mark, so that others take their place."""
+        if self._awake:
+            super().rewind(mark)
+            return
+        del self._members[mark.members :]
+        self._arrays = {name: self._arrays[name] for name in self._arrays if name in mark.arrays}
+        self._position = mark.position
+
+    def _write(self, member: Member, parts: Sequence[bytes]) -> None:
+        self._wake()
+        try:
+            super()._write(member, parts)
+        except OSError as error:
+            raise self._explained(error) from error
+
+    def _tail(self, header: Mapping[str, Any]) -> bytes:
+        self._wake()
+        return super()._tail(header)
+
+    def _wake(self) -> None:
+        """Open the hidden file, with all lasting members in it."""
+        if self._awake:
+            return
+        fresh = self._target.with_name(leftovers.new_stem(self._target.name) + leftovers.PARTIAL)
+        hidden = self._spare or fresh
+        common = 0 if self._spare is None else self._common
+        try:
+            file = hidden.open("xb" if self._spare is None else "r+b")
+            try:
+                file.truncate(common)
+                file.seek(common)
+                if self._ours is not None:
+                    self._copy(file, common)
+            except BaseException:
+                file.close()
+                if self._spare is None:
+                    leftovers.remove(hidden)
+                raise
+        except OSError as error:
+            raise self._explained(error) from error
+        self._temporary, self._file, self._spare, self._awake = hidden, file, None, True  # type: ignore[assignment]
+
+    def _copy(self, file: Any, start: int) -> None:
+        """Copy lasting members from the file that has the name, from a position on."""
+        if self._identity() != self._ours:
+            raise self._taken()
+        with self._target.open("rb") as source:
+            source.seek(start)
+            left = self._lasting - start
+            while left > 0:
+                piece = source.read(min(PIECE, left))
+                if not piece:
+                    raise self._taken()
+                file.write(piece)
+                left -= len(piece)
+
+    def _take_name(self) -> None:
+        """Give the first state the name of the container."""
+        before = self._continues
+        if before is not None and self._identity() != (before.st_dev, before.st_ino):
+            raise self._taken()
+        with replacing(self.path, force=self._force) as temporary:
+            os.replace(self._temporary, temporary)
+
+    def _swap(self) -> None:
+        """Let the hidden file take the name, and hide the one that had it."""
+        with suppress(OSError):  # file systems such as exFAT have no permissions
+            shutil.copymode(self._target, self._temporary)
+        spare = self._target.with_name(leftovers.new_stem(self._target.name) + leftovers.PARTIAL)
+        with signals_held():
+            if self._identity() != self._ours:
+                raise self._taken()
+            try:
+                os.link(self._target, spare)
+            except OSError:  # without hard links the next layer copies the whole file
+                spare = None  # type: ignore[assignment]
+            try:
+                os.replace(self._temporary, self._target)
+            except BaseException:
+                if spare is not None:
+                    leftovers.remove(spare)
+                raise
+            self._spare = spare
+        sync_folder(self._target.parent)
+
+    def _identity(self) -> tuple[int, int] | None:
+        """Device and number of the file that has the name; None where there is none."""
+        try:
+            state = os.stat(self._target)
+        except FileNotFoundError:
+            return None
+        return state.st_dev, state.st_ino
+
+    def _taken(self) -> OutputError:
+        return OutputError(
+            f"{self.path}: another process moved, replaced or changed the file while it grew; "
+            "nothing more is written to it: append to one file from one process"
+        )
+
+    def _explained(self, error: OSError) -> OSError:
+        """The error that says in one line why the file could not grow."""
+        if isinstance(error, FhashError):
+            return error
+        explanation = explained(self.path, error)
+        if self._ours is None:
+            return explanation
+        return OutputError(f"{explanation}; the layers before are in the file")

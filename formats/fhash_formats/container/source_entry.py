@@ -1,0 +1,317 @@
+"""The header's `source` and the arrays `auxiliary/...`, read and checked.
+
+FORMAT.md, Source metadata, is the norm. `source_described` writes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container.array import DTYPES, MAX_DIMENSIONS
+from fhash_formats.container.record import MAX_LENGTH, Record
+from fhash_formats.container.typed_values import (
+    attribute_value,
+    inline_array,
+    type_of_name,
+)
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.source_metadata import (
+    NO_AXIS,
+    SourceMetadata,
+    SourceVariable,
+    is_plain_name,
+)
+
+__all__ = [
+    "AUXILIARY",
+    "SOURCE",
+    "check_source",
+    "narrowed",
+    "read_metadata",
+]
+
+SOURCE = "source"
+"""Key of the header."""
+SINCE = (1, 7)
+"""(major, minor) of the first format that knows the key; an older file may hold anything there."""
+AUXILIARY = "auxiliary/"
+"""Prefix of the arrays."""
+MAX_VARIABLES = 1024
+"""Arrays beside the data that a reader takes."""
+MAX_BYTES = 1 << 28
+"""Bytes of all arrays beside the data that a reader takes, decoded."""
+MAX_FURTHER = 16
+"""Dimensions of the variable: four axes, and others of length 1."""
+
+
+class Readable(Protocol):
+    """An array of a container, as far as it is needed here."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of each axis."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers."""
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """Attributes, as JSON values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Entry:
+    """One array beside the data, checked: where its values are, and all else."""
+
+    name: str
+    dimensions: tuple[str, ...]
+    shape: tuple[int, ...]
+    type_name: str
+    attributes: Mapping[str, Any]
+    is_coordinate: bool
+    axis: str | None = None
+    array: str | None = None
+    values: npt.NDArray[Any] | None = None
+
+
+def check_source(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> None:
+    """Check the header's `source` and its arrays; raises DamagedFileError that names the key."""
+    if has_source(header):
+        _parsed(header, arrays)
+
+
+def has_source(header: Mapping[str, Any]) -> bool:
+    """Whether a header describes its source."""
+    return SOURCE in header and tuple(header["format_version"]) >= SINCE
+
+
+def read_metadata(
+    header: Mapping[str, Any], arrays: Mapping[str, Any], coords: Mapping[str, Coordinate]
+) -> SourceMetadata | None:
+    """The source of a container that `check_source` passed; None where it says nothing.
+
+    arrays: StoredArray by name. coords: those of the container.
+    """
+    if not has_source(header):
+        return None
+    dimensions, entries = _parsed(header, arrays)
+    entry = header[SOURCE]
+    variables = []
+    for each in entries:
+        if each.values is not None:
+            values = each.values
+        elif each.axis is not None:
+            values = narrowed(coords[each.axis].values, type_of_name(each.type_name))
+        else:
+            values = arrays[f"{AUXILIARY}{each.array}"].read()
+        variables.append(
+            SourceVariable(
+                name=each.name,
+                dimensions=each.dimensions,
+                values=values.reshape(each.shape),
+                attributes=each.attributes,
+                is_coordinate=each.is_coordinate,
+            )
+        )
+    return SourceMetadata(
+        dimensions=dimensions,
+        variable_attributes=_attributes(entry, "variable", header["variable"]["attributes"]),
+        variables=tuple(variables),
+        attributes=_attributes(entry, "attributes", {}),
+        stored=entry.get("stored"),
+        file=entry.get("file"),
+        digest=entry.get("digest"),
+    )
+
+
+def _parsed(
+    header: Mapping[str, Any], arrays: Mapping[str, Readable]
+) -> tuple[dict[str, str], list[_Entry]]:
+    """The dimensions of the variable, and the arrays beside it, all checked."""
+    top = Record(header, "header key ").record(SOURCE)
+    names = _coordinate_names(header, arrays)
+    dimensions = _dimensions(top, names)
+    by_axis = dict(zip(AXES, header["domain"]["shape"], strict=True))
+    for axis, length in by_axis.items():
+        made_up = axis not in dimensions.values()
+        top.need(not made_up or length == 1, "dimensions", f"axis {axis}, of length {length}")
+    lengths = {name: by_axis.get(axis, 1) for name, axis in dimensions.items()}
+    for name, length in _lengths(top).items():
+        top.need(name not in lengths, "lengths", "other names than those of dimensions")
+        lengths[name] = length
+    for key in ("file", "digest", "date"):
+        if top.has(key):
+            top.text(key)
+    if top.has("stored"):
+        top.choice("stored", tuple(DTYPES))
+    _attributes(header[SOURCE], "variable", header["variable"]["attributes"])
+    _attributes(header[SOURCE], "attributes", {})
+    records = top.records("variables") if top.has("variables") else []
+    top.need(len(records) <= MAX_VARIABLES, "variables", f"at most {MAX_VARIABLES} of them")
+    entries: list[_Entry] = []
+    left = MAX_BYTES
+    for record in records:
+        entry = _entry(record, header, arrays, names, dimensions, lengths)
+        taken = {each.name for each in entries} | {header["variable"]["name"]}
+        record.need(entry.name not in taken, "name" if record.has("name") else "axis", "one only")
+        left -= prod(entry.shape) * type_of_name(entry.type_name).itemsize
+        top.need(left >= 0, "variables", f"at most {MAX_BYTES} bytes of values")
+        entries.append(entry)
+    return dimensions, entries
+
+
+def _coordinate_names(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> dict[str, str]:
+    """Name of each axis in the source."""
+    described = header.get("coordinates", {})
+    found = {}
+    for axis, stored in AXIS_NAMES.items():
+        array = arrays.get(f"coords/{stored}")
+        place = described.get(stored, {}) if array is None else array.attributes
+        found[axis] = str(place.get("name", stored))
+    return found
+
+
+def _dimensions(top: Record, names: Mapping[str, str]) -> dict[str, str]:
+    """Dimensions of the variable with their axes, in the source's order."""
+    listed = top.get("dimensions")
+    top.need(isinstance(listed, list) and len(listed) <= MAX_FURTHER, "dimensions", "a short list")
+    found: dict[str, str] = {}
+    for each in listed:
+        pair = [names[each], each] if isinstance(each, str) and each in AXES else each
+        top.need(
+            isinstance(pair, list)
+            and len(pair) == 2
+            and pair[1] in (*AXES, NO_AXIS)
+            and (is_plain_name(pair[0]) or pair is not each),
+            "dimensions",
+            "axes t, z, y, x, or pairs [name, axis]",
+        )
+        name, axis = pair
+        again = name in found or (axis != NO_AXIS and axis in found.values())
+        top.need(not again, "dimensions", "each name and axis once")
+        found[name] = axis
+    return found
+
+
+def _lengths(top: Record) -> dict[str, int]:
+    """Lengths of further dimensions, those of arrays beside the data alone."""
+    if not top.has("lengths"):
+        return {}
+    top.record("lengths")
+    lengths: dict[str, Any] = top.get("lengths")
+    for name, length in lengths.items():
+        good = is_plain_name(name) and type(length) is int and 1 <= length <= MAX_LENGTH
+        top.need(good, "lengths", "whole numbers from 1 by name of a dimension")
+    return lengths
+
+
+def _entry(
+    record: Record,
+    header: Mapping[str, Any],
+    arrays: Mapping[str, Readable],
+    names: Mapping[str, str],
+    dimensions: Mapping[str, str],
+    lengths: Mapping[str, int],
+) -> _Entry:
+    """One entry of `variables`, checked."""
+    axis = record.choice("axis", AXES) if record.has("axis") else None
+    name = record.text("name") if record.has("name") or axis is None else names[axis]
+    record.need(is_plain_name(name) or not record.has("name"), "name", "a plain name")
+    own = next((key for key, each in dimensions.items() if each == axis), None)
+    default = [own] if axis is not None and own is not None else []
+    along = record.texts("dimensions") if record.has("dimensions") else default
+    known = all(each in lengths for each in along) and len(set(along)) == len(along)
+    record.need(known and len(along) <= MAX_DIMENSIONS, "dimensions", "known dimensions, once each")
+    shape = tuple(lengths[each] for each in along)
+    kind = record.text("dtype") if record.has("dtype") else "float64"
+    dtype = type_of_name(kind)
+    base: Mapping[str, Any] = {}
+    array, values = None, None
+    if axis is not None:
+        length = header["domain"]["shape"][AXES.index(axis)]
+        record.need(kind in DTYPES and prod(shape) == length, "axis", f"numbers, {length} of them")
+        base = _base_attributes(header, arrays, axis) if name == names[axis] else {}
+    elif record.has("array"):
+        array = record.text("array")
+        _check_array(array, arrays, shape or (1,), dtype)
+    else:
+        try:
+            values = inline_array(record.get("values"), kind, shape)
+        except DamagedFileError as error:
+            raise DamagedFileError(f"header key {SOURCE}.variables: {name}: {error}") from error
+    if record.has("coordinate"):
+        record.need(isinstance(record.get("coordinate"), bool), "coordinate", "true or false")
+    return _Entry(
+        name=name,
+        dimensions=tuple(along),
+        shape=shape,
+        type_name=kind,
+        attributes=_changed(record.get("attributes") if record.has("attributes") else {}, base),
+        is_coordinate=record.get("coordinate") if record.has("coordinate") else axis is not None,
+        axis=axis,
+        array=array,
+        values=values,
+    )
+
+
+def _check_array(
+    place: str, arrays: Mapping[str, Readable], shape: Sequence[int], dtype: np.dtype[Any]
+) -> None:
+    name = f"{AUXILIARY}{place}"
+    if name not in arrays:
+        raise DamagedFileError(f"array {name} is missing")
+    array = arrays[name]
+    if array.shape != tuple(shape) or array.dtype != dtype:
+        raise DamagedFileError(
+            f"array {name} is {array.dtype} {array.shape}; the header asks for {dtype}"
+            f" {tuple(shape)}"
+        )
+
+
+def _base_attributes(
+    header: Mapping[str, Any], arrays: Mapping[str, Readable], axis: str
+) -> Mapping[str, Any]:
+    """Attributes of the coordinate of an axis."""
+    stored = AXIS_NAMES[axis]
+    array = arrays.get(f"coords/{stored}")
+    if array is not None:
+        return {key: value for key, value in array.attributes.items() if key != "name"}
+    found: Mapping[str, Any] = header["coordinates"][stored].get("attributes", {})
+    return found
+
+
+def narrowed(positions: npt.NDArray[np.float64], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Positions in another type, which holds them where the file is sound."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return positions.astype(dtype)
+
+
+def _attributes(entry: Mapping[str, Any], key: str, base: Mapping[str, Any]) -> dict[str, Any]:
+    return _changed(entry.get(key, {}), base)
+
+
+def _changed(changes: object, base: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes of a base, with some of them changed, added or, where null, left out."""
+    if not isinstance(changes, Mapping):
+        raise DamagedFileError(f"header key {SOURCE}: attributes are no object")
+    found = {name: _natural(value) for name, value in base.items() if name not in changes}
+    for name, value in changes.items():
+        if value is not None:
+            found[name] = attribute_value(value)
+    return found
+
+
+def _natural(value: Any) -> Any:
+    """An attribute of a coordinate or variable of the header, which may be any JSON value."""
+    try:
+        return attribute_value(value)
+    except DamagedFileError:
+        return value

@@ -1,0 +1,286 @@
+"""All that belongs to a variable in its source: found by the CF conventions, read, and bounded.
+
+A variable names its surroundings by attributes: `coordinates`, `grid_mapping`, `bounds` of these,
+`formula_terms` and so on (CF 1.11, sections 4, 5, 7 and appendix A). What is too large, or a field
+of its own, is left out, and one warning names it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container.typed_values import stored_type, typed_attribute
+from fhash_formats.errors import FhashWarning
+from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.layout import Layout, picks
+from fhash_formats.source_metadata import (
+    COORDINATES,
+    NO_AXIS,
+    SourceMetadata,
+    SourceVariable,
+    is_plain_name,
+    references,
+    without_names,
+)
+from fhash_formats.support.attributes import PLUMBING
+from fhash_formats.support.plain_json import UnknownValueError
+
+__all__ = ["Stored", "Wanted", "digest_of", "kept_dimensions", "surroundings"]
+
+MAX_ONE = 16 << 20
+"""Bytes of one array beside the data: latitudes of 1400^2 vertices as float64."""
+MAX_ALL = 64 << 20
+"""Bytes of all arrays beside the data."""
+MAX_TEXTS = 1 << 14
+"""Texts of one array; they stand in the header."""
+MAX_ATTRIBUTE = 64 << 10
+"""Bytes of one attribute as JSON; those of a file stand in the header, too."""
+DIGEST_BYTES = 256 << 20
+"""Bytes of a file up to which its digest is taken: it is one more reading of the whole file, which
+costs little beside an encoding, but minutes where the file lies on a slow disk."""
+TEXT_BYTES = 32
+"""Bytes that a text is counted as."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stored:
+    """An array as a file has it: nothing is decoded.
+
+    `read` takes a slice or an index along each dimension.
+    """
+
+    dimensions: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    attributes: Mapping[str, Any]
+    read: Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """The variable whose surroundings are asked for.
+
+    Attributes:
+        source: for messages.
+        name: of the variable.
+        dimensions: those that are kept, with their axis, or NO_AXIS.
+        picked: index along each dimension that the user selected, by name.
+        coordinates: names of coordinates that no attribute tells.
+        used: names of further variables that are wanted, such as one that gave the positions.
+        without: attributes of the variable that do not hold for its values.
+        stored: number type of the stored values, where the decoded ones have another.
+        path: of the file; None for data in memory.
+    """
+
+    source: str
+    name: str
+    dimensions: Mapping[str, str]
+    picked: Mapping[str, int]
+    coordinates: Collection[str] = ()
+    used: Collection[str] = ()
+    without: Collection[str] = ()
+    stored: str | None = None
+    path: Path | None = None
+
+
+def kept_dimensions(
+    source: str, name: str, layout: Layout, names: Sequence[str], select: Sequence[tuple[str, str]]
+) -> tuple[dict[str, str], dict[str, int]]:
+    """Dimensions that are kept, with their axis, and the index along those that the user selected.
+
+    A dimension of length 1 that nobody selected along is kept, although it is no axis.
+
+    names: of the dimensions in the file. select: the user's wishes, see `layout.picks`.
+    """
+    asked = picks(source, name, layout.dimensions, select)
+    axes = iter(layout.axes)
+    kept, picked = {}, {}
+    for place, each in enumerate(names):
+        if place in asked:
+            picked[each] = asked[place]
+        else:
+            kept[each] = NO_AXIS if place in layout.picked else next(axes)
+    return kept, picked
+
+
+def surroundings(
+    wanted: Wanted, variables: Mapping[str, Stored], attributes: Mapping[str, Any]
+) -> SourceMetadata:
+    """All that belongs to a variable; warns (FhashWarning) once, of all that is left out.
+
+    variables: all that the variable can name. attributes: of the file.
+    """
+    left_out: dict[str, str] = {}
+    found = _Collected(wanted, variables, left_out)
+    own = variables[wanted.name]
+    for name, is_coordinate in _named(wanted, own, variables, attributes).items():
+        found.add(name, is_coordinate)
+    kept = {key: value for key, value in own.attributes.items() if key not in (*wanted.without, "")}
+    of_file = {key: value for key, value in attributes.items() if key != COORDINATES}
+    metadata = SourceMetadata(
+        dimensions=dict(wanted.dimensions),
+        variable_attributes=without_names(
+            _storable(kept, f"{wanted.name}:", left_out), left_out.keys()
+        ),
+        variables=tuple(found.variables),
+        attributes=_storable(of_file, ":", left_out),
+        stored=wanted.stored,
+        file=None if wanted.path is None else wanted.path.name,
+        digest=None if wanted.path is None else digest_of(wanted.path),
+    )
+    if left_out:
+        told = ", ".join(f"{name} ({why})" for name, why in left_out.items())
+        warnings.warn(
+            f"{wanted.source}: not everything beside {wanted.name} is kept: {told}",
+            FhashWarning,
+            stacklevel=2,
+        )
+    return metadata
+
+
+def digest_of(path: Path) -> str | None:
+    """SHA-256 of a file, hexadecimal; None for a folder and a file above DIGEST_BYTES."""
+    if not path.is_file() or path.stat().st_size > DIGEST_BYTES:
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _named(
+    wanted: Wanted,
+    own: Stored,
+    variables: Mapping[str, Stored],
+    attributes: Mapping[str, Any],
+) -> dict[str, bool]:
+    """Names of all that belongs to a variable, in order, and whether each is a coordinate."""
+    names = {name: True for name in own.dimensions}
+    names |= dict.fromkeys([*_texts(own.attributes, COORDINATES), *wanted.coordinates], True)
+    for name in _texts(attributes, COORDINATES):
+        # a coordinate that belongs to no variable alone
+        if name in variables and set(variables[name].dimensions) <= set(own.dimensions):
+            names[name] = True
+    for name in [*_references(own), *wanted.used]:
+        names.setdefault(name, False)
+    names = {name: told for name, told in names.items() if name in variables}
+    names.pop(wanted.name, None)
+    open_names = list(names)
+    while open_names:
+        for name in _references(variables[open_names.pop(0)]):
+            if name in variables and name not in names and name != wanted.name:
+                names[name] = False
+                open_names.append(name)
+    return names
+
+
+def _texts(attributes: Mapping[str, Any], key: str) -> list[str]:
+    text = attributes.get(key)
+    return text.split() if isinstance(text, str) else []
+
+
+def _references(stored: Stored) -> list[str]:
+    """Names in the attributes of a variable that name others, its coordinates excepted."""
+    return [name for key, name in references(stored.attributes) if key != COORDINATES]
+
+
+class _Collected:
+    """The arrays beside the data that were read, and what was left out and why."""
+
+    def __init__(
+        self, wanted: Wanted, variables: Mapping[str, Stored], left_out: dict[str, str]
+    ) -> None:
+        self.variables: list[SourceVariable] = []
+        self._wanted, self._stored, self._left_out = wanted, variables, left_out
+        self._bytes = 0
+        own = variables[wanted.name]
+        self._lengths = dict(zip(own.dimensions, own.shape, strict=True))
+
+    def add(self, name: str, is_coordinate: bool) -> None:
+        """Read a variable, or note why it is left out."""
+        problem = self._problem(name, self._stored[name])
+        if problem:
+            self._left_out[name] = problem
+            return
+        stored, picked = self._stored[name], self._wanted.picked
+        try:
+            values = np.asarray(
+                stored.read(tuple(picked.get(each, slice(None)) for each in stored.dimensions))
+            )
+        except Exception as error:  # filters and files raise all kinds
+            self._left_out[name] = f"cannot be read: {condense(error)}"
+            return
+        if stored_type(values) is None:
+            self._left_out[name] = f"values of type {values.dtype}"
+            return
+        dimensions = tuple(each for each in stored.dimensions if each not in picked)
+        self._bytes += _size(values.shape, values.dtype)
+        self._lengths |= dict(zip(dimensions, values.shape, strict=True))
+        self.variables.append(
+            SourceVariable(
+                name=name,
+                dimensions=dimensions,
+                values=values,
+                attributes=_storable(stored.attributes, f"{name}:", self._left_out),
+                is_coordinate=is_coordinate,
+            )
+        )
+
+    def _problem(self, name: str, stored: Stored) -> str:
+        """Why a variable is left out, as far as is known before it is read; "" if it is not."""
+        kept = [
+            (each, length)
+            for each, length in zip(stored.dimensions, stored.shape, strict=True)
+            if each not in self._wanted.picked
+        ]
+        names = [each for each, _ in kept]
+        shape = tuple(length for _, length in kept)
+        size = _size(shape, stored.dtype)
+        if not all(map(is_plain_name, [name, *names])) or len(set(names)) < len(names):
+            return "its name or dimensions have no form in all formats"
+        if 0 in shape or any(self._lengths.get(each, length) != length for each, length in kept):
+            return "its dimensions do not fit"
+        if stored.dtype.kind not in "iufSUTO" or stored.dtype.itemsize > 1 << 16:
+            return f"values of type {stored.dtype}"
+        # of a plane, latitude and longitude have all dimensions
+        if len(self._wanted.dimensions) > 2 and set(self._wanted.dimensions) <= set(names):
+            return "a field of its own: it has all dimensions of the variable"
+        if stored.dtype.kind in "SUTO" and prod(shape) > MAX_TEXTS:
+            return f"{prod(shape)} texts; {MAX_TEXTS} are kept"
+        if size > MAX_ONE:
+            return f"{size / 2**20:.0f} MiB; {MAX_ONE >> 20} are kept"
+        if self._bytes + size > MAX_ALL:
+            return f"all together are more than {MAX_ALL >> 20} MiB"
+        return ""
+
+
+def _size(shape: Sequence[int], dtype: np.dtype[Any]) -> int:
+    return prod(shape) * (TEXT_BYTES if dtype.kind in "UTO" else dtype.itemsize)
+
+
+def _storable(
+    attributes: Mapping[str, Any], prefix: str, left_out: dict[str, str]
+) -> dict[str, Any]:
+    """The attributes that a container holds; the others are noted."""
+    found = {}
+    for key, value in attributes.items():
+        if key in PLUMBING:
+            continue
+        try:
+            size = len(json.dumps(typed_attribute(value)))
+        except UnknownValueError:
+            left_out[f"{prefix}{key}"] = "a value of no known type"
+            continue
+        if size > MAX_ATTRIBUTE or not is_plain_name(key):
+            left_out[f"{prefix}{key}"] = f"{size} bytes" if is_plain_name(key) else "its name"
+            continue
+        found[key] = value
+    return found

@@ -1,0 +1,214 @@
+"""Several variables in one file, by every command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import Result
+
+from fhash_cli.variables import config_of, configs_of, info_table, report_table
+from fhash_formats.errors import InputError
+
+Fhash = Callable[..., Result]
+SMALL = ["--effort", "1", "--quiet"]
+SHAPE = (3, 6, 7, 8)
+
+
+def values(scale: float) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
+    return (scale * np.sin(0.3 * (x + y) + t) + z).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two variables of four axes, one of five, and numbers along one."""
+    path = tmp_path_factory.mktemp("several") / "data.h5"
+    with h5py.File(path, "w") as file:
+        file["u"], file["v"] = values(1), values(2)
+        file["members"] = np.stack([values(1)] * 2)
+        file["numbers"] = np.arange(3.0)
+        file["u"].attrs["units"] = "m s-1"
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(data: Path) -> Path:
+    import fhash_codec
+
+    path = data.with_name("run.fhz")
+    config = fhash_codec.EncodeConfig(effort=1, max_error=0.01)
+    fhash_codec.encode_dataset(data, path, config, variables=["u", "v"])
+    return path
+
+
+def test_all_takes_what_can_be_encoded_as_it_is(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data, "-o", path, "--effort", 1]
+    result = fhash(*words, "--var", "all", "--max-error", "u=0.1,v=0.2")
+    assert result.exit_code == 0
+    assert f"--var all leaves out members, numbers; fhash info {data} says why" in result.stderr
+    rows = [line.split() for line in result.stdout.splitlines() if line[:1] in ("u", "v")]
+    assert [row[0] for row in rows] == ["variable", "u", "v"]
+    info = json.loads(fhash("info", path, "--json").stdout)
+    bounds = {name: each["config"]["max_error"] for name, each in info["variables"].items()}
+    assert bounds == {"u": 0.1, "v": 0.2}
+    assert info["bytes"] == path.stat().st_size
+
+
+def test_several_names_with_a_plain_promise(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data, "-o", path, *SMALL, "--var", "v, u", "--psnr", 60]
+    report = json.loads(fhash(*words, "--explain", "--json").stdout)
+    assert list(report["variables"]) == ["v", "u"]
+    for name, each in report["variables"].items():
+        assert each["psnr"] >= 60, name
+        assert each["stages"]
+    assert report["bytes"] == path.stat().st_size
+
+
+def test_components_become_variables(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data, "-o", path, *SMALL, "--components", "dim0", "--json"]
+    result = fhash(*words, "--max-error", "members_1=0.5")
+    assert list(json.loads(result.stdout)["variables"]) == ["members_0", "members_1"]
+    report = json.loads(fhash("info", path, "--json").stdout)["variables"]
+    assert report["members_1"]["config"]["max_error"] == 0.5
+    assert report["members_0"]["variable"]["name"] == "members"
+    difference = ["diff", data, path, "--var", "members", "--select", "dim0=1", "--json"]
+    assert json.loads(fhash(*difference).stdout)["max_abs_error"] <= 0.5
+    result = fhash(*words, "--var", "all", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == [
+        *(f"members_{n}" for n in range(2)),
+        "u",
+        "v",
+    ]
+    result = fhash(*words, "--var", "u,members", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == ["u", "members_0", "members_1"]
+
+
+def test_info_lists_the_variables_and_tells_all_of_one(fhash: Fhash, run: Path) -> None:
+    text = fhash("info", run).stdout
+    assert [line.split()[:2] for line in text.splitlines() if line[:2] in ("u ", "v ")] == [
+        ["u", "m"],
+        ["v", "-"],
+    ]
+    assert f"fhash info {run} --var u" in text
+    card = fhash("info", run, "--var", "v").stdout
+    assert "variable       v, float32" in card
+    assert "; v, fhash.transform" in card
+
+
+def test_decode_and_render_take_one(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    assert fhash("decode", run, "--var", "v", "-o", tmp_path / "v.npy").exit_code == 0
+    assert np.abs(np.load(tmp_path / "v.npy") - values(2)).max() <= 0.01
+    picture = tmp_path / "v.png"
+    words = ["render", run, "--size", "16x16", "-o", picture]
+    assert fhash(*words, "--var", "v").exit_code == 0
+    assert picture.exists()
+
+
+def test_diff_compares_one_with_its_data(fhash: Fhash, run: Path, data: Path) -> None:
+    for name in "uv":
+        words = ["diff", data, run, "--var", name, "--max-error", 0.01, "--json"]
+        result = fhash(*words)
+        assert result.exit_code == 0
+        assert json.loads(result.stdout)["max_abs_error"] <= 0.01
+        assert json.loads(result.stdout)["differences"] == []
+
+
+def test_verify_checks_all_or_one(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    assert fhash("verify", run).stdout == f"{run}: sound, 6 arrays checked\n"
+    assert fhash("verify", run, "--var", "v").stdout == f"{run}: sound, 5 arrays checked\n"
+    damaged = bytearray(run.read_bytes())
+    damaged[damaged.index(b"v/c/0") + 20] ^= 1
+    path = tmp_path / "bad.fhz"
+    path.write_bytes(damaged)
+    assert fhash("verify", path, "--var", "u").exit_code == 0
+    assert fhash("verify", path).exit_code == 4
+
+
+@pytest.mark.parametrize("command", ["decode", "render", "diff", "export"])
+def test_a_variable_must_be_named(
+    refused: Callable[..., str], run: Path, data: Path, tmp_path: Path, command: str
+) -> None:
+    words = {"diff": [data, run], "export": [run, "--plain", "-o", tmp_path / "plain.fhz"]}
+    message = refused(2, command, *words.get(command, [run]))
+    assert "holds several variables, u, v; choose one" in message
+    if command != "export":
+        message = refused(2, command, *words.get(command, [run]), "--var", "w")
+        assert "has no variable 'w'; it holds u" in message
+
+
+def test_options_of_encodings_are_refused_for_what_is_encoded(
+    refused: Callable[..., str], run: Path
+) -> None:
+    assert "--axes is for data" in refused(2, "info", run, "--axes", "t,z,y,x", "--var", "u")
+
+
+BAD = {
+    "a name twice": (["--var", "u,u"], "has 'u' where another name"),
+    "an empty name": (["--var", "u,"], "has '' where another name"),
+    "an unknown variable": (["--var", "u,q"], "no variable 'q'"),
+    "one that needs a choice": (["--var", "u,members"], "members"),
+    "a promise for no variable": (
+        ["--var", "u,v", "--psnr", "q=40"],
+        "--psnr names q, which is none of the variables u, v",
+    ),
+    "a promise by name for one": (["--var", "u", "--psnr", "u=40"], "give the number alone"),
+    "a promise twice": (["--var", "u,v", "--psnr", "u=40,u=41"], "for each name once"),
+    "a promise that is no number": (["--var", "u,v", "--psnr", "u=a"], "not a valid"),
+    "a promise beyond its range": (["--var", "u,v", "--psnr", "u=-1"], "not in the range"),
+    "two promises for one": (
+        ["--var", "u,v", "--psnr", "u=40", "--max-error", "u=1"],
+        "promise one of them",
+    ),
+    "components of no dimension": (["--components", "dim9"], "no variable has that dimension"),
+    "an axis as components": (["--components", "t"], "no variable has that dimension"),
+    "a budget": (["--var", "u,v", "--time-budget", "9s"], "are for one variable"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_commands(refused: Callable[..., str], data: Path, tmp_path: Path, case: str) -> None:
+    words, message = BAD[case]
+    output = tmp_path / "run.fhz"
+    assert message in refused(2, "encode", data, "-o", output, *SMALL, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def settings(**given: object) -> dict[str, object]:
+    promises = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
+    return {**dict.fromkeys(promises), **given}
+
+
+def test_a_promise_by_name_stands_in_place_of_those_for_all() -> None:
+    configs = configs_of(settings(psnr=50.0, max_error={"v": 0.5}, effort=3), ["u", "v"])
+    assert [(c.psnr, c.max_error, c.effort) for c in configs.values()] == [
+        (50, None, 3),
+        (None, 0.5, 3),
+    ]
+    (config,) = configs_of(settings(psnr={"u": 40.0}, psnr_bulk={"u": 30.0}), ["u"]).values()
+    assert (config.psnr, config.psnr_bulk) == (40, 30)
+    assert config_of(settings(ratio=8.0)).ratio == 8
+    with pytest.raises(InputError, match="number for u"):
+        config_of(settings(ratio={"u": 8.0}))
+
+
+def test_tables_have_a_row_for_each_variable() -> None:
+    figures = {"bytes": 1000, "ratio": 4.0, "rmse": 0.0, "psnr": None, "max_abs_error": 0.0}
+    assert report_table({"u": figures})[1] == ["u", "1.00 kB", "4.00x", "exact", "0"]
+    described = {
+        "bytes": 1000,
+        "ratio": 4.0,
+        "quality": {"psnr": 40.0, "rmse": 1.0},
+        "domain": {"shape": [1, 2, 3, 4]},
+        "variable": {"units": "", "dtype": "int8"},
+    }
+    header, row = info_table({"u": described})
+    assert len(header) == len(row)
+    assert row == ["u", "-", "1 x 2 x 3 x 4", "int8", "1.00 kB", "4.00x", "40 dB", "-"]

@@ -1,0 +1,48 @@
+"""Figures of a growing file: those of a comparison, before and after they were in a header."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fhash_codec.appending.figures import Figures
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.errors import InputError
+
+
+def measured(count: int = 3) -> tuple[Figures, np.ndarray]:
+    errors = np.random.default_rng(0).normal(0, 0.01, (count, 2, 3, 4))
+    figures = Figures(Figures.scale_of(ValueRange(0.0, 5.0)))
+    for error in errors:
+        figures.steps.append(figures.measure(np.zeros(error.shape), error))
+    return figures, errors
+
+
+def test_figures_are_those_of_the_errors_rounded_to_the_worse_side() -> None:
+    figures, errors = measured()
+    quality = figures.header(5.0)
+    rmse = np.sqrt(np.mean(errors**2))
+    assert rmse <= quality["rmse"] <= rmse * (1 + 1e-5)
+    assert np.abs(errors).max() <= quality["max_abs_error"] <= np.abs(errors).max() * (1 + 1e-5)
+    assert quality["psnr"] == pytest.approx(20 * np.log10(5.0 / rmse), abs=1e-3)
+    assert len(quality["per_step"]["rmse"]) == 3
+
+
+def test_what_a_header_tells_is_taken_up_again() -> None:
+    figures, _ = measured()
+    told = figures.header(5.0)
+    columns = told["per_step"]
+    steps = [dict(zip(columns, pair, strict=True)) for pair in zip(*columns.values(), strict=True)]
+    header = {"domain": {"shape": [3, 2, 3, 4]}, "quality": {**told, "per_step": steps}}
+    again = Figures.of_header(header, figures.scale).header(5.0)
+    assert again["rmse"] == pytest.approx(told["rmse"], rel=1e-4)
+    assert again["rmse"] >= told["rmse"]
+    assert again["max_abs_error"] == told["max_abs_error"]
+    for wrong in (steps[:2], [*steps[:2], {"rmse": None, "max_abs_error": 1.0}]):
+        with pytest.raises(InputError, match="does not tell the errors of step 2"):
+            Figures.of_header({**header, "quality": {"per_step": wrong}}, 1.0)
+
+
+def test_a_range_of_one_value_has_a_scale() -> None:
+    for value in (0.0, 3.0, -1e-300):
+        assert Figures.scale_of(ValueRange(value, value)) > 0

@@ -1,0 +1,135 @@
+"""`merge`: parts become the file of the whole, byte for byte; wrong sets of parts are refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import DamagedFileError, EncodeConfig, InputError
+from fhash_codec.appending.merging import merge
+from fhash_codec.appending.parts import Part, encode_part
+from fhash_formats.container import table_parts
+from fhash_formats.errors import OutputExistsError
+from fhash_formats.series import ArraySeries, Coordinate
+
+SHAPE = (7, 4, 6, 8)
+TILE = "2x4x6x4"
+
+
+def values(seed: int = 0) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE), indexing="ij")
+    noise = np.random.default_rng(seed).random(SHAPE)
+    return (np.sin(6 * x + 2 * t) * np.cos(5 * y) + z + 0.05 * noise).astype(np.float32)
+
+
+def with_gaps() -> np.ndarray:
+    gaps = values()
+    gaps[3:5, 1:3, 2:4] = np.nan
+    return gaps
+
+
+def settings(**options) -> EncodeConfig:
+    return EncodeConfig(**{"max_error": 0.02, "effort": 1, "tile": TILE, **options}, timings=False)
+
+
+def parts_of(source, folder: Path, config: EncodeConfig, count: int = 3) -> list[Path]:
+    paths = [folder / f"part{number}.fhz" for number in range(1, count + 1)]
+    for number, path in enumerate(paths, start=1):
+        encode_part(source, path, config, Part(number=number, of=count))
+    return paths
+
+
+CASES = {
+    "bound": (values, {}),
+    "trials": (values, {"effort": 2, "max_error": 0.2}),
+    "a relative bound": (values, {"max_error": None, "max_error_rel": 0.01}),
+    "missing values": (with_gaps, {}),
+    "a feature and missing values": (with_gaps, {"features": ("interval:0.5:9",)}),
+    "integers": (lambda: (values() * 50).astype(np.int32), {"max_error": 0}),
+    "no ssim": (values, {"without": ("ssim",)}),
+}
+
+
+@pytest.mark.parametrize("case", [*CASES, "masks apart"])
+def test_merged_parts_are_the_whole_byte_for_byte(tmp_path, monkeypatch, case) -> None:
+    apart = case == "masks apart"
+    if apart:  # those of a large file, which its smaller parts would not have
+        monkeypatch.setattr(table_parts, "APART_BYTES", 1)
+        case = "a feature and missing values"
+    make, options = CASES[case]
+    source, config = make(), settings(**options)
+    fhash_codec.encode(source, tmp_path / "whole.fhz", config)
+    parts = parts_of(source, tmp_path, config)
+    report = merge([parts[1], parts[2], parts[0]], tmp_path / "run.fhz")
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    assert (report["parts"], report["steps"], report["tiles"]) == (3, 7, 8)
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        assert volume.verify()
+        assert ("apart" in volume.info["required_features"]) == apart
+
+
+def test_a_part_is_a_sound_file_of_its_steps(tmp_path) -> None:
+    times = {"t": Coordinate(name="time", values=np.array([0, 1, 2.5, 4, 7, 8, 9]))}
+    source = ArraySeries(values(), coords=times, name="u", units="m")
+    parts = parts_of(source, tmp_path, settings())
+    with fhash_codec.open(parts[1]) as volume:
+        assert volume.verify()
+        assert volume.shape == (2, *SHAPE[1:])
+        assert np.abs(volume[:] - values()[2:4]).max() <= 0.02
+        np.testing.assert_array_equal(volume.coords["t"].values, [2.5, 4])
+    merge(parts, tmp_path / "run.fhz")
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        np.testing.assert_array_equal(volume.coords["t"].values, times["t"].values)
+        assert (volume.name, volume.units) == ("u", "m")
+
+
+def test_the_whole_as_one_part(tmp_path) -> None:
+    fhash_codec.encode(values(), tmp_path / "whole.fhz", settings())
+    merge(parts_of(values(), tmp_path, settings(), 1), tmp_path / "run.fhz")
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+
+
+def test_gaps_overlaps_and_strangers_are_refused(tmp_path) -> None:
+    parts = parts_of(values(), tmp_path, settings())
+    (tmp_path / "other").mkdir()
+    strangers = {
+        "settings": parts_of(values(), tmp_path / "other", settings(max_error=0.03)),
+        "value_range": [tmp_path / "other" / "data.fhz"],
+        "parts": [tmp_path / "other" / "halves.fhz"],
+    }
+    encode_part(values(1), strangers["value_range"][0], settings(), Part(number=2, of=3))
+    encode_part(values(), strangers["parts"][0], settings(), Part(number=2, of=2))
+    fhash_codec.encode(values(), tmp_path / "whole.fhz", settings())
+    for chosen, message in (
+        ([], "no parts are given"),
+        (parts[1:], "steps 0 to 1 are missing: parts 1/3"),
+        (parts[:2], "steps 4 to 6 are missing: parts 3/3"),
+        ([parts[0], parts[2]], "steps 2 to 3 are missing: parts 2/3"),
+        ([*parts, parts[0]], "give each part once"),
+        ([parts[0], strangers["settings"][1], parts[2]], "not of one encoding, they differ in"),
+        ([parts[0], strangers["value_range"][0], parts[2]], "they differ in"),
+        ([parts[0], strangers["parts"][0]], "they differ in parts"),
+        ([parts[0], tmp_path / "whole.fhz"], "is no part of a series"),
+    ):
+        with pytest.raises(InputError, match=message):
+            merge(chosen, tmp_path / "run.fhz")
+        assert not (tmp_path / "run.fhz").exists()
+    with pytest.raises(InputError, match="is the input itself"):
+        merge(parts, parts[0], force=True)
+    with pytest.raises(OutputExistsError):
+        merge(parts, tmp_path / "whole.fhz")
+
+
+def test_a_damaged_tile_is_found_and_nothing_is_written(tmp_path) -> None:
+    parts = parts_of(values(), tmp_path, settings())
+    data = bytearray(parts[1].read_bytes())
+    place = data.index(b"tables/level_1/c/0") + 40
+    data[place] ^= 1
+    parts[1].write_bytes(data)
+    with pytest.raises(DamagedFileError, match="part2"):
+        merge(parts, tmp_path / "run.fhz")
+    assert sorted(os.listdir(tmp_path)) == ["part1.fhz", "part2.fhz", "part3.fhz"]

@@ -1,0 +1,338 @@
+"""`Writer`: frames in, a file that is complete after every layer and keeps its bound."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig, InputError, Writer
+from fhash_codec.appending.growing import GrowingFile
+from fhash_formats.errors import OutputError, OutputExistsError
+from fhash_formats.series import Coordinate
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from kill_writer import BOUND, SHAPE, TILE, frame
+
+CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile=TILE)
+LAYER = 3
+
+
+def written(path: Path, steps: int, **options) -> Path:
+    with Writer(path, shape=SHAPE, config=CONFIG, **options) as writer:
+        for step in range(steps):
+            writer.append(frame(step))
+    return path
+
+
+def frames(steps: int) -> np.ndarray:
+    return np.stack([frame(step) for step in range(steps)])
+
+
+def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+        for step in range(10):
+            writer.append(frame(step))
+            assert (writer.steps, writer.steps_written) == (step + 1, (step + 1) // LAYER * LAYER)
+            if writer.steps_written:
+                with fhash_codec.open(path) as volume:
+                    assert volume.shape == (writer.steps_written, *SHAPE)
+            else:
+                assert not path.exists()
+    assert (writer.steps, writer.steps_written) == (10, 10)
+    assert os.listdir(tmp_path) == ["run.fhz"]
+    with fhash_codec.open(path) as volume:
+        assert volume.verify()
+        assert np.abs(volume[:] - frames(10)).max() <= BOUND
+        assert volume.chunks == (LAYER, *SHAPE)
+        np.testing.assert_array_equal(volume.coords["t"].values, np.arange(10))
+
+
+def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
+    path = written(tmp_path / "run.fhz", 7)
+    with fhash_codec.open(path) as volume:
+        told = volume.info
+    found = fhash_codec.diff(frames(7), path)
+    quality = told["quality"]
+    assert quality["psnr"] == pytest.approx(found["psnr"], rel=1e-5)
+    assert quality["psnr"] <= found["psnr"]
+    for name in ("rmse", "max_abs_error"):
+        assert quality[name] == pytest.approx(found[name], rel=1e-5)
+        assert quality[name] >= found[name]
+    for step, other in zip(quality["per_step"], found["quality"]["per_step"], strict=True):
+        assert step["rmse"] == pytest.approx(other["rmse"], rel=2e-3)
+        assert step["rmse"] >= other["rmse"]
+    values = frames(7)
+    assert told["value_range"] == [values.min(), values.max()]
+    assert told["config"]["max_error"] == BOUND
+    assert quality["max_abs_error"] <= BOUND
+
+
+def test_resumed_it_goes_on_as_if_it_had_not_stopped(tmp_path) -> None:
+    path = written(tmp_path / "run.fhz", 6)
+    with Writer.resume(path) as writer:
+        assert writer.steps == 6
+        for step in range(6, 11):
+            writer.append(frame(step))
+    assert os.listdir(tmp_path) == ["run.fhz"]
+    with fhash_codec.open(written(tmp_path / "whole.fhz", 11)) as whole:
+        expected = whole[:]
+        with fhash_codec.open(path) as volume:
+            assert volume.verify()
+            np.testing.assert_array_equal(volume[:], expected)
+            assert volume.info["model"]["parameters"] == whole.info["model"]["parameters"]
+            np.testing.assert_array_equal(volume.coords["t"].values, np.arange(11))
+
+
+def test_resumed_without_a_frame_the_file_is_as_it_was(tmp_path) -> None:
+    path = written(tmp_path / "run.fhz", 6)
+    before = path.read_bytes()
+    with Writer.resume(path):
+        pass
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["run.fhz"]
+
+
+def test_a_short_last_layer_is_not_extended_but_may_be_dropped(tmp_path) -> None:
+    path = written(tmp_path / "run.fhz", 7)
+    with pytest.raises(InputError, match=r"within a layer of 3 steps.*keep 6 steps"):
+        Writer.resume(path)
+    with pytest.raises(InputError, match="8 steps are to be kept; it has 7"):
+        Writer.resume(path, steps=8)
+    with Writer.resume(path, steps=3) as writer:
+        for step in range(3, 9):
+            writer.append(frame(step))
+    with fhash_codec.open(path) as volume:
+        assert np.abs(volume[:] - frames(9)).max() <= BOUND
+        assert len(volume.info["quality"]["per_step"]) == 9
+
+
+def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(frames(6), path, EncodeConfig(max_error=BOUND, effort=5, tile=TILE))
+    with Writer.resume(path) as writer:
+        for step in range(6, 9):
+            writer.append(frame(step))
+    with fhash_codec.open(path) as volume:
+        assert volume.verify()
+        assert np.abs(volume[:] - frames(9)).max() <= BOUND
+    fhash_codec.encode(frames(6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE))
+    with pytest.raises(InputError, match="does not promise a bound"):
+        Writer.resume(tmp_path / "psnr.fhz")
+    feature = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, features=("interval:0.5:1",))
+    fhash_codec.encode(frames(6), tmp_path / "feature.fhz", feature)
+    with pytest.raises(InputError, match="keeps features"):
+        Writer.resume(tmp_path / "feature.fhz")
+
+
+def test_a_trained_head_is_shared_and_values_beyond_the_range_keep_the_bound(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    config = EncodeConfig(max_error=BOUND, effort=5, tile=TILE)
+    values = frames(9) * np.array([1, 1, 1, 1, 1, 1, 40, 40, 40], np.float32)[:, None, None, None]
+    with Writer(path, shape=SHAPE, config=config) as writer:
+        for values_of_step in values:
+            writer.append(values_of_step)
+    with fhash_codec.open(path) as volume:
+        assert np.abs(volume[:].astype(float) - values).max() <= BOUND
+        assert volume.value_range.high == values.max()
+        assert volume.verify()
+        assert volume.info["quality"]["max_abs_error"] <= BOUND
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int64", "float64", "float16"])
+def test_other_number_types(tmp_path, dtype) -> None:
+    path = tmp_path / "run.fhz"
+    values = (100 + 20 * frames(5)).astype(dtype)
+    with Writer(path, shape=SHAPE, max_error=0.0 if dtype == "int64" else 2.0) as writer:
+        for values_of_step in values:
+            writer.append(values_of_step)
+    with fhash_codec.open(path) as volume:
+        assert volume.dtype.kind == np.dtype(dtype).kind
+        error = np.abs(volume[:].astype(float) - values).max()
+        assert error <= (0 if dtype == "int64" else 2)
+
+
+def test_coordinates_and_labels(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
+    options = {"coords": coords, "name": "u", "units": "m s-1", "time_units": "hours"}
+    with Writer(path, shape=SHAPE, config=CONFIG, attributes={"a": 1}, **options) as writer:
+        for step, now in enumerate((0.0, 0.1, 0.7, 2.0)):
+            writer.append(frame(step), time=now)
+    with fhash_codec.open(path) as volume:
+        assert (volume.name, volume.units, dict(volume.attrs)) == ("u", "m s-1", {"a": 1})
+        np.testing.assert_array_equal(volume.coords["t"].values, [0.0, 0.1, 0.7, 2.0])
+        assert volume.coords["t"].attributes == {"units": "hours"}
+        assert volume.coords["z"].name == "lev"
+        np.testing.assert_array_equal(volume.coords["z"].values, [1, 2, 4, 8])
+        np.testing.assert_array_equal(volume.coords["x"].values, np.arange(12) / 3)
+    with pytest.raises(InputError, match="the coordinate of x has shape"):
+        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG, coords={"x": np.arange(3)})
+    with pytest.raises(InputError, match="coords names 'w'"):
+        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG, coords={"w": np.arange(3)})
+
+
+def test_many_irregular_times_have_an_array(tmp_path) -> None:
+    path, shape = tmp_path / "run.fhz", (1, 2, 3)
+    times = np.cumsum(np.random.default_rng(0).random(1200))
+    config = EncodeConfig(max_error=BOUND, effort=1, tile="400x1x2x3")
+    with Writer(path, shape=shape, config=config) as writer:
+        for now in times:
+            writer.append(np.full(shape, now, np.float32), time=now)
+    with fhash_codec.open(path) as volume:
+        np.testing.assert_array_equal(volume.coords["t"].values, times)
+        assert volume.verify()
+
+
+def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> None:
+    path, good = tmp_path / "run.fhz", frame(0)
+    bad = good.copy()
+    bad[0, 0, :2] = np.nan
+    with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+        writer.append(good)
+        for wrong, time_of_step, message in (
+            (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
+            (bad, None, "step 1: 2 of its values are NaN or infinite"),
+            (good.astype("f8"), None, "step 1: the frame is float64, those before are float32"),
+            (good.astype(complex), None, "complex128 cannot be encoded"),
+            (good, 0.0, "step 1: its time is 0, the one before has 0.0; times must"),
+            (good, np.nan, "step 1: its time is nan"),
+            (good, "noon", "step 1: its time is 'noon'"),
+        ):
+            with pytest.raises(InputError, match=message):
+                writer.append(wrong, time=time_of_step)
+            assert writer.steps == 1
+        for step in range(1, 4):
+            writer.append(frame(step))
+    with pytest.raises(InputError, match="the writer is closed"):
+        writer.append(good)
+    with fhash_codec.open(path) as volume:
+        assert np.abs(volume[:] - frames(4)).max() <= BOUND
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "promises a bound"),
+        ({"config": EncodeConfig(psnr=40)}, "a PSNR or a ratio depends"),
+        ({"max_error_rel": 0.01}, "give value_range"),
+        ({"config": EncodeConfig(max_error=1, features=("interval:0:1",))}, "keeps everything"),
+        ({"config": EncodeConfig(profile="paper")}, "profile 'paper'"),
+        ({"max_error": 1, "shape": (4, 10)}, "three lengths"),
+        ({"max_error": 1, "path": "run.nc"}, "a container is not a .nc file"),
+    ],
+)
+def test_settings_that_cannot_be_kept_are_refused_at_once(tmp_path, options, message) -> None:
+    path = tmp_path / options.pop("path", "run.fhz")
+    with pytest.raises(InputError, match=message):
+        Writer(path, **{"shape": SHAPE, **options})
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    with Writer(path, shape=SHAPE, max_error_rel=0.001, value_range=(-2, 2)) as writer:
+        for step in range(4):
+            writer.append(frame(step))
+    with fhash_codec.open(path) as volume:
+        assert volume.info["config"]["max_error"] == 0.004
+        assert np.abs(volume[:] - frames(4)).max() <= 0.004
+
+
+def test_an_existing_file_needs_force(tmp_path) -> None:
+    path = written(tmp_path / "run.fhz", 3)
+    with pytest.raises(OutputExistsError):
+        Writer(path, shape=SHAPE, config=CONFIG)
+    with Writer(path, shape=SHAPE, config=CONFIG, force=True) as writer:
+        writer.append(frame(0))
+    with fhash_codec.open(path) as volume:
+        assert volume.shape[0] == 1
+
+
+def test_a_failing_simulation_keeps_what_it_appended(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+
+    def simulate() -> None:
+        with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+            for step in range(4):
+                writer.append(frame(step))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        simulate()
+    with fhash_codec.open(path) as volume:
+        assert volume.shape[0] == 4
+
+
+def test_without_a_frame_there_is_no_file(tmp_path) -> None:
+    with Writer(tmp_path / "run.fhz", shape=SHAPE, config=CONFIG):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
+    tmp_path, monkeypatch
+) -> None:
+    path = tmp_path / "run.fhz"
+    writer = Writer(path, shape=SHAPE, config=CONFIG)
+    for step in range(LAYER):
+        writer.append(frame(step))
+
+    def fail(*arguments):
+        raise OutputError("no space left")
+
+    monkeypatch.setattr(GrowingFile, "publish", fail)
+    writer.append(frame(3))
+    writer.append(frame(4))
+    with pytest.raises(OutputError, match="no space left"):
+        writer.append(frame(5))
+    writer.close()
+    assert os.listdir(tmp_path) == ["run.fhz"]
+    with fhash_codec.open(path) as volume:
+        assert volume.shape[0] == LAYER
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_killed_it_loses_no_layer_that_was_written(tmp_path) -> None:
+    path, chance = tmp_path / "run.fhz", random.Random(1)
+    before = 0
+    for kill in range(3):
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                str(Path(__file__).with_name("kill_writer.py")),
+                str(path),
+                *(["resume"] if kill else []),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        assert process.stdout is not None
+        told = before
+        while told < before + 4 * LAYER:
+            told = int(process.stdout.readline())
+        time.sleep(chance.random() / 20)
+        process.send_signal(signal.SIGKILL)
+        told = max([told, *map(int, process.stdout.read().split())])
+        process.stdout.close()
+        process.wait()
+        with fhash_codec.open(path) as volume:
+            assert volume.verify()
+            steps = volume.shape[0]
+            assert np.abs(volume[:] - frames(steps)).max() <= BOUND
+        assert told <= steps <= told + LAYER
+        before = steps
+    with Writer.resume(path):
+        pass
+    assert os.listdir(tmp_path) == ["run.fhz"]

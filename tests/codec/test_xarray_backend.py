@@ -1,0 +1,233 @@
+"""The engine `fhash` gives what xarray gives of the source, but for the stated error."""
+
+from __future__ import annotations
+
+import pickle
+import tomllib
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from cf_files import KINDS, Kind, smooth
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+from fhash_codec.xarray_backend import FhashBackend
+from fhash_formats import open_series
+from fhash_formats.errors import InputError
+
+QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def made(request, tmp_path_factory) -> tuple[Kind, Path, Path]:
+    """A kind of file, the file, and the container of its variable."""
+    kind, folder = KINDS[request.param](), tmp_path_factory.mktemp(request.param)
+    source = kind.write(folder / "source.nc")
+    with open_series(source, var=kind.variable, select=kind.select) as series:
+        fhash_codec.encode(series, folder / "run.fhz", QUICK)
+    return kind, source, folder / "run.fhz"
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    """The container of a feature of an array, of several tiles; x is cut by the feature."""
+    path = tmp_path_factory.mktemp("plain") / "run.fhz"
+    values = smooth(5, 12, 20, 24).astype(np.float32)
+    mask = np.zeros(values.shape[1:], dtype=bool)
+    mask[2:11, 3:19, 1:20] = True
+    fhash_codec.encode(values, path, EncodeConfig(effort=1, tile="2x6x8x8"), mask=mask)
+    return path
+
+
+def opened(path: Path, **options: Any) -> xr.Dataset:
+    return xr.open_dataset(path, engine=FhashBackend, **options)
+
+
+def without_own(dataset: xr.Dataset) -> xr.Dataset:
+    """A copy without the attributes that are the container's own."""
+    copy = dataset.copy()
+    for place in (copy, *copy.data_vars.values()):
+        for key in list(place.attrs):
+            # the names of coordinates of no variable are not kept as such, but the coordinates are
+            own = key.startswith("fhash_") or key in ("history", "selection")
+            if own or (key == "coordinates" and place is copy):
+                del place.attrs[key]
+    return copy
+
+
+@pytest.mark.parametrize("coords", [True, "all", False])
+def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
+    kind, source, container = made
+    name = kind.variable
+    with (
+        xr.open_dataset(source, decode_coords=coords) as whole,
+        opened(container, decode_coords=coords) as stored,
+    ):
+        wanted, found = whole.isel(kind.select), stored
+        if not coords:
+            wanted = wanted.reset_coords(list(kind.select))
+        error = np.abs(wanted[name].values - found[name].values)
+        assert np.nanmax(error) <= stored[name].attrs["fhash_max_error"] * (1 + 1e-6)
+        np.testing.assert_array_equal(np.isnan(wanted[name]), np.isnan(found[name]))
+        assert stored[name].attrs["fhash_psnr"] >= 45
+        same = found.assign({name: found[name].copy(data=wanted[name].values)})
+        xr.testing.assert_identical(without_own(wanted), without_own(same))
+        for each in wanted.variables:
+            # xarray makes one text of an array of one object
+            if same[each].dtype != object:
+                assert wanted[each].dtype == same[each].dtype
+        packing = ("scale_factor", "add_offset", "_FillValue")
+        for key in packing:
+            assert found[name].encoding.get(key) == pytest.approx(
+                whole[name].encoding.get(key), nan_ok=True
+            )
+
+
+def test_the_file_says_where_it_comes_from(made) -> None:
+    container = made[2]
+    with opened(container) as stored:
+        *before, line = stored.attrs["history"].split("\n")
+        assert "fhash encode source.nc --psnr 45 --effort 1 --without ssim" in line
+        assert line.startswith("fhash ")  # no date without timings
+        assert before in ([], ["made by hand"])
+        assert stored.attrs["fhash_source"] == "source.nc"
+        assert len(stored.attrs["fhash_source_digest"]) == 64
+
+
+def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
+    read = []
+    original = fhash_codec.Volume.values
+    monkeypatch.setattr(
+        fhash_codec.Volume,
+        "values",
+        lambda self, t, *args, **kw: (read.append(t), original(self, t, *args, **kw))[1],
+    )
+    with opened(plain) as stored:
+        part = stored["values"].isel(time=slice(3, None, -2), z=4)
+        assert read == []
+        assert part.shape == (2, 20, 24)
+        part.load()
+    assert sorted(read) == [1, 3]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        (slice(None, None, -1), 3, slice(18, 2, -3), slice(0, 0)),
+        (np.array([4, 0, 0]), slice(1, 9), np.array([-1, 5]), 7),
+        (2, slice(None), slice(4, None, 5), np.array([True, False] * 12)),
+        (-1, -2, -3, -4),
+    ],
+)
+def test_indices_are_those_of_numpy(plain, key: tuple[Any, ...]) -> None:
+    with fhash_codec.open(plain) as volume, opened(plain) as stored:
+        whole = xr.Variable(volume.dims, volume[...])
+        np.testing.assert_array_equal(stored["values"][key].values, whole[key].values)
+
+
+def test_points_are_picked_one_by_one(plain) -> None:
+    places = xr.DataArray([0, 3, 3], dims="point")
+    with fhash_codec.open(plain) as volume, opened(plain) as stored:
+        found = stored["values"].isel(time=places, x=places + 5).values
+        whole = volume[...]
+    np.testing.assert_array_equal(found, np.stack([whole[n, :, :, n + 5] for n in (0, 3, 3)]))
+
+
+def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
+    with fhash_codec.open(plain) as volume:
+        whole = volume[...]
+        tile = volume.chunks
+    with opened(plain, chunks={}) as stored:
+        lazy = stored["values"]
+        assert tuple(along[0] for along in lazy.chunks) == tile
+        for scheduler in ("synchronous", "threads", "processes"):
+            workers = 1 if scheduler == "processes" else 2  # each takes seconds to begin
+            found = lazy.compute(scheduler=scheduler, num_workers=workers).values
+            assert found.tobytes() == whole.tobytes(), scheduler
+
+
+def test_a_dataset_is_pickled_by_its_path(plain) -> None:
+    with opened(plain) as stored:
+        data = pickle.dumps(stored)
+        assert len(data) < 20_000
+        other = pickle.loads(data)
+        np.testing.assert_array_equal(other["values"][1], stored["values"][1])
+
+
+def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    path.write_bytes(plain.read_bytes())
+    with opened(path) as stored:
+        data = pickle.dumps(stored)
+    path.unlink()
+    fhash_codec.encode(smooth(5, 12, 20, 24), path, QUICK)
+    with pytest.raises(InputError, match="another file"):
+        pickle.loads(data)["values"].values  # noqa: B018 - reads them
+
+
+def test_a_closed_dataset_opens_its_file_again(plain) -> None:
+    stored = opened(plain)
+    before = stored["values"][0].values
+    stored.close()
+    np.testing.assert_array_equal(stored["values"][0].values, before)
+
+
+def test_levels_of_detail_have_every_other_vertex(plain) -> None:
+    with fhash_codec.open(plain) as volume, opened(plain, lod=1) as stored:
+        z, y, x = volume.lod_vertices(1)
+        assert stored["values"].shape == (5, len(z), len(y), len(x))
+        np.testing.assert_array_equal(stored["x"], list(x))
+        np.testing.assert_array_equal(stored["values"][3], volume.read_lod(3, 1))
+        part = stored["values"][3, 1:4, ::-2, 5].values
+        np.testing.assert_array_equal(part, volume.read_lod(3, 1)[1:4, ::-2, 5])
+
+
+def test_the_background_stands_outside(plain) -> None:
+    with fhash_codec.open(plain) as volume, opened(plain, outside="background") as stored:
+        assert np.isnan(volume[0]).any()
+        np.testing.assert_array_equal(
+            stored["values"][0].values, volume.read(0, outside="background")
+        )
+
+
+@pytest.mark.parametrize(
+    "options", [{"outside": "zero"}, {"lod": 1, "outside": "background"}, {"variable": "u"}]
+)
+def test_other_options_are_refused(plain, options: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        opened(plain, **options)
+
+
+def test_a_container_is_known_by_its_end(plain, tmp_path) -> None:
+    (tmp_path / "run").write_bytes(plain.read_bytes())
+    (tmp_path / "other").write_bytes(b"nothing")
+    backend = FhashBackend()
+    assert backend.guess_can_open("s3://bucket/run.fhz")
+    assert backend.guess_can_open(tmp_path / "run")
+    assert not backend.guess_can_open(tmp_path / "other")
+    assert not backend.guess_can_open(b"nothing")
+
+
+def test_the_entry_point_is_the_engine() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    module, _, name = project["entry-points"]["xarray.backends"]["fhash"].partition(":")
+    assert getattr(import_module(module), name) is FhashBackend
+
+
+def test_a_dataset_is_encoded_by_its_accessor(tmp_path) -> None:
+    kind = KINDS["rotated"]()
+    source = xr.decode_cf(kind.dataset, decode_coords="all")
+    source.fhash.encode(tmp_path / "run.fhz", effort=1, psnr=45.0)
+    with opened(tmp_path / "run.fhz", decode_coords="all") as stored:
+        same = stored.assign(tas=stored["tas"].copy(data=source["tas"].values))
+        xr.testing.assert_identical(without_own(source), without_own(same))
+    with pytest.raises(InputError, match="unknown setting"):
+        source["tas"].fhash.encode(tmp_path / "other.fhz", psnrr=45)
+    source["tas"].fhash.encode(tmp_path / "other.fhz", config=QUICK)
+    with pytest.raises(InputError, match="not both"):
+        source["tas"].fhash.encode(tmp_path / "more.fhz", config=QUICK, psnr=40)

@@ -1,0 +1,221 @@
+"""Containers that grow: complete at every moment, and nothing written before is lost."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from growing_file import FRAME, add_layer, check_layers, growing_array, growing_header, streams_of
+
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.growing import GrowingContainer
+from fhash_formats.errors import InputError, OutputError, OutputExistsError
+
+PROGRAM = Path(__file__).with_name("growing_file.py")
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+@pytest.mark.parametrize("frame", [FRAME, (3, 4, 4)], ids=["shards", "single tiles"])
+def test_after_every_layer_the_file_is_complete(tmp_path, frame) -> None:
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        for number in range(5):
+            add_layer(growing, number, frame)
+            assert check_layers(path, frame) == number + 1
+    assert names(tmp_path) == ["a.fhz"]
+    assert check_layers(path, frame) == 5
+
+
+def test_the_last_layer_may_be_short(tmp_path) -> None:
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        add_layer(growing, 1, steps=3)
+    with Container.open(path) as container:
+        assert container.arrays["tables/level_1"].shape == (3, *FRAME)
+    assert check_layers(path) == 2
+
+
+def test_a_grown_file_has_no_trace_of_its_growth(tmp_path) -> None:
+    """The same layers at once and one by one give the same bytes."""
+    for path, published in (("one", (0, 1, 2)), ("all", (2,))):
+        with GrowingContainer(tmp_path / path) as growing:
+            array = growing_array()
+            for number in range(3):
+                values = np.random.default_rng(number).standard_normal((2, 3, 4, 8))
+                growing.add_layer(array, number, streams_of(values.astype(np.float32)))
+                if number in published:
+                    mark = growing.mark()
+                    growing.describe(array, 2 * number + 2)
+                    growing.publish(growing_header(2 * number + 2), mark)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "all").read_bytes()
+
+
+def test_a_reader_goes_on_with_the_state_that_it_opened(tmp_path) -> None:
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        with Container.open(path) as early:
+            for number in range(1, 4):
+                add_layer(growing, number)
+            assert early.arrays["tables/level_1"].shape[0] == 2
+            first = early.arrays["tables/level_1"].read()
+        with Container.open(path) as late:
+            np.testing.assert_array_equal(late.arrays["tables/level_1"].read()[:2], first)
+
+
+def test_zarr_reads_every_state(tmp_path) -> None:
+    zarr = pytest.importorskip("zarr")
+    pytest.importorskip("fhash_formats.transform.zarr_codec")
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        for number in range(2):
+            add_layer(growing, number)
+            with zarr.storage.ZipStore(path, mode="r") as store:
+                array = zarr.open_array(store, path="tables/level_1", mode="r")
+                assert array.shape[0] == 2 * number + 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_killed_at_one_line_of_five_it_leaves_a_complete_file(tmp_path) -> None:
+    result = subprocess.run(
+        [sys.executable, str(PROGRAM), str(tmp_path), "3", "5"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) > 80
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace", "link"])
+def test_a_failing_call_leaves_the_layers_before(tmp_path, monkeypatch, call) -> None:
+    path = tmp_path / "a.fhz"
+
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        add_layer(growing, 1)
+        monkeypatch.setattr(os, call, full)
+        if call == "link":  # a file system without hard links costs a copy and no more
+            add_layer(growing, 2)
+            add_layer(growing, 3)
+        else:
+            with pytest.raises(OutputError, match=r"no space left.*the layers before are in"):
+                add_layer(growing, 2)
+    monkeypatch.undo()
+    assert check_layers(path) == (4 if call == "link" else 2)
+    assert names(tmp_path) == ["a.fhz"]
+
+
+def test_an_existing_file_is_replaced_only_by_force_and_only_by_a_layer(tmp_path) -> None:
+    path = tmp_path / "a.fhz"
+    path.write_bytes(b"older")
+    with pytest.raises(OutputExistsError), GrowingContainer(path):
+        pass
+    with GrowingContainer(path, force=True) as growing:
+        array = growing_array()
+        growing.add_layer(array, 0, streams_of(np.zeros((2, 3, 4, 8), np.float32)))
+        assert path.read_bytes() == b"older"
+    assert path.read_bytes() == b"older"
+    assert names(tmp_path) == ["a.fhz"]
+    with GrowingContainer(path, force=True) as growing:
+        add_layer(growing, 0)
+    assert check_layers(path) == 1
+
+
+def test_a_file_that_another_process_took_is_left_alone(tmp_path) -> None:
+    path, other = tmp_path / "a.fhz", tmp_path / "b.fhz"
+    with GrowingContainer(other) as growing:
+        add_layer(growing, 0)
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        add_layer(growing, 1)
+        os.replace(path, tmp_path / "moved.fhz")
+        with pytest.raises(OutputError, match="another process"):
+            add_layer(growing, 2)
+    assert not path.exists()
+    assert check_layers(tmp_path / "moved.fhz") == 2
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        os.replace(other, path)
+        with pytest.raises(OutputError, match="another process"):
+            add_layer(growing, 1)
+    assert check_layers(path) == 1
+    assert names(tmp_path) == ["a.fhz", "moved.fhz"]
+
+
+def test_a_continued_file_is_replaced_only_while_it_is_that_file(tmp_path) -> None:
+    path, other = tmp_path / "a.fhz", tmp_path / "b.fhz"
+    for one in (path, other):
+        with GrowingContainer(one) as growing:
+            add_layer(growing, 0)
+    state = os.stat(path)
+    with GrowingContainer(path, continues=state) as growing:
+        os.replace(other, path)
+        with pytest.raises(OutputError, match="another process"):
+            add_layer(growing, 0)
+    with GrowingContainer(path, continues=os.stat(path)) as growing:
+        add_layer(growing, 0)
+        add_layer(growing, 1)
+    assert check_layers(path) == 2
+
+
+def test_permissions_and_links_stay(tmp_path) -> None:
+    path, link = tmp_path / "a.fhz", tmp_path / "link.fhz"
+    link.symlink_to(path)
+    with GrowingContainer(link) as growing:
+        add_layer(growing, 0)
+        path.chmod(0o600)
+        add_layer(growing, 1)
+    assert link.is_symlink()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert check_layers(link) == 2
+
+
+def test_a_header_that_does_not_fit_changes_nothing(tmp_path) -> None:
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        add_layer(growing, 0)
+        growing.add_layer(growing_array(), 1, streams_of(np.zeros((2, 3, 4, 8), np.float32)))
+        mark = growing.mark()
+        growing.describe(growing_array(), 4)
+        with pytest.raises(InputError, match="would not be readable"):
+            growing.publish(growing_header(5), mark)
+        assert check_layers(path) == 1
+    assert check_layers(path) == 1
+
+
+def test_the_grown_file_is_that_of_a_plain_writer_but_for_the_order_of_its_members(
+    tmp_path,
+) -> None:
+    with GrowingContainer(tmp_path / "a.fhz") as growing:
+        add_layer(growing, 0)
+        add_layer(growing, 1)
+    array = growing_array()
+    with ContainerWriter(tmp_path / "b.fhz") as writer, Container.open(tmp_path / "a.fhz") as grown:
+        table = grown.arrays["tables/level_1"]
+        writer.add_sharded(
+            "tables/level_1",
+            shape=table.shape,
+            dtype=table.dtype,
+            chunk_shape=table.chunk_shape,
+            shard_shape=array.chunk_shape,
+            chunks=(bytes(table.coded(index)) for index in np.ndindex(*table.grid)),
+            dimension_names=table.dimension_names,
+            codecs=array.codecs,
+        )
+        writer.commit(growing_header(4))
+        size = grown.size
+    assert (tmp_path / "b.fhz").stat().st_size == size

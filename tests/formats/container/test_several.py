@@ -1,0 +1,155 @@
+"""Several variables in a container: each reads as if it were alone, and coordinates are shared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from several_files import add_coordinates, compact_header, write_several
+from table_files import table_parts, write_table
+
+from fhash_formats.container import Container, ContainerWriter, SeveralWriter
+from fhash_formats.errors import InputError
+
+
+def test_each_variable_is_what_a_file_of_its_own_would_be(tmp_path, samples) -> None:
+    header = samples.header()
+    arrays = samples.arrays(header)
+    alone = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts(), apart=True)
+    path = write_several(tmp_path / "b.fhz", samples)
+    with Container.open(path) as file, Container.open(alone) as one:
+        assert list(file.variables) == ["u", "group/v", "w", "paper"]
+        assert (file.variable, one.variable, dict(one.variables)) == (None, None, {})
+        for name in ("u", "group/v"):
+            own, table = file.variables[name], one.arrays["tables/level_1"]
+            assert own.variable == name
+            assert own.header["variable"] == one.header["variable"]
+            read = own.arrays["tables/level_1"]
+            np.testing.assert_array_equal(read.read(), table.read())
+            np.testing.assert_array_equal(read.read_mask(), table.read_mask())
+            for lod in (0, 1):
+                np.testing.assert_array_equal(
+                    read.decode_chunk((0, 0, 0, 1), lod), table.decode_chunk((0, 0, 0, 1), lod)
+                )
+        assert not np.array_equal(
+            file.variables["w"].arrays["tables/level_1"].read(), one.arrays["tables/level_1"].read()
+        )
+        paper = file.variables["paper"]
+        assert {name: array.read().tobytes() for name, array in paper.arrays.items()} == {
+            name: values.tobytes() for name, values in arrays.items()
+        }
+        assert file.verify() == len(file.arrays)
+        assert paper.verify() == len(arrays)
+
+
+def test_coordinates_are_there_once_and_others_have_their_own(tmp_path, samples) -> None:
+    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+        shared = [name for name in file.arrays if "parts" not in name]
+        assert shared == ["time", "z", "y", "lon_deg_", "u", "group_v", "lon_deg__of_w", "w"]
+        u, v, w = file.variables.values()
+        for axis in ("time", "z", "y"):
+            assert u.arrays[f"coords/{axis}"] is w.arrays[f"coords/{axis}"]
+        assert u.arrays["coords/x"] is v.arrays["coords/x"] is not w.arrays["coords/x"]
+        assert u.coordinate("x").name == w.coordinate("x").name == "lon (deg)"
+        assert u.coordinate("time").name == "time"
+        assert (w.coordinate("x").values - u.coordinate("x").values).tolist() == [0.25] * 6
+        assert u.coordinate("z").attributes == {"units": "m"}
+        assert file.attributes == {"title": "four winds"}
+
+
+def test_arrays_show_the_axes_that_are_whole(tmp_path, samples) -> None:
+    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+        # The box of the samples has 4 of 5 vertices along y.
+        names = file.arrays["u"].dimension_names, file.arrays["w"].dimension_names
+        assert names == (
+            ("time", "z", "y_box_u", "lon_deg_"),
+            ("time", "z", "y_box_w", "lon_deg__of_w"),
+        )
+        assert file.arrays["u"].attributes == {"units": "m s-1"}
+        assert file.arrays["lon_deg_"].dimension_names == ("lon_deg_",)
+
+
+def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
+    parts, sizes = replace(table_parts(), apart=False), []
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        several = SeveralWriter(writer, ["u", "v"])
+        for name in "uv":
+            variable = several.variable(name)
+            add_coordinates(variable)
+            mark = variable.mark()
+            for _ in range(2):  # once more after a rewinding
+                variable.rewind(mark)
+                parts.write(variable)
+                header = compact_header(samples, parts)
+                sizes.append(variable.size(header))
+                with variable.preview(header) as preview:
+                    assert preview.verify() == 5
+            variable.finish(header)
+        size = several.commit()
+    assert sizes[0] == sizes[1]
+    assert sizes[1] + sizes[3] == size == (tmp_path / "a.fhz").stat().st_size
+    with Container.open(tmp_path / "a.fhz") as file:
+        own = [variable.size for variable in file.variables.values()]
+        assert 0 < own[0] == own[1] < sizes[3] < sizes[1]
+        overheads = [variable.overhead() for variable in file.variables.values()]
+        assert all(0 < each < size for each, size in zip(overheads, own, strict=True))
+
+
+def test_variables_do_not_share_cached_chunks(tmp_path, samples) -> None:
+    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+        region = tuple(slice(0, 2) for _ in range(4))
+        values = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
+        again = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
+        for name in values:
+            np.testing.assert_array_equal(values[name], again[name])
+        assert not np.array_equal(values["u"], values["w"])
+        assert len({v.digest for v in (file, *file.variables.values())}) == 4
+        file.variables["u"].close()
+        file.variables["w"].arrays["tables/level_1"].read()
+        file.variables["u"].closing_file().close()
+        with pytest.raises(InputError, match="closed"):
+            file.variables["w"].arrays["coords/x"].read()
+
+
+@pytest.mark.parametrize("names", [[], [""], ["u", "u"]])
+def test_names_must_differ(tmp_path, names) -> None:
+    with pytest.raises(InputError, match="different names"):
+        SeveralWriter(ContainerWriter(tmp_path / "a.fhz"), names)
+
+
+def test_a_variable_alone_is_not_committed(tmp_path) -> None:
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        variable = SeveralWriter(writer, ["u"]).variable("u")
+        with pytest.raises(InputError, match="commit them together"):
+            variable.commit({})
+    assert not (tmp_path / "a.fhz").exists()
+
+
+def test_a_coordinate_never_takes_the_place_of_a_variable(tmp_path, samples) -> None:
+    parts = replace(table_parts(), apart=False)
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        several = SeveralWriter(writer, ["u", "z", "y_box_u", "parts"])
+        for name in several.nodes:
+            variable = several.variable(name)
+            add_coordinates(variable)
+            parts.write(variable)
+            variable.finish(compact_header(samples, parts))
+        several.commit()
+    with Container.open(tmp_path / "a.fhz") as file:
+        assert file.arrays["z"].shape == (4, 3, 4, 6)
+        assert file.arrays["z_of_u"].dimension_names == ("z_of_u",)
+        assert file.arrays["u"].dimension_names == ("time", "z_of_u", "y_box_u_2", "lon_deg_")
+        assert file.arrays["parts_2"].shape == (4, 3, 4, 6)
+        assert all(v.coordinate("z").name == "z" for v in file.variables.values())
+
+
+def test_integers_with_gaps_are_not_shown(tmp_path) -> None:
+    # Where they have no value they hold a number that looks like one.
+    masked = {"name": "fhash.transform", "configuration": {"mask": {}}}
+    variable = SeveralWriter(ContainerWriter(tmp_path / "a.fhz"), ["u"]).variable("u")
+    placed = {
+        kind: variable._placed("tables/level_1", (4, 3, 5, 6), kind, [masked], None, None)[0]
+        for kind in ("int16", "float32")
+    }
+    assert placed == {"int16": "parts/u.tables.level_1", "float32": "u"}
