@@ -50,10 +50,7 @@ POSITIONS_CHUNK = 1 << 17
 
 def opened_view(path: str | Path, **options: Any) -> tuple[Any, ZarrView]:
     """A file, opened by `fhash_codec.open` with its options, and the view of it."""
-    # The public name: what it returns for several variables is a mapping of volumes.
-    import fhash_codec
-
-    opened: Any = fhash_codec.open(path, **options)
+    opened: Any = open_file(path, **options)
     try:
         return opened, ZarrView(opened if isinstance(opened, Mapping) else {opened.name: opened})
     except BaseException:
