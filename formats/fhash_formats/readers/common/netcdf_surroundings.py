@@ -79,6 +79,7 @@ def netcdf_metadata(
                     without=without,
                     stored=None if packed is None else other_type(packed),
                     path=path,
+                    digested=request.digested,
                 )
                 return surroundings(wanted, variables, scope[0].attrs)
             finally:

@@ -89,6 +89,7 @@ class Wanted:
         without: attributes of the variable that do not hold for its values.
         stored: number type of the stored values, where the decoded ones have another.
         path: of the file; None for data in memory.
+        digested: whether the digest of the file is taken.
     """
 
     source: str
@@ -100,6 +101,7 @@ class Wanted:
     without: Collection[str] = ()
     stored: str | None = None
     path: Path | None = None
+    digested: bool = True
 
 
 def kept_dimensions(
@@ -145,7 +147,7 @@ def surroundings(
         attributes=_storable(of_file, ":", left_out),
         stored=wanted.stored,
         file=None if wanted.path is None else wanted.path.name,
-        digest=None if wanted.path is None else digest_of(wanted.path),
+        digest=digest_of(wanted.path) if wanted.path is not None and wanted.digested else None,
     )
     if left_out:
         told = ", ".join(f"{name} ({why})" for name, why in left_out.items())

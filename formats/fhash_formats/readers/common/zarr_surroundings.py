@@ -89,6 +89,7 @@ def zarr_metadata(
                 without=without,
                 stored=None if packed is None else other_type(packed),
                 path=root,
+                digested=request.digested,
             )
             return surroundings(wanted, variables, groups.get(group, {}))
 
