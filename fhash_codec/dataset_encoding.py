@@ -198,7 +198,8 @@ def encodable(listed: Sequence[Listed], selected: int = 0) -> tuple[list[str], l
     listed: as `list_variables` gives them. selected: number of dimensions along which an index was
         selected for the listing; a variable that needs another one is left out.
     """
-    names, others = [], []
+    names: list[str] = []
+    others: list[str] = []
     for entry in listed:
         plain = len(entry.options) == 1 and entry.options[0].count("--select") == selected
         (names if plain else others).append(entry.name)

@@ -60,7 +60,7 @@ class FhashBackend(BackendEntrypoint):
             place.lower().endswith(SUFFIX) or ("://" not in place and is_container(place))
         )
 
-    def open_dataset(  # type: ignore[override]
+    def open_dataset(
         self,
         filename_or_obj: Any,
         *,
@@ -251,7 +251,7 @@ def _encode(
     return encode(labelled_series(data, variable), path, chosen, force=force)
 
 
-@xr.register_dataset_accessor("fhash")
+@xr.register_dataset_accessor("fhash")  # type: ignore[no-untyped-call]
 class DatasetAccessor:
     """`Dataset.fhash`: write a variable as a container."""
 
@@ -274,7 +274,7 @@ class DatasetAccessor:
         return _encode(self._dataset, path, variable, config, force, settings)
 
 
-@xr.register_dataarray_accessor("fhash")
+@xr.register_dataarray_accessor("fhash")  # type: ignore[no-untyped-call]
 class DataArrayAccessor:
     """`DataArray.fhash`: write the array as a container."""
 

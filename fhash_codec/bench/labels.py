@@ -18,6 +18,7 @@ from fhash_codec.bench.machine import machine
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import ArraySeries, Series
 from fhash_formats.transform.chunk import encode_chunk
@@ -132,7 +133,7 @@ def _measured(kind: str, series: Series, config: EncodeConfig, path: Path) -> La
     begun = time.perf_counter()
     fhash_codec.encode(series, path, config, force=True)
     seconds = time.perf_counter() - begun
-    with fhash_codec.open(path) as volume:
+    with open_volume(path) as volume:
         if not np.array_equal(volume[...], values, equal_nan=values.dtype.kind == "f"):
             raise FhashError(f"{kind}: the file decodes to other values than those that went in")
     return LabelSize(

@@ -161,7 +161,7 @@ class ZarrView:
 
         Volumes share a coordinate that has the same name, positions and attributes.
         """
-        names = []
+        names: list[str] = []
         for number, axis in enumerate(AXES):
             coordinate = volume.coords[axis]
             values = coordinate.values[level.vertices(number - 1)] if number else coordinate.values

@@ -75,17 +75,20 @@ class SourceVariable:
 
     def cut(self, places: Mapping[str, Places]) -> SourceVariable | None:
         """The variable at some places along dimensions; None where it has no values there."""
-        along = [
-            (number, places[name]) for number, name in enumerate(self.dimensions) if name in places
-        ]
-        if any(chosen is None for _, chosen in along):
-            return None
-        values, dimensions = self.values, list(self.dimensions)
-        for number, chosen in reversed(along):
-            values = np.take(values, chosen, axis=number)
-            if isinstance(chosen, int):
-                del dimensions[number]
-        return replace(self, values=np.asarray(values), dimensions=tuple(dimensions))
+        values, kept = self.values, list(self.dimensions)
+        for number, name in reversed(list(enumerate(self.dimensions))):
+            if name not in places:
+                continue
+            chosen = places[name]
+            if chosen is None:
+                return None
+            single = isinstance(chosen, int)
+            indices = np.array([chosen] if isinstance(chosen, int) else list(chosen), dtype=np.intp)
+            values = np.take(values, indices, axis=number)
+            if single:
+                del kept[number]
+                values = values.reshape(values.shape[:number] + values.shape[number + 1 :])
+        return replace(self, values=values, dimensions=tuple(kept))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

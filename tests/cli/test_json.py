@@ -156,6 +156,11 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         explained.append(parsed(fhash(*words, "--json", "-q", "--explain")))
         outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
         outputs["info"].append(parsed(fhash("info", path, "--json")))
+    other = tmp_path / "b.fhz"  # of a source with attributes and coordinates of its own
+    for words in (["decode", path, "-o", tmp_path / "a.nc"], ["encode", tmp_path / "a.nc"]):
+        more = [] if words[0] == "decode" else ["-o", other, "--effort", "1"]
+        parsed(fhash(*words, *more, "--json", "-q"))
+    outputs["info"].append(parsed(fhash("info", other, "--json")))
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     outputs["encode --explain"] = explained
     words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]

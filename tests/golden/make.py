@@ -18,6 +18,7 @@ from fhash_codec import EncodeConfig, encoding
 from fhash_codec.compact import encode as compact
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.source_metadata import SourceMetadata, SourceVariable
 from fhash_formats.transform.head.head import Layer, NeighbourHead
 
 HERE = Path(__file__).parent
@@ -125,6 +126,7 @@ GOLDENS = {
         tables="uint8",
         key_frames="0,1,4",
     ),
+    "compact-1.7-source": EncodeConfig(psnr=50.0, effort=1, timings=False),
 }
 
 PLAIN = {
@@ -150,6 +152,41 @@ def series() -> ArraySeries:
     for step in range(5):
         values[step, 2, 3, step : step + 2] = np.nan
     return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+
+
+def with_source() -> ArraySeries:
+    """The field with attributes, and arrays of all kinds beside it."""
+    field = series()
+    number = np.arange(2.0, 302.0, dtype=np.float32) ** 3
+    field.metadata = SourceMetadata(
+        dimensions={"lon": "x", "time": "t", "member": "", "y": "y", "lev": "z"},
+        variable_attributes={"units": "kg m-3", "grid_mapping": "crs", "level": np.int16(3)},
+        variables=(
+            SourceVariable(
+                name="time",
+                dimensions=("time",),
+                values=TIME.values,
+                attributes={**TIME.attributes, "bounds": "time_bnds"},
+                is_coordinate=True,
+            ),
+            SourceVariable(name="y", dimensions=("y",), values=np.arange(7, dtype=np.int32)),
+            SourceVariable(name="time_bnds", dimensions=("time", "bnds"), values=np.eye(5)[:, :2]),
+            SourceVariable(
+                name="member",
+                dimensions=("member",),
+                values=np.array(["contrôle"], dtype=object),
+                is_coordinate=True,
+            ),
+            SourceVariable(name="wide", dimensions=("n",), values=number),
+            SourceVariable(name="code", dimensions=(), values=np.array(b"a\xff", dtype="S2")),
+            SourceVariable(name="crs", dimensions=(), values=np.array(np.nan, dtype=np.float32)),
+        ),
+        attributes={"title": "golden", "range": np.array([0.1, np.inf], dtype=np.float32)},
+        stored="int16",
+        file="golden.nc",
+        digest="0123",
+    )
+    return field
 
 
 def fronts() -> ArraySeries:
@@ -259,6 +296,7 @@ SERIES = {
     "compact-1.5-lean-head": cells,
     "compact-1.5-linear": fronts,
     "compact-1.5-trellis": fronts,
+    "compact-1.7-source": with_source,
 }
 """Sources of the goldens that are not made from `series`."""
 

@@ -36,6 +36,7 @@ COMPACT = [
     "compact-1.5-linear",
     "compact-1.5-signs",
     "compact-1.5-trellis",
+    "compact-1.7-source",
 ]
 NAMES = [
     "paper-1.0-plain",
@@ -78,6 +79,36 @@ def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
         fhash_codec.open(HERE / f"{name}.fhz") as volume,
     ):
         np.testing.assert_array_equal(volume[...], expected["whole"])
+
+
+def test_the_source_of_a_golden_comes_back() -> None:
+    with fhash_codec.open(HERE / "compact-1.7-source.fhz") as volume:
+        metadata = volume.metadata
+    assert list(metadata.dimensions.items()) == [
+        ("lon", "x"),
+        ("time", "t"),
+        ("member", ""),
+        ("y", "y"),
+        ("lev", "z"),
+    ]
+    found = {each.name: each for each in metadata.variables}
+    assert list(found) == ["time", "y", "time_bnds", "member", "wide", "code", "crs"]
+    assert found["time"].values.tolist() == [0, 0.5, 2, 2.25, 9]
+    assert found["time"].attributes["bounds"] == "time_bnds"
+    assert (found["y"].values.dtype, found["y"].values[6]) == (np.int32, 6)
+    assert found["time_bnds"].values[1].tolist() == [0, 1]
+    assert found["member"].values.tolist() == ["contrôle"]
+    assert found["wide"].values[299] == np.float32(301) ** 3
+    assert found["code"].values == b"a\xff"
+    assert np.isnan(found["crs"].values)
+    assert [each for each in found if found[each].is_coordinate] == ["time", "member"]
+    assert metadata.variable_attributes["level"] == np.int16(3)
+    assert metadata.attributes["range"].dtype == np.float32
+    assert metadata.attributes["range"].tolist() == [np.float32(0.1), np.inf]
+    assert metadata.attributes["history"].endswith(
+        "encode golden.nc --psnr 50.0 --effort 1 --no-timings"
+    )
+    assert (metadata.stored, metadata.file, metadata.digest) == ("int16", "golden.nc", "0123")
 
 
 def test_no_golden_is_left_untested() -> None:

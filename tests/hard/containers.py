@@ -7,13 +7,14 @@ from collections.abc import Iterable
 
 from fhash_formats.container.coding import crc32c
 from fhash_formats.container.layout import END, Member, comment, ending, local_header
+from fhash_formats.container.source import Source
 from fhash_formats.container.zip_checked import read_member, read_members
 
 Parts = list[tuple[str, bytes]]
 """Name and inflated data of each member, in the order of the file."""
 
 
-class BytesSource:
+class BytesSource(Source):
     """A file in memory, as a source of a reader."""
 
     def __init__(self, data: bytes) -> None:

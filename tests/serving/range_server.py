@@ -19,7 +19,9 @@ class RangeServer:
         log: (method, Range header or None, status, bytes of the body) of each request.
         failures: statuses of the next requests, "drop" for a connection that is cut.
         ranges: whether it gives parts of files.
-        conditions: whether it heeds If-Match and If-Unmodified-Since.
+        conditions: whether it heeds If-Match.
+        range_conditions: whether it heeds If-Range.
+        own_tags: whether it takes its own tags for those of the file.
         validators: whether it names ETag and Last-Modified.
         sized: whether it says how large a file is.
         token: value of the header Authorization that it wants; None for none.
@@ -29,7 +31,8 @@ class RangeServer:
         self.files: dict[str, bytes] = {}
         self.log: list[tuple[str, str | None, int, int]] = []
         self.failures: list[int | str] = []
-        self.ranges = self.conditions = self.validators = self.sized = True
+        self.ranges = self.conditions = self.range_conditions = True
+        self.validators = self.sized = self.own_tags = True
         self.token: str | None = None
         self.lock = threading.Lock()
         self._http = _Server(("127.0.0.1", 0), _Handler)
@@ -109,7 +112,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(412, b"", headers, body)
             return
         asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range") or "")
-        if asked and owner.ranges:
+        same = not owner.range_conditions or (
+            owner.own_tags and self.headers.get("If-Range", tag) == tag
+        )
+        if asked and owner.ranges and (same or "If-Range" not in self.headers):
             start, stop = int(asked[1]), min(int(asked[2]) + 1, len(data))
             if start >= len(data):
                 self._send(416, b"", headers, body)

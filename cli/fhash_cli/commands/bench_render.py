@@ -98,9 +98,9 @@ def render(
     """
     if plot is not None:
         check_writable(plot, force, sources=[run])
-    import fhash_codec
+    from fhash_codec.volume import open as open_volume
 
-    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+    with open_volume(run) as volume, Progress(quiet=quiet) as progress:
         from fhash_codec.bench.pictures.pictures import bench_render
         from fhash_codec.bench.pictures.plot import plot as draw
         from fhash_codec.bench.pictures.results import PARTS

@@ -137,6 +137,7 @@ def _demonstrate(
     import fhash_codec
     from fhash_codec.config import EncodeConfig
     from fhash_codec.coreset.features import parse_feature
+    from fhash_codec.volume import open as open_volume
     from fhash_formats import open_series
     from fhash_formats.support.atomic import replacing
 
@@ -157,7 +158,7 @@ def _demonstrate(
     seconds = time.perf_counter() - start
     with (
         open_series(data) as series,
-        fhash_codec.open(run) as volume,
+        open_volume(run) as volume,
         replacing(picture, force=force) as temporary,
     ):
         _draw(chosen.name, series, volume, report).save(temporary, format="PNG", optimize=True)

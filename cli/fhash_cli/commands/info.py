@@ -122,6 +122,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             + (f", in {volume.units}" if volume.units not in ("", "1") else "")
             + _missing(volume),
         ),
+        *_source(volume),
         ("t, z, y, x", extent(volume.shape)),
         *((f"  {axis}", positions(volume.coords[axis], axis)) for axis in "tzyx"),
         ("features", f"{', '.join(info['features'])}; grown by {info['dilation']}"),
@@ -139,6 +140,18 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         *_predicted(info),
         *quality_rows(info["quality"], volume.units),
     ]
+
+
+def _source(volume: Volume) -> list[tuple[str, str]]:
+    """The row of the source: its name and digest, dimensions, and the arrays kept beside."""
+    metadata = volume.metadata
+    if metadata is None:
+        return []
+    digest = "" if metadata.digest is None else f", SHA-256 {metadata.digest[:16]}..."
+    names = [each.name for each in metadata.variables if each.name not in metadata.dimensions]
+    beside = f"; beside it {listed(names)}" if names else ""
+    dimensions = ", ".join(metadata.dimensions)
+    return [("source", f"{metadata.file or 'in memory'}{digest}; ({dimensions}){beside}")]
 
 
 def _missing(volume: Volume) -> str:

@@ -22,6 +22,7 @@ from fhash_codec.bench.paper.table import QUOTED, PaperTable, Value
 from fhash_codec.bench.rate.rate import bench_rate
 from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Progress, silent
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, MissingDependencyError, QualityError
 from fhash_formats.series import Series
 
@@ -210,7 +211,7 @@ class _Files:
             with suppress(QualityError):  # the file is written, and its quality is in the result
                 fhash_codec.encode(self.series, path, config, progress=self.progress)
             seconds = time.perf_counter() - begun
-            with fhash_codec.open(path) as volume:
+            with open_volume(path) as volume:
                 info = volume.info
         psnr = info["quality"]["psnr"]
         return FileResult(

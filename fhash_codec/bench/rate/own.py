@@ -17,6 +17,7 @@ from fhash_codec.bench.rate.search import EXACT, Trial
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.measure.metrics import Errors
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import QualityError
 from fhash_formats.series import Series
 
@@ -77,7 +78,7 @@ class Own:
 
     def has_one_tile(self, config: EncodeConfig) -> bool:
         """Whether the file with these settings, of the profile compact, has a single tile."""
-        with fhash_codec.open(self._paths[config]) as volume:
+        with open_volume(self._paths[config]) as volume:
             table = volume.container.arrays["tables/level_1"]
             return prod(table.grid) == 1
 
@@ -86,7 +87,7 @@ class Own:
         if config not in self._trials:
             self.encode(config)
             errors = Errors(self._range)
-            with fhash_codec.open(self._paths[config]) as volume:
+            with open_volume(self._paths[config]) as volume:
                 for step in range(volume.shape[0]):
                     errors.add(step, self._series.read(step), volume.read(step))
             self._trials[config] = trial_of(errors, 0.0, self._paths[config].stat().st_size)
@@ -96,7 +97,7 @@ class Own:
         """Open the file and decode every frame; what it took."""
 
         def decode() -> None:
-            with fhash_codec.open(self._paths[config]) as volume:
+            with open_volume(self._paths[config]) as volume:
                 for step in range(volume.shape[0]):
                     volume.read(step)
 
@@ -105,7 +106,7 @@ class Own:
     def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, float]:
         """Open the file and read a region of one step; bytes read of the file, and seconds."""
         begun = time.perf_counter()
-        with fhash_codec.open(self._paths[config]) as volume:
+        with open_volume(self._paths[config]) as volume:
             volume.read(step, region)
             count = volume.container.bytes_read
         return count, time.perf_counter() - begun

@@ -1,8 +1,9 @@
 """Files of any file system that fsspec knows: HTTP, S3, memory, an archive, ...
 
 A request that fails for a reason that may pass is made again. A file that changes meanwhile is
-noticed: a server of HTTP is asked for the bytes of the version that was opened, and another file
-system is asked, after the bytes came, whether the file is still the same.
+noticed: a server of HTTP is asked for the bytes of the version that was opened. One that names no
+version is asked again for the end of the file after the bytes came, since a container ends in a
+digest of all; another file system is asked whether the file is still the same.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ PAUSES = (0.2, 0.8, 3.2)
 WHOLE_BYTES = 64 << 20
 """Bytes of a file that are read at once from a server that cannot give a part."""
 
+END_BYTES = 128
+"""Bytes of the end of a file by which two containers differ."""
 _PASSING = {408, 425, 429, 500, 502, 503, 504}
 """HTTP statuses that say that the same request may succeed later."""
 _CHANGED = 412
@@ -84,6 +87,8 @@ class FsspecFile:
         self._partial = info.get("partial", True)
         self._stamp = _stamp(info)
         self._conditions = _conditions(info) if self._http else {}
+        self._gave_parts = False
+        self._end: bytes | None = None
         self._clock = count()
         self._checked = -1
         self._check_lock = threading.Lock()
@@ -123,8 +128,11 @@ class FsspecFile:
         if self._whole is not None:
             return self._whole[start:stop]
         data = self._tried(lambda: self._range(start, stop))
-        if self._whole is None and not self._conditions and not self._http:
-            self._check_unchanged()
+        if self._whole is None and not self._conditions:
+            if self._http and self._end is None and stop == self.size:
+                self._end = data[-END_BYTES:]
+            else:
+                self._check_unchanged()
         return data
 
     def changed(self) -> bool:
@@ -175,10 +183,19 @@ class FsspecFile:
         try:
             with self._fs.open(self._path, "rb", **options) as file:
                 file.seek(start)
-                return bytes(file.read(stop - start))
+                data = bytes(file.read(stop - start))
+            self._gave_parts = True
+            return data
         except ValueError as error:
             if "range requests" not in str(error):
                 raise
+        if "If-Range" in self._conditions:
+            if self._gave_parts:
+                # The whole of another version, of which nothing was loaded.
+                raise InputError(f"{self._name}: {CHANGED}")
+            # Some servers do not know their own tags; then the other condition is left.
+            del self._conditions["If-Range"]
+            return self._http_range(start, stop)
         self._read_whole()
         assert self._whole is not None
         return self._whole[start:stop]
@@ -219,7 +236,13 @@ class FsspecFile:
             if self._checked > came:
                 return
             asked = next(self._clock)
-            if _stamp(self._tried(self._info)) != self._stamp:
+            if not self._http:
+                same = _stamp(self._tried(self._info)) == self._stamp
+            else:
+                end = self._tried(lambda: self._range(max(0, self.size - END_BYTES), self.size))
+                same = self._end in (None, end)
+                self._end = end if self._end is None else self._end
+            if not same:
                 raise InputError(f"{self._name}: {CHANGED}")
             self._checked = asked
 
@@ -244,7 +267,7 @@ class FsspecFile:
         if isinstance(error, _ShortError):
             if self.changed():
                 return InputError(f"{self._name}: {CHANGED}")
-            return DamagedFileError(f"{self._name}: the file is cut short: {error}")
+            return DamagedFileError(f"the file is cut short: {error}")
         if status == 404 or (
             status is None and isinstance(error, FileNotFoundError) and not _may_pass(error)
         ):
@@ -274,12 +297,15 @@ def _stamp(info: Mapping[str, Any]) -> dict[str, Any]:
 def _conditions(info: Mapping[str, Any]) -> dict[str, str]:
     """Headers by which a server gives bytes of the version that was opened, and no others.
 
-    A weak ETag equals none in If-Match (RFC 9110, 13.1.1).
+    Servers that ignore If-Match may heed If-Range, and give all of another version. A weak ETag
+    equals none in either (RFC 9110, 13.1).
     """
     tag, modified = info.get("ETag"), info.get("Last-Modified")
     if isinstance(tag, str) and tag.startswith('"'):
-        return {"If-Match": tag}
-    return {"If-Unmodified-Since": modified} if isinstance(modified, str) else {}
+        return {"If-Match": tag, "If-Range": tag}
+    if isinstance(modified, str):
+        return {"If-Unmodified-Since": modified, "If-Range": modified}
+    return {}
 
 
 def _cause(error: BaseException) -> BaseException:

@@ -66,11 +66,11 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
     if source.gap:
-        heads = (f"{HEAD_ARRAY}/c/0",)
+        limits = {DOCUMENT: strict_json.MAX_BYTES, f"{HEAD_ARRAY}/c/0": MAX_HEAD_BYTES}
         source.prefetch(
             (member.offset, member.header_size + member.size)
             for name, member in members.items()
-            if name.rpartition("/")[2] == DOCUMENT or name in heads
+            if member.size <= limits.get(name, limits.get(name.rpartition("/")[2], -1))
         )
     groups: dict[str, Mapping[str, Any]] = {}
     group_documents: dict[str, Mapping[str, Any]] = {}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from fhash_formats.container.source import FileSource, OpenFileSource, Source
+from fhash_formats.container.source import FileSource, OpenFileSource, Source, damage_named
 from fhash_formats.errors import InputError
 from fhash_formats.support.locations import is_url, local_path
 
@@ -57,7 +57,8 @@ def located(
 
         url = str(place)
         location = Location(place=url, storage_options=storage_options)
-        return location, url, RemoteSource(FsspecFile.open(url, storage_options or {}))
+        with damage_named(url):
+            return location, url, RemoteSource(FsspecFile.open(url, storage_options or {}))
     _refuse_options(storage_options, str(path))
     if is_url(str(path).replace(":/", "://", 1)) and not path.exists():
         raise InputError(f"{path}: a URL is given as text, not as a Path, which changes it")
@@ -74,7 +75,8 @@ def _opened(file: Any) -> tuple[None, str, Source]:
         if getattr(file, "compression", None) is not None:
             raise InputError(f"{path}: a compressed file; decompress it, ranges of it are needed")
         full_name = str(getattr(file, "full_name", path))
-        return None, full_name, RemoteSource(FsspecFile(fs, path, full_name))
+        with damage_named(full_name):
+            return None, full_name, RemoteSource(FsspecFile(fs, path, full_name))
     if not (hasattr(file, "read") and hasattr(file, "seek")):
         raise InputError(
             f"{type(file).__name__} is no place of a container; "

@@ -162,7 +162,8 @@ def _parsed(
         entry = _entry(record, header, arrays, names, dimensions, lengths)
         taken = {each.name for each in entries} | {header["variable"]["name"]}
         record.need(entry.name not in taken, "name" if record.has("name") else "axis", "one only")
-        left -= prod(entry.shape) * type_of_name(entry.type_name).itemsize
+        if entry.axis is None:
+            left -= prod(entry.shape) * type_of_name(entry.type_name).itemsize
         top.need(left >= 0, "variables", f"at most {MAX_BYTES} bytes of values")
         entries.append(entry)
     return dimensions, entries
@@ -304,8 +305,11 @@ def _changed(changes: object, base: Mapping[str, Any]) -> dict[str, Any]:
         raise DamagedFileError(f"header key {SOURCE}: attributes are no object")
     found = {name: _natural(value) for name, value in base.items() if name not in changes}
     for name, value in changes.items():
-        if value is not None:
-            found[name] = attribute_value(value)
+        if value is None:
+            continue
+        if not is_plain_name(name):
+            raise DamagedFileError(f"header key {SOURCE}: attribute {ascii(name)[:40]} has no name")
+        found[name] = attribute_value(value)
     return found
 
 

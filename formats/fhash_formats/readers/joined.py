@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -19,8 +19,10 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.failures import FolderStamp, Stamp
 from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.joined_surroundings import joined_metadata
 from fhash_formats.readers.common.times import join_times
 from fhash_formats.series import Coordinate, Series, index_coordinate
+from fhash_formats.source_metadata import SourceMetadata
 
 
 def is_pattern(text: str) -> bool:
@@ -106,6 +108,7 @@ class JoinedSeries(Series):
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times()}
+        self.metadata = self._joined_metadata
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
@@ -139,6 +142,19 @@ class JoinedSeries(Series):
             series.close()
             raise
         return series
+
+    def _joined_metadata(self) -> SourceMetadata | None:
+        """The metadata of all files, which are opened one after the other."""
+
+        def each() -> Iterator[SourceMetadata | None]:
+            for number, part in enumerate(self._parts):
+                with self._reopened(part) as series, warnings.catch_warnings():
+                    if number:
+                        warnings.simplefilter("ignore")  # it was said of the first file
+                    metadata = series.metadata
+                yield metadata
+
+        return joined_metadata(self.source, each(), self.coords["t"])
 
     def _times(self) -> Coordinate:
         times = [(part.path, part.time) for part in self._parts if part.time is not None]

@@ -271,7 +271,7 @@ def open_whole(path: str | Path, request: Request) -> Series:
 
 def _open_part(path: Path, request: Request) -> FileSeries:
     """Open one file of a pattern."""
-    part = _open_one(path, request)
+    part = _open_one(path, replace(request, digested=False))
     if isinstance(part, FileSeries):
         return part
     part.close()

@@ -32,6 +32,7 @@ from fhash_formats.readers.common.zarr_nodes import (
     nodes_in_zip,
     open_arrays,
 )
+from fhash_formats.readers.common.zarr_surroundings import dimension_names, zarr_metadata
 from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
 
@@ -232,7 +233,9 @@ def _series(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     folder = root if variable.members else root / path
     chunks = (*((1,) if variable.members else ()), *array.chunks)
     trailing = variable.shape[len(chunks) :]
-    return FileSeries(
+    # counts have not the unit of the values
+    without = PLUMBING | PACKING | ({"units"} if scaled else frozenset())
+    series = FileSeries(
         source=found.source,
         name=plain_name(variable.name),
         shape=layout.shape,
@@ -244,16 +247,25 @@ def _series(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         stamp=Stamp.of((metadata_of(root / path) or root) if root.is_dir() else root),
         folder=FolderStamp.of(folder) if root.is_dir() else None,
         coords=found.coordinates(variable, layout),
-        attributes=json_attributes(
-            dict(array.attrs),
-            # counts have not the unit of the values
-            without=PLUMBING | PACKING | ({"units"} if scaled else frozenset()),
-        )
-        | layout.attributes(),
+        attributes=json_attributes(dict(array.attrs), without=without) | layout.attributes(),
         chunks=layout.chunks((*chunks, *trailing)),
         close=store.close,
         packing=packed,
     )
+    if not variable.members and not variable.field:
+        used = [coordinate.name for coordinate in series.coords.values()]
+        series.metadata = zarr_metadata(
+            root,
+            path,
+            found.arrays,
+            found.groups,
+            layout,
+            request,
+            used,
+            packed,
+            without if request.raw_values else (),
+        )
+    return series
 
 
 def _variables(
@@ -294,19 +306,6 @@ def _hint(name: str | None, column: Column | None) -> str | None:
     if not name:
         return None
     return role_of_coordinate(name, column.attributes) if column else role_of_name(name)
-
-
-def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
-    """Name of each dimension, None for one without a name.
-
-    Format 3 has a field for them, xarray an attribute in format 2.
-    """
-    names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(
-        array.metadata, "dimension_names", None
-    )
-    if not isinstance(names, list | tuple) or len(names) != array.ndim:
-        return [None] * array.ndim
-    return [str(name) if name is not None else None for name in names]
 
 
 def _column_of(

@@ -310,3 +310,62 @@ def test_isosurfaces_that_cannot_be_written(
         2, "decode", run, "--isosurface", "1000", "--t", "0", "-o", "s.ply"
     )
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", ["nc", "zarr"])
+def test_a_part_comes_back_as_that_part_of_the_source(
+    fhash: Fhash, tmp_path: Path, suffix: str
+) -> None:
+    import xarray as xr
+
+    lat = np.linspace(50, 55, 6, dtype="f4")
+    source = xr.Dataset(
+        {
+            "tas": (
+                ("lon", "time", "lat"),
+                np.arange(168, dtype="f4").reshape(7, 4, 6),
+                {"units": "K"},
+            ),
+            "lat_bnds": (("lat", "bnds"), np.stack([lat - 0.5, lat + 0.5], axis=1)),
+        },
+        {
+            "time": ("time", np.array([0, 1, 3, 4], "i4"), {"units": "hours since 2001-01-01"}),
+            "month": ("time", np.array(["a", "b", "c", "d"], dtype=object)),
+            "lat": ("lat", lat, {"bounds": "lat_bnds", "units": "degrees_north"}),
+            "height": ((), 2.0, {"units": "m"}),
+        },
+        {"title": "a source", "Conventions": "CF-1.8"},
+    )
+    source.to_netcdf(tmp_path / "source.nc", engine="h5netcdf")
+    fhash("encode", tmp_path / "source.nc", "-o", tmp_path / "a.fhz", "--effort", "1")
+    options = {"engine": "zarr"} if suffix == "zarr" else {"engine": "h5netcdf"}
+    out = tmp_path / f"a.{suffix}"
+    for selection, places in (
+        ([], {}),
+        (
+            ["--t", "1:4:2", "--roi", ":,1:3,2:6"],
+            {"time": slice(1, 4, 2), "lat": slice(1, 3), "lon": slice(2, 6)},
+        ),
+    ):
+        fhash("decode", tmp_path / "a.fhz", "-o", out, "--force", *selection)
+        with (
+            xr.open_dataset(tmp_path / "source.nc", engine="h5netcdf") as whole,
+            xr.open_dataset(out, **options) as found,
+        ):
+            wanted = whole.isel(places)
+            assert np.abs(wanted["tas"] - found["tas"]).max() < 5
+            if places:
+                # the source has no longitudes, and the part says which vertices it has
+                assert found["lon"].values.tolist() == [2, 3, 4, 5]
+                found = found.drop_vars("lon")
+            history = found.attrs.pop("history")
+            assert "fhash encode source.nc" in history
+            same = found.assign(tas=found["tas"].copy(data=wanted["tas"].values))
+            xr.testing.assert_identical(wanted, same)
+    # between two steps the time is known, and nothing else along it
+    fhash("decode", tmp_path / "a.fhz", "-o", out, "--force", "--time", "2")
+    with xr.open_dataset(out, **options, decode_times=False) as found:
+        assert found["time"].values.tolist() == [2]
+        assert found["time"].attrs["units"] == "hours since 2001-01-01"
+        assert "month" not in found.variables
+        assert "height" in found.coords

@@ -215,3 +215,17 @@ def test_steps_are_repeated_and_checked(
         np.save(tmp_path / f"step_{number}.npy", np.zeros((3, 2, 5), "f4"))
     result = fhash("info", tmp_path / "step_*.npy", "--t", "2", "--json")
     assert json.loads(result.stdout)["series"]["shape"] == [1, 3, 2, 5]
+
+
+def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Path) -> None:
+    import xarray as xr
+
+    source = xr.Dataset(
+        {"u": (("lev", "lat", "lon"), np.arange(60.0).reshape(3, 4, 5))},
+        {"lev": ("lev", np.arange(3.0)), "height": ((), 2.0)},
+    )
+    source.to_netcdf(tmp_path / "wind.nc", engine="h5netcdf")
+    fhash("encode", tmp_path / "wind.nc", "-o", tmp_path / "a.fhz", "--effort", "1")
+    printed = fhash("info", tmp_path / "a.fhz").stdout
+    assert "wind.nc, SHA-256 " in printed
+    assert "(lev, lat, lon); beside it height" in " ".join(printed.split())

@@ -148,14 +148,40 @@ def test_no_size_at_all(memory, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("other", [DATA[::-1], DATA[:50_000], DATA + b"more"])
-def test_a_file_that_changed_on_a_server(range_server, other) -> None:
+@pytest.mark.parametrize("heeded", ["conditions", "range_conditions"])
+def test_a_file_that_changed_on_a_server(range_server, other, heeded) -> None:
+    range_server.conditions, range_server.range_conditions = False, False
+    setattr(range_server, heeded, True)
     url = range_server.put("run.fhz", DATA)
     file = FsspecFile.open(url, {})
     assert not file.changed()
+    assert file.fetch(5, 9) == DATA[5:9]
     range_server.put("run.fhz", other)
+    range_server.taken()
     with pytest.raises(InputError, match=r"run\.fhz: the file changed since it was opened"):
         file.fetch(5, 9)
+    assert range_server.log[0][2] == (412 if heeded == "conditions" else 200)
     assert file.changed()
+
+
+def test_a_server_that_does_not_know_its_own_tags(range_server) -> None:
+    range_server.own_tags = False
+    file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
+    assert [file.fetch(start, start + 9) for start in (70, 700)] == [DATA[70:79], DATA[700:709]]
+    assert [entry[2] for entry in range_server.log] == [200, 200, 206, 206]
+
+
+def test_a_file_of_the_same_size_on_a_server_without_versions(range_server) -> None:
+    range_server.validators = False
+    url = range_server.put("run.fhz", DATA)
+    file = FsspecFile.open(url, {})
+    assert file.fetch(len(DATA) - 900, len(DATA)) == DATA[-900:]
+    range_server.taken()
+    assert file.fetch(5, 9) == DATA[5:9]
+    assert range_server.taken() == (2, 4 + 128)
+    range_server.put("run.fhz", DATA[:-1] + b"x")
+    with pytest.raises(InputError, match="the file changed since it was opened"):
+        file.fetch(300, 700)
 
 
 def test_a_file_that_is_gone(range_server) -> None:
@@ -175,8 +201,10 @@ def test_a_server_that_fails_does_not_mean_a_change(range_server) -> None:
 
 def test_a_weak_tag_is_no_condition() -> None:
     conditions = fsspec_file._conditions
-    assert conditions({"ETag": '"a"', "Last-Modified": "then"}) == {"If-Match": '"a"'}
-    assert conditions({"ETag": 'W/"a"', "Last-Modified": "then"}) == {"If-Unmodified-Since": "then"}
+    strong = {"If-Match": '"a"', "If-Range": '"a"'}
+    assert conditions({"ETag": '"a"', "Last-Modified": "then"}) == strong
+    dated = {"If-Unmodified-Since": "then", "If-Range": "then"}
+    assert conditions({"ETag": 'W/"a"', "Last-Modified": "then"}) == dated
     assert conditions({"ETag": 'W/"a"'}) == {}
 
 
@@ -202,7 +230,7 @@ def test_a_file_that_is_cut_short_and_says_nothing(memory, monkeypatch, pauses) 
     memory.pipe("/run.fhz", DATA)
     file = FsspecFile(memory, "/run.fhz", "m")
     monkeypatch.setattr(memory, "cat_file", lambda path, start, end: DATA[start : end - 1])
-    with pytest.raises(DamagedFileError, match="m: the file is cut short: 399 bytes came"):
+    with pytest.raises(DamagedFileError, match="the file is cut short: 399 bytes came"):
         file.fetch(300, 700)
     assert pauses == list(PAUSES)
 

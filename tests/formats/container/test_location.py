@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fhash_formats.container import Container
+from fhash_formats.container import Container, remote
 from fhash_formats.container.location import Location
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 
@@ -45,9 +45,7 @@ def test_a_relative_path_is_opened_again_from_elsewhere(sample, monkeypatch) -> 
 
 
 def test_a_url(sample, expected, range_server) -> None:
-    url = range_server.put("run.fhz?signature=1", b"") and range_server.put(
-        "run.fhz", sample.read_bytes()
-    )
+    url = range_server.put("run.fhz", sample.read_bytes())
     with Container.open(f"{url}?signature=1") as container:
         np.testing.assert_array_equal(values(container), expected)
         assert container.path == f"{url}?signature=1"
@@ -151,34 +149,45 @@ def test_a_file_of_fsspec_is_read_by_ranges(sample, expected, range_server) -> N
 
 
 def test_another_file_in_the_place_is_noticed(sample, range_server) -> None:
-    data = sample.read_bytes()
-    with Container.open(range_server.put("run.fhz", data)) as container:
+    with Container.open(range_server.put("run.fhz", sample.read_bytes())) as container:
         location = container.reopening()
     Container.open(location).close()
-    other = location.__class__(place=sample, digest="0" * 64)
-    for changed in (other,):
-        with pytest.raises(InputError, match="another file is there than was opened before"):
-            Container.open(changed)
+    with pytest.raises(InputError, match="another file is there than was opened before"):
+        Container.open(Location(place=location.place, digest="0" * 64))
 
 
-def test_damage_is_told_as_a_change_where_the_file_changed(sample, range_server) -> None:
-    range_server.conditions = False
-    data = sample.read_bytes() + b""
-    padded = range_server.put("run.fhz", data)
-    with Container.open(padded) as container:
-        # The tail is read already; so the place of the bytes decides what is noticed.
-        container._source._source._tail_start = len(data)
+def test_a_tail_that_is_cut_short_names_the_file(sample, monkeypatch) -> None:
+    import fsspec
+
+    from fhash_formats.container.fsspec_file import FsspecFile
+
+    monkeypatch.setattr(FsspecFile.__init__, "__kwdefaults__", {"pause": lambda seconds: None})
+    fsspec.filesystem("memory").pipe("/location/cut.fhz", sample.read_bytes())
+    cat = fsspec.filesystem("memory").__class__.cat_file
+    monkeypatch.setattr(
+        fsspec.filesystem("memory").__class__,
+        "cat_file",
+        lambda self, path, start, end: cat(self, path, start, end - 1),
+    )
+    with pytest.raises(DamagedFileError, match=r"^memory://location/cut\.fhz: the file is"):
+        Container.open("memory://location/cut.fhz")
+
+
+@pytest.mark.parametrize("validators", [True, False])
+def test_damage_is_told_as_a_change(sample, range_server, validators, monkeypatch) -> None:
+    # Nothing but the documents and a short end is read at opening.
+    monkeypatch.setattr(remote, "TAIL_BYTES", 1000)
+    monkeypatch.setattr(remote, "GAP", 1)
+    range_server.conditions = range_server.range_conditions = False
+    range_server.validators = validators
+    data = sample.read_bytes()
+    with Container.open(range_server.put("run.fhz", data)) as container:
+        member = next(iter(container.arrays["tables/level_1"].chunks.values()))
+        assert member.end < len(data) - 1000
         range_server.put("run.fhz", bytes(len(data)))
         with pytest.raises(InputError, match="the file changed since it was opened") as told:
-            values(container)
+            container.arrays["tables/level_1"].read()
         assert not isinstance(told.value, DamagedFileError)
-    range_server.put("run.fhz", data)
-    with Container.open(padded) as container:
-        container._source._source._tail_start = len(data)
-        range_server.validators = False
-        range_server.put("run.fhz", bytes(len(data)))
-        with pytest.raises(InputError, match="the file changed"):
-            values(container)
 
 
 def test_damage_without_a_change_is_damage(sample, range_server) -> None:

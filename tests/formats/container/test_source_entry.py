@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import random
 from collections.abc import Callable
 from typing import Any
 
@@ -103,6 +104,7 @@ HOSTILE = [
     put("variable", "valid_min", value={"int16": 1 << 20}),
     put("attributes", value=[1]),
     put("attributes", "title", value={}),
+    put("attributes", "a\0b", value=1),
     put("stored", value="int12"),
     put("file", value=3),
     put("digest", value=None),
@@ -145,6 +147,40 @@ def test_arrays_of_too_many_bytes_are_damage() -> None:
     source["variables"].append({"name": "h", "dimensions": ["n"], "dtype": "int8", "array": "huge"})
     with pytest.raises(DamagedFileError, match=r"bytes|array"):
         check_source(header(source), ARRAYS)
+
+
+def places(values: Any) -> list[tuple[Any, Any]]:
+    """Every place in nested JSON values, as what holds it and its key."""
+    found = []
+    keys = values.keys() if isinstance(values, dict) else range(len(values))
+    for key in list(keys):
+        found.append((values, key))
+        if isinstance(values[key], dict | list):
+            found += places(values[key])
+    return found
+
+
+def test_mutations_are_damage_or_are_read() -> None:
+    chance = random.Random(7)
+    others = [None, True, 0, -1, 2**70, 0.5, "", "t", "lon", "NaN", [], [1], {}, {"int8": 1}]
+    coords = {axis: index_coordinate(axis, n) for axis, n in zip("tzyx", SHAPE, strict=True)}
+    read = 0
+    for _ in range(1500):
+        source = copy.deepcopy(sound())
+        source["variables"].pop()
+        for _ in range(chance.choice((1, 1, 2, 3))):
+            holder, key = chance.choice(places(source))
+            if chance.random() < 0.2:
+                del holder[key]
+            else:
+                holder[key] = copy.deepcopy(chance.choice(others))
+        try:
+            check_source(header(source), ARRAYS)
+        except DamagedFileError:
+            continue
+        assert read_metadata(header(source), ARRAYS, coords) is not None
+        read += 1
+    assert 100 < read < 1400
 
 
 def test_no_object_is_damage() -> None:

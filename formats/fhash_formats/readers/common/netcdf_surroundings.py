@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +24,9 @@ from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
     kept_dimensions,
+    other_type,
     surroundings,
+    with_attributes,
 )
 from fhash_formats.source_metadata import SourceMetadata
 
@@ -67,7 +68,7 @@ def netcdf_metadata(
                 }
                 name = handle[1]
                 own = variables[name]
-                variables[name] = replace(own, attributes={**own.attributes, **layout.attributes()})
+                variables[name] = with_attributes(own, layout.attributes())
                 kept, picked = kept_dimensions(source, name, layout, own.dimensions, request.select)
                 wanted = Wanted(
                     source=source,
@@ -76,8 +77,9 @@ def netcdf_metadata(
                     picked=picked,
                     used=used,
                     without=without,
-                    stored=None if packed is None else _other(packed),
+                    stored=None if packed is None else other_type(packed),
                     path=path,
+                    digested=request.digested,
                 )
                 return surroundings(wanted, variables, scope[0].attrs)
             finally:
@@ -102,8 +104,3 @@ def _values(array: xr.Variable, places: tuple[slice | int, ...]) -> npt.NDArray[
         values: npt.NDArray[Any] = array[places].to_numpy()
     # without what xarray notes of the stored type, such as enumerations
     return values if values.dtype.kind == "O" else np.asarray(values, dtype=values.dtype.str)
-
-
-def _other(packed: Packing) -> str | None:
-    """The stored type where unpacking changes it."""
-    return packed.stored.name if packed.stored != packed.dtype else None

@@ -124,6 +124,7 @@ class Request:
         raw_values: the numbers are read as stored; fill values, scale and offset are not applied.
         select: for dimensions that are no axis, (name, index) as texts; see layout.py.
         keep_extremes: extreme values that repeat are data, see `Series`.
+        digested: the digest of the file is taken where its metadata are asked for.
         asked: a last dimension that may hold components is asked about; else it is x.
     """
 
@@ -136,6 +137,7 @@ class Request:
     select: tuple[tuple[str, str], ...] = ()
     keep_extremes: bool = False
     asked: bool = True
+    digested: bool = True
 
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""

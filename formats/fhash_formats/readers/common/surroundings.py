@@ -11,7 +11,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from fhash_formats.container.typed_values import stored_type, typed_attribute
 from fhash_formats.errors import FhashWarning
+from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.layout import Layout, picks
 from fhash_formats.source_metadata import (
@@ -35,7 +36,15 @@ from fhash_formats.source_metadata import (
 from fhash_formats.support.attributes import PLUMBING
 from fhash_formats.support.plain_json import UnknownValueError
 
-__all__ = ["Stored", "Wanted", "digest_of", "kept_dimensions", "surroundings"]
+__all__ = [
+    "Stored",
+    "Wanted",
+    "digest_of",
+    "kept_dimensions",
+    "other_type",
+    "surroundings",
+    "with_attributes",
+]
 
 MAX_ONE = 16 << 20
 """Bytes of one array beside the data: latitudes of 1400^2 vertices as float64."""
@@ -80,6 +89,7 @@ class Wanted:
         without: attributes of the variable that do not hold for its values.
         stored: number type of the stored values, where the decoded ones have another.
         path: of the file; None for data in memory.
+        digested: whether the digest of the file is taken.
     """
 
     source: str
@@ -91,6 +101,7 @@ class Wanted:
     without: Collection[str] = ()
     stored: str | None = None
     path: Path | None = None
+    digested: bool = True
 
 
 def kept_dimensions(
@@ -136,7 +147,7 @@ def surroundings(
         attributes=_storable(of_file, ":", left_out),
         stored=wanted.stored,
         file=None if wanted.path is None else wanted.path.name,
-        digest=None if wanted.path is None else digest_of(wanted.path),
+        digest=digest_of(wanted.path) if wanted.path is not None and wanted.digested else None,
     )
     if left_out:
         told = ", ".join(f"{name} ({why})" for name, why in left_out.items())
@@ -146,6 +157,16 @@ def surroundings(
             stacklevel=2,
         )
     return metadata
+
+
+def with_attributes(stored: Stored, attributes: Mapping[str, Any]) -> Stored:
+    """The array with further attributes."""
+    return replace(stored, attributes={**stored.attributes, **attributes})
+
+
+def other_type(packed: Packing) -> str | None:
+    """The stored type where unpacking changes it."""
+    return packed.stored.name if packed.stored != packed.dtype else None
 
 
 def digest_of(path: Path) -> str | None:
