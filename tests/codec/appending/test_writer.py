@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -300,6 +301,22 @@ def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     assert os.listdir(tmp_path) == ["run.fhz"]
     with fhash_codec.open(path) as volume:
         assert volume.shape[0] == LAYER
+
+
+def test_memory_does_not_grow_with_the_steps(tmp_path) -> None:
+    shape = (8, 40, 40)
+    noise = np.random.default_rng(0).random(shape).astype(np.float32)
+    config = EncodeConfig(max_error=0.1, effort=1, tile="3x8x40x40")
+    path, peaks = tmp_path / "run.fhz", []
+    with Writer(path, shape=shape, config=config) as writer:
+        for step in range(45):
+            if step == LAYER:
+                tracemalloc.start()  # after the plan
+            writer.append(noise + step)
+            if step in (14, 44):
+                peaks.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 10 * noise.nbytes  # of 30 more frames
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
