@@ -71,15 +71,14 @@ class Figures:
         count, errors = math.prod(frame), []
         for step in range(steps):
             figures = told[step] if step < len(told) else {}
-            rmse, largest = (figures.get(name) for name in ("rmse", "max_abs_error"))
-            if not all(isinstance(one, int | float) and one >= 0 for one in (rmse, largest)):
+            pair: list[Any] = [figures.get(name) for name in ("rmse", "max_abs_error")]
+            if not all(isinstance(one, int | float) and one >= 0 for one in pair):
                 raise InputError(
                     f"the file does not tell the errors of step {step}, and a longer one could not"
                 )
-            root, most_of_step = (
-                float(one) * ROUNDED_ONCE * scale for one in (rmse, min(largest, limit))
-            )
-            errors.append(StepErrors(count, count * root * root, most_of_step))
+            root = float(pair[0]) * ROUNDED_ONCE * scale
+            largest = min(float(pair[1]), limit) * ROUNDED_ONCE * scale
+            errors.append(StepErrors(count, count * root * root, largest))
         return cls(scale, errors)
 
     def measure(self, original: Values, decoded: Values) -> StepErrors:

@@ -14,7 +14,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.parts import COLUMNS, ERRORS, PART, WHOLE, comparisons_of
+from fhash_codec.appending.parts import COLUMNS, COUNTS, ERRORS, PART, WHOLE, comparisons_of
 from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.encoding import check_name
@@ -108,7 +108,12 @@ class _Piece:
             raise DamagedFileError(f"{self.path}: array {ERRORS} is missing or does not fit")
         if table is None or not isinstance(table.settings, TileSettings):
             raise DamagedFileError(f"{self.path}: array {TABLE} has no settings of all tiles")
-        self.errors, self.table, self.settings = errors, table, table.settings
+        if not isinstance(header["model"].get("gains"), list):
+            raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
+        self.table, self.settings = table, table.settings
+        self.errors = errors.read()
+        if not np.isfinite(self.errors).all() or (self.errors[:, COUNTS] < 0).any():
+            raise DamagedFileError(f"{self.path}: array {ERRORS} has numbers that are no errors")
 
     @cached_property
     def shared(self) -> dict[str, Any]:
@@ -298,6 +303,6 @@ class _Whole:
             None if bulk is None else ValueRange(*map(float, bulk)),
         )
         for part in self._parts:
-            for comparison in comparisons_of(part.errors.read(), part.first):
+            for comparison in comparisons_of(part.errors, part.first):
                 comparer.add(comparison)
         return comparer.quality(first.ssim_steps).to_dict()

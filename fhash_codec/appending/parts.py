@@ -26,7 +26,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import FeatureSelection, Source, open_source, select_features
-from fhash_codec.encoding import check_name
+from fhash_codec.encoding import check_name, mask_files
 from fhash_codec.header import OUTSIDE, brief_quality, describe_source, write_series
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparison
@@ -54,6 +54,8 @@ WHOLE = "whole/"
 """Prefix of arrays of the first part that belong to the whole series."""
 COLUMNS = 10
 """Numbers that it has for each step, see `_row`."""
+COUNTS = (0, 3, 5, 9)
+"""Those of them that count vertices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +119,7 @@ def encode_part(
     check_output(path, force)
     begun = time.perf_counter()
     with open_source(source) as series:
-        check_output(path, force, sources=series.files)
+        check_output(path, force, sources=[*series.files, *mask_files(config)])
         selection = select_features(series, config, progress, ranked=not fits_memory(series))
         with thread_pool() as workers:
             plan, _, bulk = plan_series(series, selection, config, workers, progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
 from fhash_codec.appending.merging import merge
 from fhash_codec.appending.parts import Part, encode_part
 from fhash_formats import open_series
-from fhash_formats.container import table_parts
+from fhash_formats.container import Container, ContainerWriter, table_parts
+from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import OutputExistsError
 from fhash_formats.series import ArraySeries, Coordinate
 
@@ -134,6 +136,48 @@ def test_a_damaged_tile_is_found_and_nothing_is_written(tmp_path) -> None:
     with pytest.raises(DamagedFileError, match="part2"):
         merge(parts, tmp_path / "run.fhz")
     assert sorted(os.listdir(tmp_path)) == ["part1.fhz", "part2.fhz", "part3.fhz"]
+
+
+def rewritten(path: Path, change) -> None:
+    """Write a part anew, with another header or other errors. change(header, errors) in place."""
+    with Container.open(path) as container:
+        table, header = container.arrays["tables/level_1"], deepcopy(container.header)
+        errors = container.arrays["steps/errors"].read()
+        change(header, errors)
+        other = path.with_name("other.fhz")
+        with ContainerWriter(other) as writer:
+            TableParts(
+                shape=table.shape,
+                dtype=table.dtype,
+                tile=table.chunk_shape,
+                settings=table.settings,
+                streams=[bytes(table.coded(index)) for index in np.ndindex(*table.grid)],
+            ).write(writer)
+            writer.add_whole("steps/errors", errors)
+            writer.commit(header)
+    os.replace(other, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda header, errors: header["part"].pop("of"), "part.of"),
+        (lambda header, errors: header["part"].update(number=9), "part.number"),
+        (lambda header, errors: header["part"].update(first=-1), "part.first"),
+        (lambda header, errors: header["part"].update(ssim_steps=[1, "a"]), "ssim_steps"),
+        (lambda header, errors: header["part"].update(ssim_steps=3), "ssim_steps"),
+        (lambda header, errors: header.update(part=[]), "part"),
+        (lambda header, errors: header["model"].pop("gains"), "model.gains"),
+        (lambda header, errors: errors.fill(np.nan), "steps/errors has numbers"),
+        (lambda header, errors: errors.fill(-1), "steps/errors has numbers"),
+    ],
+)
+def test_a_hostile_part_is_refused(tmp_path, change, message) -> None:
+    parts = parts_of(values(), tmp_path, settings(), 1)
+    rewritten(parts[0], change)
+    with pytest.raises(DamagedFileError, match=message):
+        merge(parts, tmp_path / "run.fhz")
+    assert os.listdir(tmp_path) == ["part1.fhz"]
 
 
 @pytest.mark.parametrize("kind", ["rotated", "calendar"])
