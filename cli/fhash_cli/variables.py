@@ -23,7 +23,7 @@ MAX_COMPONENTS = 9
 def variables_to_encode(
     source: SourceOptions, path: str, components: str | None, *, quiet: bool
 ) -> dict[str, SourceOptions] | None:
-    """How each of several variables is opened, by its name; None where one variable is asked for.
+    """The options that open each of several variables, by its name; None where one is asked for.
 
     Several are asked for by `--var u,v`, `--var all`, and by `--components DIM`: each index along
     that dimension makes a variable of its own, such as velocity_0. One line on stderr says which
