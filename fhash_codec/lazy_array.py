@@ -73,13 +73,12 @@ class FhashArray(BackendArray):
         self.shape = tuple(form.sizes(volume).values())
         self.dtype = volume.dtype if form.lod is None else volume.float_dtype
 
-    @property
-    def volume(self) -> Volume:
-        """The open volume; raises InputError where the file has been replaced."""
+    def _opened(self) -> Handle:
+        """The open file, for as long as it is held; InputError where it has been replaced."""
         handle = self._handle
         if handle is None or not handle.is_of_this_process():
             handle = self._handle = acquire(self._place, self._options, self._digest)
-        return handle.volumes[self._name]
+        return handle
 
     def release(self) -> None:
         """Close the file, unless others read from it; the next reading opens it again."""
@@ -119,7 +118,9 @@ class FhashArray(BackendArray):
 
     def _values(self, ranges: Mapping[str, range]) -> npt.NDArray[Any]:
         """Values (t, z, y, x) at some of the steps and vertices that are shown."""
-        volume, form = self.volume, self._form
+        # held until the values are there, even if another thread releases it
+        handle, form = self._opened(), self._form
+        volume = handle.volumes[self._name]
         result = np.empty([len(ranges[axis]) for axis in AXES], dtype=self.dtype)
         if not result.size:
             return result

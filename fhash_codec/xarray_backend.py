@@ -27,6 +27,7 @@ from fhash_codec.encoding import encode
 from fhash_codec.lazy_array import FhashArray, Form
 from fhash_codec.provenance import history_line
 from fhash_codec.shared_volumes import acquire, place_of
+from fhash_codec.value_type import holds
 from fhash_codec.volume import OUTSIDE, Volume
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError
@@ -217,10 +218,13 @@ class Shown:
             raw = dict(self._metadata.variable_attributes)
         found = {key: value for key, value in raw.items() if key not in PACKING or key in VALID}
         if volume.dtype.kind in "iu" and self.form.lod is None:
-            fills = {key: raw[key] for key in FILLS if key in raw}
-            if not fills and volume.value_type.has_gaps and volume.fill is not None:
-                fills = {FILLS[0]: volume.dtype.type(volume.fill)}
-            found |= fills
+            gaps = volume.value_type.has_gaps
+            fill = volume.fill if gaps else volume.value_type.fill
+            told = gaps or set(FILLS) & set(raw)
+            if told and fill is not None and holds(volume.dtype, fill):
+                found[FILLS[0]] = volume.dtype.type(fill)
+        if self.form.lod is not None:
+            return found  # the figures are those of all vertices
         quality = volume.container.header["quality"]
         figures = {key: quality.get(name) for key, name in FIGURES.items()}
         return found | {key: value for key, value in figures.items() if value is not None}

@@ -194,6 +194,8 @@ class ZarrView:
             for path, attributes in groups.items()
         }
         nodes |= {path: array.document() for path, array in self.arrays.items()}
+        # zarr-python loses nodes of a group that do not stand together.
+        nodes = {path: nodes[path] for path in sorted(nodes, key=_depth_and_group)}
         documents = {}
         for path, node in nodes.items():
             if path in groups:
@@ -270,6 +272,11 @@ def _unique(name: str, used: set[str]) -> str:
         unique, number = f"{name}_{number}", number + 1
     used.add(unique)
     return unique
+
+
+def _depth_and_group(path: str) -> tuple[int, str]:
+    """Number of groups above a node, and the path of the one that it is in."""
+    return path.count("/"), path.rpartition("/")[0]
 
 
 def _join(group: str, name: str) -> str:

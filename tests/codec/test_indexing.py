@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_codec.indexing import expand_index, index_ranges, slice_of
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.indexing import expand_index, index_ranges, shared_part, slice_of
 
 SHAPE = (3, 4, 1, 5)
 ENDS = st.none() | st.integers(-7, 7)
@@ -54,3 +55,12 @@ def test_a_slice_takes_the_positions_of_a_range_from_an_array_that_begins_later(
 def test_other_indices_are_refused(index: Any) -> None:
     with pytest.raises(IndexError, match="a volume"):
         expand_index(index)
+
+
+def test_the_part_that_a_region_shares_with_a_box() -> None:
+    box, region = Box.of([(1, 4), (2, 6), (0, 3)]), Box.of([(0, 2), (3, 9), (1, 2)])
+    assert shared_part(box, region) == (
+        Box.of([(1, 2), (0, 3), (0, 1)]),
+        Box.of([(0, 1), (1, 4), (1, 2)]),
+    )
+    assert shared_part(box, Box.of([(4, 5), (2, 6), (0, 3)])) is None

@@ -183,6 +183,7 @@ def test_levels_of_detail_have_every_other_vertex(plain) -> None:
         assert stored["values"].shape == (5, len(z), len(y), len(x))
         np.testing.assert_array_equal(stored["x"], list(x))
         np.testing.assert_array_equal(stored["values"][3], volume.read_lod(3, 1))
+        assert "fhash_max_error" not in stored["values"].attrs
         part = stored["values"][3, 1:4, ::-2, 5].values
         np.testing.assert_array_equal(part, volume.read_lod(3, 1)[1:4, ::-2, 5])
 

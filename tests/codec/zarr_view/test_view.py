@@ -244,6 +244,24 @@ def test_several_volumes_share_the_coordinates_that_are_equal(tmp_path: Path) ->
         assert view.get("v/c/0/0/0/0") == second[...].tobytes()
 
 
+def test_the_nodes_of_a_group_stand_together(whole: Path, feature: Path) -> None:
+    # zarr-python loses those of consolidated metadata that do not
+    with fhash_codec.open(whole) as first, fhash_codec.open(feature) as second:
+        view = ZarrView({"u": first, "v": second})
+        assert set(view.names.values()) == {"density", "density_2"}
+        for group in ("", "lod"):
+            inside = document(view, group)["consolidated_metadata"]["metadata"]
+            by_depth = sorted(inside, key=lambda path: path.count("/"))
+            parents = [path.rpartition("/")[0] for path in by_depth]
+            runs = [
+                name
+                for name, before in zip(parents, [None, *parents], strict=False)
+                if name != before
+            ]
+            assert len(runs) == len(set(runs))
+        assert {"lod/2/density", "lod/1/density_2"} <= view.arrays.keys()
+
+
 def test_the_tag_tells_files_and_settings_apart(
     view_of: ViewOf, whole: Path, feature: Path
 ) -> None:

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_codec import Renderer, Volume
+from fhash_codec import EncodeConfig, Renderer, Volume, encode_dataset
 from fhash_codec.rendering.animation.animate import animate
 from fhash_codec.rendering.animation.animation import Animation
 from fhash_codec.rendering.animation.workers import rendered_by_workers
 from fhash_codec.rendering.scene.scene import Scene, TransferFunctionSpec
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashError, InputError
 
 SMALL = Scene(size=(20, 14))
@@ -45,6 +46,19 @@ def test_processes_write_the_files_of_one(volume: Volume, tmp_path: Path, drawin
     for processes, draw in ((0, None), (2, drawing())):
         with pytest.raises(InputError, match=f"processes is {processes}"):
             animate(volume, SMALL, animation, tmp_path / "c.gif", processes=processes, draw=draw)
+
+
+def test_a_process_opens_the_same_variable(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).random((1, 6, 7, 8), dtype=np.float32)
+    path, config = tmp_path / "run.fhz", EncodeConfig(effort=1)
+    encode_dataset({"a": values, "b": 1 - values}, path, config)
+    pictures = {}
+    for name in "ab":
+        with open_volume(path, variable=name) as one:
+            (picture,) = rendered_by_workers(one, [SMALL], 1)
+            np.testing.assert_array_equal(picture.rgba, Renderer(one).render(SMALL).rgba)
+            pictures[name] = picture.rgba
+    assert not np.array_equal(pictures["a"], pictures["b"])
 
 
 def test_what_a_process_raises_is_raised_here_and_none_is_left(volume: Volume) -> None:
