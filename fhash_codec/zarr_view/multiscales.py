@@ -6,7 +6,7 @@ in vertices, without a unit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -39,7 +39,7 @@ Positions that were rounded to float32 differ by less.
 def multiscale(
     name: str,
     coords: Mapping[str, Coordinate],
-    dimension_names: Sequence[str],
+    dimensions: Mapping[str, str],
     levels: Mapping[str, Level],
 ) -> dict[str, Any]:
     """The entry of a variable in `multiscales`.
@@ -47,11 +47,12 @@ def multiscale(
     Args:
         name: the variable's.
         coords: positions along each of t, z, y and x.
-        dimension_names: names of the axes (t, z, y, x) of the arrays.
+        dimensions: name in the arrays of each axis that they have, in the order t, z, y, x.
         levels: the levels by the path of their arrays, finest first.
     """
-    axes, rules = [], []
-    for axis, dimension in zip(AXES, dimension_names, strict=True):
+    axes: list[dict[str, Any]] = []
+    rules: dict[str, tuple[float, float]] = {}
+    for axis, dimension in dimensions.items():
         coordinate = coords[axis]
         rule = _even(coordinate.values)
         unit = None if rule is None else _unit(axis, coordinate)
@@ -62,7 +63,7 @@ def multiscale(
                 **({} if unit is None else {"unit": unit}),
             }
         )
-        rules.append((0.0, 1.0) if rule is None else rule)
+        rules[axis] = (0.0, 1.0) if rule is None else rule
     return {
         "name": name,
         "type": "lowpass",
@@ -75,19 +76,20 @@ def multiscale(
     }
 
 
-def _transformations(level: Level, rules: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+def _transformations(
+    level: Level, rules: Mapping[str, tuple[float, float]]
+) -> list[dict[str, Any]]:
     """Scale and translation from the vertices of a level to positions.
 
     rules: first position and step along each axis.
     """
-    strides, firsts = (1, *[level.stride] * 3), (0, *level.first)
+    strides = dict(zip(AXES, (1, *[level.stride] * 3), strict=True))
+    firsts = dict(zip(AXES, (0, *level.first), strict=True))
     return [
-        {"type": "scale", "scale": [step * n for (_, step), n in zip(rules, strides, strict=True)]},
+        {"type": "scale", "scale": [step * strides[axis] for axis, (_, step) in rules.items()]},
         {
             "type": "translation",
-            "translation": [
-                start + step * first for (start, step), first in zip(rules, firsts, strict=True)
-            ],
+            "translation": [start + step * firsts[axis] for axis, (start, step) in rules.items()],
         },
     ]
 

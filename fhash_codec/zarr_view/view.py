@@ -17,18 +17,25 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fhash_codec.dataset import open as open_file
 from fhash_codec.volume import Volume
+from fhash_codec.zarr_view.arrays import Region as Part
 from fhash_codec.zarr_view.arrays import ViewArray, chunk_index, chunk_key
 from fhash_codec.zarr_view.chunking import view_chunks
 from fhash_codec.zarr_view.levels import Level, level_count
 from fhash_codec.zarr_view.multiscales import multiscale
+from fhash_codec.zarr_view.surroundings import (
+    arrays_beside,
+    naming_attributes,
+    positions_along,
+    shown_axes,
+)
 from fhash_formats.series import AXES
+from fhash_formats.source_metadata import NAMING
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.writers.common.labels import (
     DROPPED,
@@ -86,10 +93,14 @@ class ZarrView:
                 groups.setdefault(group, {})
                 taken = used.setdefault(group, {DOCUMENT, *self.names.values()})
                 dimensions = self._add_coordinates(group, volume, level, taken)
-                self.arrays[_join(group, name)] = _values(volume, level, dimensions)
+                beside = self._add_beside(group, volume, level, dimensions)
+                self.arrays[_join(group, name)] = _values(volume, level, dimensions, beside)
             paths = {f"{level.lod}/{name}": level for level in levels}
-            scales.append(multiscale(name, volume.coords, self.arrays[name].dimension_names, paths))
-        groups[LEVELS]["ome"] = {"version": "0.5", "multiscales": scales}
+            axes = dict(zip(self._axes(volume), self.arrays[name].dimension_names, strict=True))
+            if len(axes.keys() - {"t"}) > 1:
+                scales.append(multiscale(name, volume.coords, axes, paths))
+        if scales:
+            groups[LEVELS]["ome"] = {"version": "0.5", "multiscales": scales}
         self._documents = self._write_documents(groups)
         self.tag = self._fingerprint()
 
@@ -122,7 +133,7 @@ class ZarrView:
         """Yield every key that begins with a prefix: the documents, then chunk after chunk."""
         yield from (key for key in self._documents if key.startswith(prefix))
         for path, array in self.arrays.items():
-            place = f"{path}/c/"
+            place = f"{path}/c"
             if place.startswith(prefix) or prefix.startswith(place):
                 keys = (f"{path}/{chunk_key(index)}" for index in array.indices())
                 yield from (key for key in keys if key.startswith(prefix))
@@ -148,44 +159,86 @@ class ZarrView:
         """The array and the index of a chunk's key; None for other keys and absent chunks."""
         path, _, end = key.rpartition("/c/")
         array, index = self.arrays.get(path), chunk_index(end)
+        if key.endswith("/c"):  # the only chunk of an array without axes
+            array, index = self.arrays.get(key.removesuffix("/c")), ()
         if array is None or index is None or not array.has(index):
             return None
         return array, index
 
     # -- how it is made --
 
+    @staticmethod
+    def _axes(volume: Volume) -> tuple[str, ...]:
+        """The axes of a volume that are shown, of "t", "z", "y" and "x"."""
+        return tuple(AXES[number] for number in shown_axes(volume))
+
     def _add_coordinates(
         self, group: str, volume: Volume, level: Level, used: set[str]
-    ) -> tuple[str, ...]:
-        """Add the coordinates of a level to its group; return the names of its axes.
+    ) -> dict[str, str]:
+        """Add the coordinates of a level to its group; return the names of its axes by axis.
 
         Volumes share a coordinate that has the same name, positions and attributes.
         """
-        names: list[str] = []
-        for number, axis in enumerate(AXES):
+        names: dict[str, str] = {}
+        for number in shown_axes(volume):
+            axis = AXES[number]
             coordinate = volume.coords[axis]
-            values = coordinate.values[level.vertices(number - 1)] if number else coordinate.values
+            values = positions_along(volume, axis)
+            values = values[level.vertices(number - 1)] if number else values
             attributes = coordinate_attributes(axis, coordinate)
             wanted = safe_name(coordinate.name or axis)
             name, count = wanted, 1
-            while name in used and not self._is_same(_join(group, name), values, attributes, names):
+            while name in used and (
+                name in names.values() or not self._is_same(_join(group, name), values, attributes)
+            ):
                 count += 1
                 name = f"{wanted}_{count}"
             if name not in used:
                 used.add(name)
                 self.arrays[_join(group, name)] = _positions(name, values, attributes)
-            names.append(name)
-        return tuple(names)
+            names[axis] = name
+        return names
 
-    def _is_same(self, path: str, values: Any, attributes: Any, taken: list[str]) -> bool:
-        """Whether a path holds these positions already, and not for another axis of the volume."""
+    def _add_beside(
+        self, group: str, volume: Volume, level: Level, dimensions: Mapping[str, str]
+    ) -> dict[str, Any]:
+        """Add the arrays beside the values; return the attributes by which the values name them."""
+        inside = {
+            path.rpartition("/")[2]: array
+            for path, array in self.arrays.items()
+            if path.rpartition("/")[0] == group
+        }
+        lengths = {
+            name: n
+            for array in inside.values()
+            for name, n in zip(array.dimension_names, array.shape, strict=True)
+        }
+        taken = {LEVELS, DOCUMENT, *self.names.values(), *inside}
+        there = set()
+        for name, array in arrays_beside(volume, level, dimensions, lengths):
+            if name not in taken:
+                self.arrays[_join(group, name)] = array
+            if name not in taken or (name in inside and inside[name].is_same(array)):
+                there.add(name)
+        if volume.metadata is None:
+            return {}
+        for dimension, axis in volume.metadata.dimensions.items():
+            source = volume.metadata.named(dimension)
+            if source is not None and axis in dimensions:
+                path = _join(group, dimensions[axis])
+                named = naming_attributes(source.attributes, there)
+                attributes = {**self.arrays[path].attributes, **named}
+                self.arrays[path] = replace(self.arrays[path], attributes=attributes)
+        return naming_attributes(volume.metadata.variable_attributes, there)
+
+    def _is_same(self, path: str, values: Any, attributes: Any) -> bool:
+        """Whether a path holds these positions already."""
         array = self.arrays.get(path)
-        if array is None or path.rpartition("/")[2] in taken or len(array.shape) != 1:
+        if array is None:
             return False
-        if array.shape != values.shape or array.attributes != attributes:
-            return False
-        there = array.read((slice(0, values.size),))
-        return bool(np.array_equal(there, values, equal_nan=True))
+        plain = {key: value for key, value in array.attributes.items() if key not in NAMING}
+        there = replace(array, attributes=plain)
+        return there.is_same(_positions(path.rpartition("/")[2], values, attributes))
 
     def _write_documents(self, groups: Mapping[str, dict[str, Any]]) -> dict[str, bytes]:
         """All metadata documents by key; those of groups hold all metadata below them."""
@@ -219,12 +272,25 @@ class ZarrView:
 
 
 def _global_attributes(volumes: Mapping[str, Volume]) -> dict[str, Any]:
-    """Attributes of the whole file, which a mapping of several variables may have."""
-    return json_attributes(getattr(volumes, "attributes", None) or {}, without=DROPPED)
+    """Attributes of the whole file: a mapping's own, and those of all sources."""
+    own = getattr(volumes, "attributes", None) or {}
+    metadata = [volume.metadata for volume in volumes.values()]
+    sources = [{} if each is None else each.attributes for each in metadata]
+    common = {
+        name: value
+        for name, value in (sources[0] if sources else {}).items()
+        if all(name in each and each[name] == value for each in sources)
+    }
+    return json_attributes({**common, **own}, without=DROPPED)
 
 
-def _values(volume: Volume, level: Level, dimensions: tuple[str, ...]) -> ViewArray:
-    """The array of a level of a volume."""
+def _values(
+    volume: Volume, level: Level, dimensions: Mapping[str, str], named: Mapping[str, Any]
+) -> ViewArray:
+    """The array of a level of a volume, without the axes that were made up.
+
+    named: attributes that name arrays beside it.
+    """
     region = Region(
         name=volume.name or "values",
         dtype=volume.dtype,
@@ -233,6 +299,14 @@ def _values(volume: Volume, level: Level, dimensions: tuple[str, ...]) -> ViewAr
         units=volume.units,
         attributes=volume.attrs,
     )
+    shown = shown_axes(volume)
+    chunk = view_chunks(level.shape, level.tile, level.dtype.itemsize)
+
+    def whole(part: Part) -> Part:
+        """The region (t, z, y, x) of a region of the axes that are shown."""
+        along = dict(zip(shown, part, strict=True))
+        return tuple(along.get(number, slice(0, 1)) for number in range(len(AXES)))
+
     # Integers have a fill value also where no vertex lacks a value: it marks nothing then.
     marks = volume.fill is not None and volume.value_type.has_gaps and volume.fill == volume.fill
     missing = {}
@@ -240,14 +314,14 @@ def _values(volume: Volume, level: Level, dimensions: tuple[str, ...]) -> ViewAr
         # xarray takes `_FillValue` of floats as bits in base64, which no other library does.
         missing = {"_FillValue" if volume.dtype.kind in "iu" else "missing_value": volume.fill}
     return ViewArray(
-        shape=level.shape,
-        chunk_shape=view_chunks(level.shape, level.tile, level.dtype.itemsize),
+        shape=tuple(level.shape[number] for number in shown),
+        chunk_shape=tuple(chunk[number] for number in shown),
         dtype=level.dtype,
-        dimension_names=dimensions,
-        attributes={**variable_attributes(region), **missing},
+        dimension_names=tuple(dimensions.values()),
+        attributes={**variable_attributes(region), **named, **missing},
         fill=volume.fill,
-        read=level.read,
-        holds=level.holds,
+        read=lambda part: level.read(whole(part)).reshape([e.stop - e.start for e in part]),
+        holds=lambda part: level.holds(whole(part)),
     )
 
 

@@ -12,7 +12,7 @@ from fhash_codec.zarr_view.levels import Level
 from fhash_codec.zarr_view.multiscales import multiscale
 from fhash_formats.series import Coordinate
 
-NAMES = ("time", "height", "lat", "lon")
+NAMES = {"t": "time", "z": "height", "y": "lat", "x": "lon"}
 
 
 def test_vertices_lead_to_positions_where_these_are_even(feature: Path) -> None:
