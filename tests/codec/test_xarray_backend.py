@@ -232,3 +232,20 @@ def test_a_dataset_is_encoded_by_its_accessor(tmp_path) -> None:
     source["tas"].fhash.encode(tmp_path / "other.fhz", config=QUICK)
     with pytest.raises(InputError, match="not both"):
         source["tas"].fhash.encode(tmp_path / "more.fhz", config=QUICK, psnr=40)
+
+
+def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None:
+    kind = KINDS["rotated"]()
+    data = kind.dataset
+    data["pr"] = 2 * data["tas"] + 1
+    data["pr"].attrs = {"units": "mm", "grid_mapping": "rotated_pole"}
+    encoding = kind.encoding | {"pr": {"_FillValue": None}}
+    data.to_netcdf(tmp_path / "two.nc", engine="h5netcdf", encoding=encoding)
+    fhash_codec.encode_dataset(tmp_path / "two.nc", tmp_path / "run.fhz", QUICK)
+    with xr.open_dataset(tmp_path / "two.nc") as whole, opened(tmp_path / "run.fhz") as found:
+        same = found
+        for name in ("tas", "pr"):
+            error = np.abs(whole[name].values - found[name].values).max()
+            assert 0 < error <= found[name].attrs["fhash_max_error"] * (1 + 1e-6)
+            same = same.assign({name: found[name].copy(data=whole[name].values)})
+        xr.testing.assert_identical(without_own(whole), without_own(same))

@@ -172,11 +172,15 @@ def _parsed(
 def _coordinate_names(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> dict[str, str]:
     """Name of each axis in the source."""
     described = header.get("coordinates", {})
+    # A file of several variables has them under their own names, which its header lists.
+    usual = header.get("dimensions")
+    if not isinstance(usual, list) or len(usual) != len(AXIS_NAMES):
+        usual = list(AXIS_NAMES.values())
     found = {}
-    for axis, stored in AXIS_NAMES.items():
+    for (axis, stored), name in zip(AXIS_NAMES.items(), usual, strict=True):
         array = arrays.get(f"coords/{stored}")
         place = described.get(stored, {}) if array is None else array.attributes
-        found[axis] = str(place.get("name", stored))
+        found[axis] = str(place.get("name", name))
     return found
 
 
