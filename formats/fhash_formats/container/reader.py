@@ -306,7 +306,8 @@ class VariableContainer(Container):
         self.digest = sha256(f"{file.digest}/{variable.name}".encode()).hexdigest()
         self._file, self._source, self._cache = file, file._source, file._cache
         self._closes_file = False
-        own = [f"{place}/" for name, place in variable.places.items() if name[:7] != "coords/"]
+        self._own = variable.own
+        own = [f"{variable.places[name]}/" for name in variable.own]
         documents = [f"{place}{DOCUMENT}" for place in own]
         chunks = (member for place in own for member in file.arrays[place[:-1]].chunks.values())
         self.size = sum(
@@ -332,8 +333,7 @@ class VariableContainer(Container):
 
     def overhead(self) -> int:
         """Bytes of the variable's arrays that are no data of chunks."""
-        own = (array for name, array in self.arrays.items() if name[:7] != "coords/")
-        return self.size - sum(array.nbytes_stored for array in own)
+        return self.size - sum(self.arrays[name].nbytes_stored for name in self._own)
 
     def close(self) -> None:
         """Release the file after `closing_file`, else nothing: other variables need it."""

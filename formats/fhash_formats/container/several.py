@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,13 @@ from fhash_formats.container.chunks import Coded
 from fhash_formats.container.coding import TRANSFORM, Codec
 from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.reader import Container
-from fhash_formats.container.variables import FEATURE, free_node, part_place
+from fhash_formats.container.variables import (
+    AUXILIARY,
+    FEATURE,
+    SHARES,
+    free_node,
+    part_place,
+)
 from fhash_formats.container.writer import ContainerWriter, Mark
 from fhash_formats.errors import InputError
 from fhash_formats.support.plain_json import plain_json
@@ -29,8 +36,8 @@ _COORDINATES = "coords/"
 class SeveralWriter:
     """The variables of a container that is being written, which are written one after the other.
 
-    Each is written by its `VariableWriter` as a file of its own would be. Coordinates that several
-    variables have are there once.
+    Each is written by its `VariableWriter` as a file of its own would be. Coordinates and arrays
+    beside the data that several variables have are there once.
     """
 
     def __init__(self, writer: ContainerWriter, names: Sequence[str]) -> None:
@@ -46,6 +53,7 @@ class SeveralWriter:
             self.nodes[name] = free_node(name, self.nodes.values())
         self.taken = set(self.nodes.values())
         self.coordinates: dict[str, tuple[str, bytes, dict[str, Any]]] = {}
+        self.auxiliary: dict[tuple[Any, ...], str] = {}
         self._headers: list[dict[str, Any]] = []
 
     def variable(self, name: str, attributes: Mapping[str, Any] | None = None) -> VariableWriter:
@@ -92,6 +100,7 @@ class VariableWriter(ContainerWriter):
         self._dimensions: dict[str, str] = {}
         self._lengths: dict[str, int] = {}
         self._parts_of: dict[str, str] = {}
+        self._shares: dict[str, str] = {}
         self._begun = several.size()
 
     def add_whole(
@@ -104,10 +113,19 @@ class VariableWriter(ContainerWriter):
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array that is in memory; a coordinate only where no other variable has it."""
+        """Write an array that is in memory.
+
+        A coordinate, or an array beside the data, is written only where no other variable has it.
+        """
         if name.startswith(_COORDINATES):
             self._share(name.removeprefix(_COORDINATES), array, attributes or {})
             return
+        if name.startswith(AUXILIARY):
+            content = (name, array.dtype.str, array.shape, sha256(array.tobytes()).digest())
+            owner = self._several.auxiliary.setdefault(content, self._node)
+            if owner != self._node:
+                self._shares[name] = owner
+                return
         super().add_whole(
             name,
             array,
@@ -201,7 +219,9 @@ class VariableWriter(ContainerWriter):
     def _complete(self, header: Mapping[str, Any]) -> dict[str, Any]:
         """The header of the variable with what a file of several needs beside it."""
         dimensions = [self._dimensions.get(axis, axis) for axis in POSITIONS]
-        placed = {"name": self.name, "array": self._node, "dimensions": dimensions}
+        placed: dict[str, Any] = {"name": self.name, "array": self._node, "dimensions": dimensions}
+        if self._shares:
+            placed[SHARES] = self._shares
         return {"required_features": [], **plain_json(header), **placed}
 
     def _share(self, axis: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]) -> None:

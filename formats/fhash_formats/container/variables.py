@@ -8,7 +8,7 @@ arrays as a file of its own would have them. Here the names of arrays in such a 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -19,10 +19,12 @@ from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError
 
 __all__ = [
+    "AUXILIARY",
     "CONSOLIDATED",
     "FEATURE",
     "NODE",
     "PARTS",
+    "SHARES",
     "VariablePlaces",
     "consolidated",
     "free_node",
@@ -41,6 +43,11 @@ CONSOLIDATED = "consolidated_metadata"
 NODE = re.compile(r"[A-Za-z0-9_-]{1,100}")
 """Name of an array at the root; without dots, so that those in `parts` mean one variable."""
 
+AUXILIARY = "auxiliary/"
+"""Beginning of the names of arrays beside the data."""
+SHARES = "shares"
+"""Key of a variable's header: arrays beside the data that lie with another variable."""
+
 _COORDINATES = "coords/"
 
 
@@ -52,11 +59,13 @@ class VariablePlaces:
         name: as in the file's list.
         header: as a file of this variable alone would have it, checked by `validate_header`.
         places: path in the hierarchy by name of the array in a file of this variable alone.
+        own: names of the arrays that no other variable has.
     """
 
     name: str
     header: dict[str, Any]
     places: Mapping[str, str]
+    own: Sequence[str]
 
 
 def is_several(header: Mapping[str, Any]) -> bool:
@@ -121,14 +130,20 @@ def read_variables(
         else:
             others.append(array)
     shared = set()
+    own = {name: tuple(found) for name, found in places.items()}
     for name, header in headers.items():
+        for part, node in header.get(SHARES, {}).items():
+            owner = nodes[node]
+            if part not in own[owner]:
+                raise DamagedFileError(f"array {part_place(node, part)} is missing")
+            _place(places[name], part, places[owner][part])
         for axis, dimension in zip(POSITIONS, header["dimensions"], strict=True):
             if dimension not in others:
                 raise DamagedFileError(f"array {dimension} is missing")
             places[name][f"{_COORDINATES}{axis}"] = dimension
             shared.add(dimension)
     found = [
-        VariablePlaces(name=name, header=header, places=places[name])
+        VariablePlaces(name=name, header=header, places=places[name], own=own[name])
         for name, header in headers.items()
     ]
     return found, [array for array in others if array not in shared]
@@ -175,11 +190,25 @@ def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         headers[name] = header
     top.need(bool(headers), FEATURE, "at least one variable")
     for name, header in headers.items():
+        with variable_named(name):
+            _check_shares(header, nodes)
+    for name, header in headers.items():
         if not nodes.isdisjoint(header["dimensions"]):
             raise DamagedFileError(
                 f"variable {name[:80]!a}: header key dimensions has the array of a variable"
             )
     return headers
+
+
+def _check_shares(header: Mapping[str, Any], nodes: Collection[str]) -> None:
+    """Check which arrays of a variable lie with another one."""
+    record = Record(header, "header key ")
+    if not record.has(SHARES):
+        return
+    record.record(SHARES)
+    for part, node in header[SHARES].items():
+        fits = part.startswith(AUXILIARY) and isinstance(node, str) and node in nodes
+        record.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the array of a variable")
 
 
 def _place(places: dict[str, str], name: str, array: str) -> None:

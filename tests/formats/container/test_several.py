@@ -153,3 +153,26 @@ def test_integers_with_gaps_are_not_shown(tmp_path) -> None:
         for kind in ("int16", "float32")
     }
     assert placed == {"int16": "parts/u.tables.level_1", "float32": "u"}
+
+
+def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, samples) -> None:
+    path, places = tmp_path / "a.fhz", np.arange(30.0).reshape(5, 6)
+    with ContainerWriter(path) as writer:
+        several = SeveralWriter(writer, ["u", "v", "w"])
+        for name in "uvw":
+            variable = several.variable(name)
+            add_coordinates(variable)
+            variable.add_whole("auxiliary/lat", places + (name == "w"))
+            parts = replace(table_parts(), apart=False)
+            parts.write(variable)
+            variable.finish(compact_header(samples, parts))
+        several.commit()
+    with Container.open(path) as file:
+        lat = [name for name in file.arrays if "lat" in name]
+        assert lat == ["parts/u.auxiliary.lat", "parts/w.auxiliary.lat"]
+        u, v, w = (each.arrays["auxiliary/lat"] for each in file.variables.values())
+        assert u is v
+        assert (w.read() - u.read() == 1).all()
+        assert file.variables["v"].size < file.variables["u"].size
+        assert file.variables["v"].overhead() > 0
+        assert sum(each.size for each in file.variables.values()) < file.size

@@ -90,6 +90,14 @@ ROOTS = {
         change_first("feature_bounding_box", [[0, 3], [0, 5], [0, 6]]),
         "variable 'u': .*levels",
     ),
+    "shares that are a list": (change_first("shares", ["auxiliary/lat"]), "an object"),
+    "a shared table": (change_first("shares", {"tables/level_1": "w"}), "auxiliary/..."),
+    "shares of no variable": (change_first("shares", {"auxiliary/a": "q"}), "array of a variable"),
+    "shares of no text": (change_first("shares", {"auxiliary/a": ["w"]}), "array of a variable"),
+    "shares that are not there": (
+        change_first("shares", {"auxiliary/a": "w"}),
+        "array parts/w.auxiliary.a is missing",
+    ),
     "other documents at the root": (
         lambda root: root["consolidated_metadata"]["metadata"]["u"].update(fill_value=1),
         "consolidated_metadata has other documents",
