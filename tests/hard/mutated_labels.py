@@ -27,7 +27,7 @@ from mutated_payload import (
     shard_of,
 )
 
-from fhash_formats.container.array import DTYPES
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.tile.sections import (
     EXACT,

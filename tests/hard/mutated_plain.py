@@ -17,8 +17,8 @@ from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
 from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, replaced
 from numcodecs.zstd import compress, decompress
 
-from fhash_formats.container.array import DTYPES
 from fhash_formats.container.header import KNOWN_FEATURES
+from fhash_formats.support.number_types import DTYPES
 
 GIANT_BYTES = 1 << 28
 """Largest decoded bytes of a chunk of zeros in a file of some kilobytes."""

@@ -33,9 +33,9 @@ from mutated_payload import (
     values_changed,
 )
 
-from fhash_formats.container.array import DTYPES
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.container.sharding import Sharding
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.axes.basis import Basis
 from fhash_formats.transform.entropy.coder import encode_block
 from fhash_formats.transform.entropy.predictor import passes_of

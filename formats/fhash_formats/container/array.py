@@ -14,25 +14,9 @@ import numpy as np
 from fhash_formats.container.coding import CheckedCoder, chunk_coder
 from fhash_formats.container.sharding import Sharding, parse_sharding
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.support.slabs import chunk_region
 
-DTYPES = {
-    name: np.dtype(name)
-    for name in (
-        "int8",
-        "int16",
-        "int32",
-        "int64",
-        "uint8",
-        "uint16",
-        "uint32",
-        "uint64",
-        "float16",
-        "float32",
-        "float64",
-    )
-}
-"""Number types of arrays by the name that Zarr gives them, in native byte order."""
 MAX_CHUNK_BYTES = 1 << 30
 """Bytes of a decoded inner chunk."""
 MAX_DIMENSIONS = 8

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.container.array import DTYPES
 from fhash_formats.container.coordinates import FEATURE as ULPS_FEATURE
 from fhash_formats.container.coordinates import MAX_RULED, check_positions
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.support.number_types import DTYPES
 
 FORMAT = "fhash"
 FORMAT_VERSION = (1, 7)

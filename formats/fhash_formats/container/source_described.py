@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.array import DTYPES
 from fhash_formats.container.source_entry import AUXILIARY, narrowed
-from fhash_formats.container.typed_values import inline_values, stored_type, typed_attribute
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import SourceMetadata, SourceVariable
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.support.plain_json import UnknownValueError
+from fhash_formats.support.typed_values import inline_values, stored_type, typed_attribute
 
 __all__ = ["describe_metadata"]
 

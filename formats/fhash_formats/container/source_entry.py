@@ -13,13 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.array import DTYPES, MAX_DIMENSIONS
+from fhash_formats.container.array import MAX_DIMENSIONS
 from fhash_formats.container.record import MAX_LENGTH, Record
-from fhash_formats.container.typed_values import (
-    attribute_value,
-    inline_array,
-    type_of_name,
-)
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 from fhash_formats.source_metadata import (
@@ -27,6 +22,12 @@ from fhash_formats.source_metadata import (
     SourceMetadata,
     SourceVariable,
     is_plain_name,
+)
+from fhash_formats.support.number_types import DTYPES
+from fhash_formats.support.typed_values import (
+    attribute_value,
+    inline_array,
+    type_of_name,
 )
 
 __all__ = [

@@ -17,12 +17,13 @@ from fhash_formats.container import (
     read_metadata,
     validate_header,
 )
-from fhash_formats.container.array import DTYPES, ArrayMetadata
+from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import ARRAY_CODECS, PlainCoder, plain_codecs
 from fhash_formats.container.header import FORMAT_VERSION
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXIS_NAMES
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.tile.settings import TileSettings
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")

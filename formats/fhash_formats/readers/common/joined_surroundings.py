@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.container.typed_values import typed_attribute
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import (
@@ -24,6 +23,7 @@ from fhash_formats.source_metadata import (
     is_plain_name,
     without_names,
 )
+from fhash_formats.support.typed_values import typed_attribute
 
 __all__ = ["joined_metadata"]
 

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.typed_values import stored_type, typed_attribute
 from fhash_formats.errors import FhashWarning
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import condense
@@ -35,6 +34,7 @@ from fhash_formats.source_metadata import (
 )
 from fhash_formats.support.attributes import PLUMBING
 from fhash_formats.support.plain_json import UnknownValueError
+from fhash_formats.support.typed_values import stored_type, typed_attribute
 
 __all__ = [
     "Stored",

@@ -30,7 +30,7 @@ class Encodings:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.configs: list[Any] = []
         monkeypatch.setattr(ratios.fhash_codec, "encode", self.encode)
-        monkeypatch.setattr(ratios.fhash_codec, "open", self.open)
+        monkeypatch.setattr(ratios, "open_volume", self.open)
 
     def encode(self, series: Series, path: Path, config: Any, *, progress: Any) -> None:
         progress("training", 1, 2, "")

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import strict_json
-from fhash_formats.container.typed_values import (
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.plain_json import UnknownValueError
+from fhash_formats.support.typed_values import (
     attribute_value,
     inline_array,
     inline_values,
@@ -17,8 +19,6 @@ from fhash_formats.container.typed_values import (
     type_of_name,
     typed_attribute,
 )
-from fhash_formats.errors import DamagedFileError
-from fhash_formats.support.plain_json import UnknownValueError
 
 ARRAYS = [
     np.array([0.1, -0.0, 1e-45, np.nan, np.inf, -np.inf], "f4"),

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.array import DTYPES
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.number_types import DTYPES
 from fhash_formats.support.plain_json import UnknownValueError, attribute_json
 
 __all__ = [
