@@ -41,12 +41,13 @@ wheels: .venv/.stamp
 	ls -l dist
 
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
-# the choice is made before any other requirement counts.
+# the choice is made before any other requirement counts. Python compiles what it imports; pip would compile all of torch,
+# scipy and vtk, which takes minutes.
 .venv/.stamp: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("fhash needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	touch $@
 
 clean:
