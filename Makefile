@@ -23,11 +23,12 @@ types: .venv/.stamp
 units: .venv/.stamp
 	$(BIN)/python -m pytest $(SPREAD)
 
-# The long set of hard cases, hostile files, faults and fuzzing: some 35 minutes on 4 processors; needs g++. docs/stability.md gets the figures.
+# The long set: every case of every test, of which `make test` runs up to four; hard cases, hostile files, faults and fuzzing. It takes
+# an hour on 4 processors and needs g++. docs/stability.md gets the figures.
 hard: .venv/.stamp
 	mkdir -p build/hard
 	rm -f build/hard/figures.jsonl
-	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) tests/hard
+	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD)
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md

@@ -29,12 +29,14 @@ for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.
 
 SLOW_ROOMS = ("fresh", "hard", "golden")
 """Rooms of `tests` whose files take minutes: they run first, so that no process ends alone."""
+QUICK_CASES = 4
+"""Cases of a parametrised test that the quick set runs."""
 SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
 """Names of files that take a good part of a minute."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts slow files first, and keeps the order of all others."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Puts slow files first, and keeps the order of all others; see `_keep_some_cases`."""
     root = Path(__file__).parent
 
     def rank(item: pytest.Item) -> int:
@@ -44,6 +46,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return len(SLOW_ROOMS) + (item.path.name not in SLOW_FILES)
 
     items.sort(key=rank)
+    if os.environ.get("FHASH_HARD") != "1":
+        _keep_some_cases(config, items)
+
+
+def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselects most cases of a test with many: the quick set has the first, the last and some
+    between them, `make hard` all."""
+    cases: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    kept = set()
+    for same in cases.values():
+        last = len(same) - 1
+        if last < QUICK_CASES:
+            kept |= {item.nodeid for item in same}
+        else:
+            kept |= {same[n * last // (QUICK_CASES - 1)].nodeid for n in range(QUICK_CASES)}
+    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in kept])
+    items[:] = [item for item in items if item.nodeid in kept]
 
 
 @pytest.fixture
