@@ -29,6 +29,8 @@ for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.
 
 SLOW_ROOMS = ("fresh", "hard", "golden")
 """Rooms of `tests` whose files take minutes: they run first, so that no process ends alone."""
+QUICK_HARD_FILES = ("test_names.py", "test_summary.py")
+"""Files of the room `hard` that take no time."""
 QUICK_CASES = 4
 """Cases of a parametrised test that the quick set runs."""
 SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
@@ -51,8 +53,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselects most cases of a test with many: the quick set has the first, the last and some
-    between them, `make hard` all."""
+    """Deselects the long set, and most cases of a test with many: the quick set has the first, the
+    last and some between them. `make hard` runs all."""
+    items_before = list(items)
+    items[:] = [item for item in items if not _is_long(item)]
     cases: dict[str, list[pytest.Item]] = {}
     for item in items:
         cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
@@ -63,8 +67,16 @@ def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
             kept |= {item.nodeid for item in same}
         else:
             kept |= {same[n * last // (QUICK_CASES - 1)].nodeid for n in range(QUICK_CASES)}
-    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in kept])
     items[:] = [item for item in items if item.nodeid in kept]
+    config.hook.pytest_deselected(items=[item for item in items_before if item.nodeid not in kept])
+
+
+def _is_long(item: pytest.Item) -> bool:
+    """Whether a test belongs to the long set: faults, hostile files, fuzzing under sanitizers."""
+    if item.path.relative_to(Path(__file__).parent).parts[0] != "hard":
+        return False
+    compiles = item.path.name == "test_fuzz.py" and "folder" in getattr(item, "fixturenames", ())
+    return compiles or item.path.name not in ("test_fuzz.py", *QUICK_HARD_FILES)
 
 
 @pytest.fixture
