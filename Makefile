@@ -23,7 +23,7 @@ types: .venv/.stamp
 units: .venv/.stamp
 	$(BIN)/python -m pytest $(SPREAD)
 
-# The long set: every case of every test, of which `make test` runs up to four; hard cases, hostile files, faults and fuzzing. It takes
+# The long set: every case of every test, of which `make test` runs up to two; hard cases, hostile files, faults and fuzzing. It takes
 # an hour on 4 processors and needs g++. docs/stability.md gets the figures.
 hard: .venv/.stamp
 	mkdir -p build/hard

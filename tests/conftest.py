@@ -31,7 +31,9 @@ SLOW_ROOMS = ("fresh", "hard", "golden")
 """Rooms of `tests` whose files take minutes: they run first, so that no process ends alone."""
 QUICK_HARD_FILES = ("test_names.py", "test_summary.py")
 """Files of the room `hard` that take no time."""
-QUICK_CASES = 4
+LONG_ROOMS = ("codec/bench", "codec/cost", "codec/selftest", "codec/paper/engines/fused")
+"""Rooms of measuring tools, and of kernels that are emulated, which the long set alone runs."""
+QUICK_CASES = 2
 """Cases of a parametrised test that the quick set runs."""
 SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
 """Names of files that take a good part of a minute."""
@@ -53,8 +55,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselects the long set, and most cases of a test with many: the quick set has the first, the
-    last and some between them. `make hard` runs all."""
+    """Deselects the long set, and most cases of a test with many: the quick set has the first
+    and the last. `make hard` runs all."""
     items_before = list(items)
     items[:] = [item for item in items if not _is_long(item)]
     cases: dict[str, list[pytest.Item]] = {}
@@ -72,8 +74,11 @@ def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
 
 
 def _is_long(item: pytest.Item) -> bool:
-    """Whether a test belongs to the long set: faults, hostile files, fuzzing under sanitizers."""
-    if item.path.relative_to(Path(__file__).parent).parts[0] != "hard":
+    """Whether a test belongs to the long set: faults, hostile files, sanitizers, LONG_ROOMS."""
+    place = item.path.relative_to(Path(__file__).parent).as_posix()
+    if place.startswith(tuple(f"{room}/" for room in LONG_ROOMS)):
+        return True
+    if not place.startswith("hard/"):
         return False
     compiles = item.path.name == "test_fuzz.py" and "folder" in getattr(item, "fixturenames", ())
     return compiles or item.path.name not in ("test_fuzz.py", *QUICK_HARD_FILES)
