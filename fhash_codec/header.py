@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.provenance import date_of, source_parts
@@ -149,18 +150,21 @@ def _write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Sca
     )
 
 
-def read_missing(container: Container, first: int, last: int) -> npt.NDArray[np.bool_] | None:
-    """Mask (z, y, x) of the values that are not finite at any step from `first` to `last`.
+def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray[np.bool_] | None:
+    """Mask (t, z, y, x) of the values of a region that are not finite at neighbouring steps.
 
     None if every value of the source is finite.
     """
     stored = container.arrays.get("missing/bits")
     if stored is None:
         return None
-    shape = container.header["domain"]["shape"][1:]
-    rows = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-    bits = np.unpackbits(np.bitwise_or.reduce(rows, axis=0), count=prod(shape))
-    return bits.view(np.bool_).reshape(shape)
+    _, y, x = container.header["domain"]["shape"][1:]
+    (low, high), *layer = region
+    # the bytes that hold the region's layers, which lie one after the other
+    first, end = low * y * x, high * y * x
+    rows = stored.read((slice(steps.start, steps.stop), slice(first // 8, -(-end // 8))))
+    bits = np.unpackbits(rows, axis=1)[:, first % 8 :][:, : end - first].view(np.bool_)
+    return bits.reshape(len(steps), high - low, y, x)[:, :, *(slice(*span) for span in layer)]
 
 
 def brief_quality(

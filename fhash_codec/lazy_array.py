@@ -16,7 +16,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.indexing import slice_of
+from fhash_codec.indexing import slice_of, step_blocks
 from fhash_codec.shared_volumes import Handle, acquire, release
 from fhash_codec.volume import Volume
 from fhash_formats.series import AXES
@@ -130,13 +130,13 @@ class FhashArray(BackendArray):
             for axis in AXES[1:]
         )
         local = tuple(slice_of(ranges[axis], min(ranges[axis])) for axis in AXES[1:])
-        for number, step in enumerate(ranges["t"]):
-            frame = (
-                volume.values(step, region, outside=form.outside)
-                if form.lod is None
-                else volume.read_lod(step, form.lod, region)
-            )
-            result[number] = frame[local]
+        if form.lod is not None:
+            for number, step in enumerate(ranges["t"]):
+                result[number] = volume.read_lod(step, form.lod, region)[local]
+            return result
+        for places, steps in step_blocks(ranges["t"], region.shape):
+            values = volume.values_of_steps(steps, region, outside=form.outside)
+            result[places] = values[:, *local]
         return result
 
 

@@ -1,18 +1,69 @@
-"""Points between vertices: which of them have a value, given the coreset around them."""
+"""Points between vertices: which have a value, given the coreset around them, and the values."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.boxes import Box, Spans
+from fhash_codec.coreset.key_frames import KeyTimes
+from fhash_codec.volume_model import VolumeModel
 
 Positions = npt.NDArray[np.float64]
 """Positions (n,) of points along one axis."""
 
 Mask = npt.NDArray[np.bool_]
+
+
+class Series(Protocol):
+    """A volume, as far as sampling asks it: where it has values, and how its time runs."""
+
+    @property
+    def box(self) -> Box:
+        """The feature bounding box."""
+        ...
+
+    @property
+    def key_times(self) -> KeyTimes:
+        """The map from steps to key indices."""
+        ...
+
+    def occupancy(self, t: float, region: Spans | None = None) -> Mask:
+        """The vertices (z, y, x) of a region of the domain that are in the coreset at a step."""
+        ...
+
+
+def sampled(
+    series: Series,
+    model: VolumeModel,
+    steps: Positions,
+    space: Sequence[Positions],
+    *,
+    gradient: bool,
+) -> tuple[Positions, Positions | None]:
+    """Values (n,) at points, NaN where there is none, and derivatives (n, 4) by t, z, y and x.
+
+    steps: of the points. space: positions z, y and x of the points, in vertices of the domain.
+    gradient: whether derivatives are asked for; None is returned for them otherwise.
+    """
+    keys = series.key_times.key_indices(steps)
+    inside = interpolable(series.box, steps, keys, space, series.occupancy)
+    values = np.full(inside.shape, np.nan)
+    slopes = np.full((*inside.shape, 4), np.nan) if gradient else None
+    if inside.any():
+        local = [
+            (position - first)[inside]
+            for position, first in zip(space, series.box.first, strict=True)
+        ]
+        if slopes is None:
+            values[inside] = model.sample(keys[inside], local)
+        else:
+            values[inside], slopes[inside] = model.sample_with_gradient(keys[inside], local)
+            slopes[inside, 0] *= series.key_times.keys_per_step(steps[inside])
+    return values, slopes
 
 
 def interpolable(

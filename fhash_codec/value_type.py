@@ -94,12 +94,13 @@ def placed(
 ) -> npt.NDArray[Any]:
     """Values (z, y, x) where a mask is True, in a box of an array of a shape that is NaN elsewhere.
 
-    The values themselves where they are all of the array.
+    The values themselves where they are all of the array. Values and mask may have more axes before
+    z, which the result has, too.
     """
     if box.shape == shape and where.all():
         return values
-    result = np.full(shape, np.nan, dtype=values.dtype)
-    np.copyto(result[box.slices()], values, where=where)
+    result = np.full((*values.shape[:-3], *shape), np.nan, dtype=values.dtype)
+    np.copyto(result[..., *box.slices()], values, where=where)
     return result
 
 

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.array_like import ArrayLike
 from fhash_codec.card import Card
+from fhash_codec.compact.model import CompactModel
 from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import OUTSIDE as OUTSIDE_IS_MISSING
 from fhash_codec.header import describe_file, read_missing
-from fhash_codec.indexing import (
-    Index,
-    checked_region,
-    coarse_vertices,
-    expand_index,
-    index_ranges,
-    shared_part,
-    slice_of,
-)
+from fhash_codec.indexing import checked_region, coarse_vertices, shared_part
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
-from fhash_codec.sampling import interpolable
+from fhash_codec.sampling import sampled
 from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
@@ -64,7 +58,7 @@ def open(
         raise
 
 
-class Volume(Card):
+class Volume(Card, ArrayLike):
     """A time-varying volume in a container, read like a numpy array (t, z, y, x).
 
     Only the tiles that a request needs are decoded. Values are in data units. Vertices outside the
@@ -89,9 +83,6 @@ class Volume(Card):
         config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
             `model`.
     """
-
-    dims = AXES
-    ndim = 4
 
     def __init__(self, container: Container, *, fill: int | float | None = None) -> None:
         """Read from an open container, which `close` closes; `fhash_codec.open` opens files.
@@ -162,26 +153,34 @@ class Volume(Card):
         Raises RegionError for a step or region outside the domain, InputError for another
         `outside`.
         """
-        if outside not in OUTSIDE:
-            raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
-        key = self._key_index(t)
-        region = self._checked(region)
-        common = shared_part(self.box, region)
-        if common is None:
-            result: npt.NDArray[Any] = np.full(region.shape, np.nan, dtype=self.float_dtype)
-        else:
-            in_region, in_box = common
+        key, region = self._key_index(t), self._checked(region)
+
+        def decode(in_box: Box) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
             requested = self._occupied(key, in_box)
             values = self._model.read(key, in_box, requested).astype(self.float_dtype, copy=False)
-            if not key.is_integer():
-                values = self._in_range(values)
-            result = placed(values, requested, in_region, region.shape)
-        if outside == "background" and not self._outside_is_missing:
-            result[np.isnan(result)] = self.background
-        missing = self._missing_at(t)
-        if missing is not None:
-            result[missing[region.slices()]] = np.nan
-        return result
+            return (values if key.is_integer() else self._in_range(values)), requested
+
+        return self._completed(decode, region, self._missing_at(t, region), outside)
+
+    def read_steps(
+        self, steps: range, region: Spans | None = None, *, outside: str = "nan"
+    ) -> npt.NDArray[Any]:
+        """Values (t, z, y, x) of a region at neighbouring steps, each as `read` gives it.
+
+        steps: whole steps; together, small frames are read faster. Errors as in `read`.
+        """
+        model = self._model_of_steps
+        if model is None or steps.step != 1:
+            return np.stack([self.read(step, region, outside=outside) for step in steps])
+        first, last = (int(self._key_index(step)) for step in (steps[0], steps[-1]))
+
+        def decode(in_box: Box) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+            values, occupied = model.read_steps(first, last + 1, in_box)
+            return values.astype(self.float_dtype, copy=False), occupied
+
+        region = self._checked(region)
+        missing = read_missing(self.container, range(first, last + 1), region)
+        return self._completed(decode, region, missing, outside, (len(steps),))
 
     def values(
         self, t: float, region: Spans | None = None, *, outside: str = "nan"
@@ -192,18 +191,28 @@ class Volume(Card):
         are interpolated, and so of `self.float_dtype`. Arguments and errors as in `read`; the
         background is rounded to integers.
         """
-        if self.dtype.kind == "f" or not float(t).is_integer():
+        if not float(t).is_integer():
             return filled(self.read(t, region, outside=outside), self.fill)
-        read = self.read(t, region, outside=outside)
+        alone = range(int(t), int(t) + 1)
+        return np.asarray(self.values_of_steps(alone, region, outside=outside)[0])
+
+    def values_of_steps(
+        self, steps: range, region: Spans | None = None, *, outside: str = "nan"
+    ) -> npt.NDArray[Any]:
+        """Values (t, z, y, x) of a region at neighbouring steps, each as `values` gives it."""
+        read = self.read_steps(steps, region, outside=outside)
+        if self.dtype.kind == "f":
+            return filled(read, self.fill)
         gaps = np.isnan(read)
         result: npt.NDArray[Any] = rounded(read, self.dtype)
         common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             # float64 has not every integer of 64 bits.
             in_region, in_box = common
-            requested = self._occupied(self._key_index(t), in_box)
-            exact = self._model.read(self._key_index(t), in_box, requested)
-            np.copyto(result[in_region.slices()], exact, where=requested)
+            model = self._model_of_steps
+            assert model is not None, "only such files hold integers"
+            exact, occupied = model.read_steps(steps[0], steps[-1] + 1, in_box)
+            np.copyto(result[(slice(None), *in_region.slices())], exact, where=occupied)
         result[gaps] = self.fill
         return result
 
@@ -240,36 +249,6 @@ class Volume(Card):
         """
         return coarse_vertices(self.box, self._checked(region), lod, str(self.path))
 
-    def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
-        """Values by numpy's basic indexing: integers, slices and `...`, negative ones as usual.
-
-        Raises RegionError (an IndexError) for an index outside the shape and for other indices.
-        """
-        parts = expand_index(index)
-        ranges = index_ranges(parts, self.shape)
-        steps, *space = ranges
-        result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
-        if result.size:
-            region = Box.of((min(positions), max(positions) + 1) for positions in space)
-            local = tuple(map(slice_of, space, region.first))
-            for number, step in enumerate(steps):
-                result[number] = self.values(step, region)[local]
-        return result[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
-
-    def __array__(
-        self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
-    ) -> npt.NDArray[Any]:
-        """All values, decoded."""
-        if copy is False:
-            raise ValueError(
-                "a volume cannot become an array without a copy: its values are decoded"
-            )
-        values = self[...]
-        return values if dtype is None else values.astype(dtype)
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
     def sample(
         self,
         *,
@@ -299,25 +278,13 @@ class Volume(Card):
         if t is None:
             t = self._steps_of_times(time)
         points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
-        shape = points[0].shape
         steps, *space = (position.ravel() for position in points)
-        keys = self.key_times.key_indices(steps)
-        inside = interpolable(self.box, steps, keys, space, self.occupancy)
-        values: npt.NDArray[Any] = np.full(inside.shape, np.nan)
-        slopes = np.full((*inside.shape, 4), np.nan)
-        if inside.any():
-            local = [
-                (position - first)[inside]
-                for position, first in zip(space, self.box.first, strict=True)
-            ]
-            if gradient:
-                sampled = self._model.sample_with_gradient(keys[inside], local)
-                values[inside], slopes[inside] = sampled
-                slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
-            else:
-                values[inside] = self._model.sample(keys[inside], local)
+        values, slopes = sampled(self, self._model, steps, space, gradient=gradient)
+        shape = points[0].shape
         values = self._in_range(values.reshape(shape).astype(self.float_dtype))
-        return (values, slopes.reshape(*shape, 4).astype(self.float_dtype)) if gradient else values
+        if slopes is None:
+            return values
+        return values, slopes.reshape(*shape, 4).astype(self.float_dtype)
 
     def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of a region that are in the coreset at step `t`.
@@ -333,8 +300,8 @@ class Volume(Card):
         if common is not None:
             in_region, in_box = common
             result[in_region.slices()] = self._occupied(key, in_box)
-        missing = self._missing_at(t)
-        return result if missing is None else result & ~missing[region.slices()]
+        missing = self._missing_at(t, region)
+        return result if missing is None else result & ~missing
 
     def step_of_time(self, time: Time) -> float:
         """The step at a time; a fraction lies between two steps.
@@ -373,9 +340,43 @@ class Volume(Card):
         """Mask (z, y, x) of the coreset at a key index; the region is in vertices of the box."""
         return self._model.occupied(int(np.floor(key)), int(np.ceil(key)), region)
 
-    def _missing_at(self, t: float) -> npt.NDArray[np.bool_] | None:
+    def _missing_at(self, t: float, region: Box) -> npt.NDArray[np.bool_] | None:
         """Mask (z, y, x) of the values that are not finite at step `t`, or at a step beside it."""
-        return read_missing(self.container, int(np.floor(t)), int(np.ceil(t)))
+        beside = range(int(np.floor(t)), int(np.ceil(t)) + 1)
+        missing = read_missing(self.container, beside, region)
+        return None if missing is None else np.asarray(missing.any(axis=0))
+
+    def _completed(
+        self,
+        decode: Callable[[Box], tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]],
+        region: Box,
+        missing: npt.NDArray[np.bool_] | None,
+        outside: str,
+        steps: tuple[int, ...] = (),
+    ) -> npt.NDArray[Any]:
+        """Decoded values (z, y, x) of a region, or (t, z, y, x), and what stands beside them.
+
+        decode: gives values of a region of the feature bounding box, and where they count.
+        """
+        if outside not in OUTSIDE:
+            raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
+        common = shared_part(self.box, region)
+        if common is None:
+            result: npt.NDArray[Any] = np.full((*steps, *region.shape), np.nan, self.float_dtype)
+        else:
+            in_region, in_box = common
+            result = placed(*decode(in_box), in_region, region.shape)
+        if outside == "background" and not self._outside_is_missing:
+            result[np.isnan(result)] = self.background
+        if missing is not None:
+            result[missing] = np.nan
+        return result
+
+    @cached_property
+    def _model_of_steps(self) -> CompactModel | None:
+        """The model where it is a table with a row for each step; None for others."""
+        every = len(self.key_times.key_frames) == self.shape[0]
+        return self._model if every and isinstance(self._model, CompactModel) else None
 
     # -- life --
 

@@ -46,7 +46,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("compact",),
         ("paper",),
         ("volume_model",),
-        ("card", "sampling", "times", "value_type"),
+        ("array_like", "card", "sampling", "times", "value_type"),
         ("volume",),
         ("dataset", "feature_volume", "promises", "report"),
         ("zarr_view",),
@@ -78,7 +78,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("durations", "intervals", "progress_bar"),
+        ("durations", "frame_statistics", "intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
         ("animation_options", "card_rows", "gallery", "peer_options"),
         ("scene_options", "simulating"),

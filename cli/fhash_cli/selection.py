@@ -136,17 +136,17 @@ def coordinates(
 
 def count_inside(
     volume: Volume,
-    step: float,
+    steps: Sequence[float],
     region: tuple[Span, Span, Span],
-    frame: npt.NDArray[Any],
+    frames: npt.NDArray[Any],
     outside: str,
 ) -> int:
-    """Number of vertices of a decoded frame that are in the coreset."""
+    """Number of vertices of decoded frames (t, z, y, x) that are in the coreset."""
     import numpy as np
 
     if outside == "nan":
-        return frame.size - int(np.isnan(frame).sum())
-    return int(volume.occupancy(step, region).sum())
+        return frames.size - int(np.isnan(frames).sum())
+    return sum(int(volume.occupancy(step, region).sum()) for step in steps)
 
 
 def metadata(

@@ -66,17 +66,19 @@ class CompactModel:
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
         # Between steps both count: a value is no better than the two it lies between.
-        space = tuple(slice(low, high) for low, high in region)
+        return np.asarray(self._occupied_at(first, last + 1, region).all(axis=0))
+
+    def _occupied_at(self, first: int, end: int, region: Box) -> npt.NDArray[np.bool_]:
+        """Return which vertices (t, z, y, x) of a region are in the coreset at each step."""
+        steps, space = slice(first, end), region.slices()
         if MASK_ARRAY in self._arrays and not self._table.masked:
-            mask = self._arrays[MASK_ARRAY].read((slice(first, last + 1), *space))
-            return np.asarray((mask[0] != 0) & (mask[-1] != 0))
+            return np.asarray(self._arrays[MASK_ARRAY].read((steps, *space)) != 0)
         if self._table.masked or "occupancy/bits" not in self._arrays:
-            mask = self._table.read_mask((slice(first, last + 1), *space))
-            return np.asarray(mask[0] & mask[-1])
+            return self._table.read_mask((steps, *space))
         stored = self._arrays["occupancy/bits"]
-        bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
         z, y, x = self._array.shape[1:]
-        return unpack(bits[0] & bits[-1], (z, y, x))[space]
+        rows = stored.read((steps, slice(0, stored.shape[1])))
+        return np.stack([unpack(bits, (z, y, x))[space] for bits in rows])
 
     def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         """Return the values (z, y, x) of a region of the box at a step.
@@ -93,6 +95,16 @@ class CompactModel:
         if weight:
             values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
+
+    def read_steps(
+        self, first: int, end: int, region: Box
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        """Return the values (t, z, y, x) of a region at neighbouring steps, and its coreset.
+
+        They have the type of the source. Raises what `read` raises.
+        """
+        values = self._array.read((slice(first, end), *region.slices()))
+        return self._without_infinities(values), self._occupied_at(first, end, region)
 
     def read_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Return every 2^lod-th vertex (z, y, x) of a region of the box at a step.

@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.indexing import expand_index, index_ranges, shared_part, slice_of
+from fhash_codec.indexing import (
+    BLOCK,
+    expand_index,
+    index_ranges,
+    shared_part,
+    slice_of,
+    step_blocks,
+)
 
 SHAPE = (3, 4, 1, 5)
 ENDS = st.none() | st.integers(-7, 7)
@@ -64,3 +71,22 @@ def test_the_part_that_a_region_shares_with_a_box() -> None:
         Box.of([(0, 1), (1, 4), (1, 2)]),
     )
     assert shared_part(box, Box.of([(4, 5), (2, 6), (0, 3)])) is None
+
+
+@pytest.mark.parametrize(
+    ("steps", "frame", "blocks"),
+    [
+        (range(5), (1, 1, 1), [range(5)]),
+        (range(3, 8), (1, 1, BLOCK // 2), [range(3, 5), range(5, 7), range(7, 8)]),
+        (range(2, 4), (2, 1, BLOCK), [range(2, 3), range(3, 4)]),
+        (range(6, 0, -3), (1, 1, 1), [range(6, 7), range(3, 4)]),
+        (range(0, 5, 2), (1, 1, 1), [range(1), range(2, 3), range(4, 5)]),
+        (range(0), (1, 1, 1), []),
+    ],
+)
+def test_steps_are_cut_into_neighbours_that_are_read_together(
+    steps: range, frame: tuple[int, int, int], blocks: list[range]
+) -> None:
+    cut = list(step_blocks(steps, frame))
+    assert [together for _, together in cut] == blocks
+    assert [step for places, _ in cut for step in steps[places]] == list(steps)

@@ -101,11 +101,14 @@ def test_the_file_says_where_it_comes_from(made) -> None:
 
 def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
     read = []
-    original = fhash_codec.Volume.values
+    original = fhash_codec.Volume.values_of_steps
     monkeypatch.setattr(
         fhash_codec.Volume,
-        "values",
-        lambda self, t, *args, **kw: (read.append(t), original(self, t, *args, **kw))[1],
+        "values_of_steps",
+        lambda self, steps, *args, **kw: (
+            read.extend(steps),
+            original(self, steps, *args, **kw),
+        )[1],
     )
     with opened(plain) as stored:
         part = stored["values"].isel(time=slice(3, None, -2), z=4)

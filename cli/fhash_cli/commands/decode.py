@@ -10,6 +10,7 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.conversion import check_fill, convert
+from fhash_cli.frame_statistics import Statistics
 from fhash_cli.intervals import IntervalsType, NumberType, SliceType
 from fhash_cli.options import (
     check_writable,
@@ -268,19 +269,38 @@ class Selection:
     def frames(
         self, volume: Volume, statistics: Statistics, progress: Callback
     ) -> Iterator[npt.NDArray[Any]]:
-        """Decode the frames (z, y, x) one by one; each is added to the statistics."""
-        for done, step in enumerate(self.steps):
+        """Decode the frames (z, y, x), small ones together; all are added to the statistics."""
+        background, done = self.outside == "background", 0
+        for steps, frames in self._decoded(volume):
+            inside = count_inside(volume, steps, self.region, frames, self.outside)
+            statistics.add(frames, inside)
+            if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
+                # float64 has not every integer of 64 bits.
+                whole = range(int(steps[0]), int(steps[-1]) + 1)
+                frames = volume.values_of_steps(whole, self.region, outside=self.outside)
+            yield from convert(frames, self.kind, fill=self.fill, background=background)
+            done += len(steps)
+            progress("decoding", done, len(self.steps), "")
+
+    def _decoded(self, volume: Volume) -> Iterator[tuple[Sequence[float], npt.NDArray[Any]]]:
+        """Some steps at a time, and their frames (t, z, y, x)."""
+        import numpy as np
+
+        from fhash_codec.indexing import step_blocks
+
+        first = int(self.steps[0])
+        neighbours = range(first, first + len(self.steps))
+        if self.lod is None and list(neighbours) == self.steps:
+            for _, steps in step_blocks(neighbours, self.shape[1:]):
+                yield steps, volume.read_steps(steps, self.region, outside=self.outside)
+            return
+        for step in self.steps:
             frame = (
                 volume.read(step, self.region, outside=self.outside)
                 if self.lod is None
                 else volume.read_lod(step, self.lod, self.region)
             )
-            statistics.add(frame, count_inside(volume, step, self.region, frame, self.outside))
-            if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
-                # float64 has not every integer of 64 bits.
-                frame = volume.values(step, self.region, outside=self.outside)
-            yield convert(frame, self.kind, fill=self.fill, background=self.outside == "background")
-            progress("decoding", done + 1, len(self.steps), "")
+            yield [step], np.expand_dims(frame, 0)
 
 
 def _save_surface(
@@ -329,46 +349,6 @@ def _save_region(
         metadata=metadata(volume, selection.steps, selection.vertices),
     )
     return [str(path) for path in save_region(output, region, frames, force=force, sources=[run])]
-
-
-class Statistics:
-    """Smallest, largest and mean value, and share inside the coreset, of frames added one by one.
-
-    NaN is left out.
-    """
-
-    def __init__(self) -> None:
-        from fhash_codec.measure.value_range import Mean
-
-        self.low, self.high, self.mean = float("inf"), float("-inf"), Mean()
-        self.inside = self.all = 0
-
-    def add(self, frame: npt.NDArray[Any], inside: int) -> None:
-        """Add a frame of any shape; inside: number of its vertices in the coreset."""
-        import numpy as np
-
-        from fhash_codec.measure.value_range import pieces
-
-        gaps = np.isnan(frame)
-        values = frame[~gaps] if gaps.any() else frame.reshape(-1)
-        self.all, self.inside = self.all + frame.size, self.inside + inside
-        if values.size:
-            self.low, self.high = (
-                min(self.low, float(values.min())),
-                max(self.high, float(values.max())),
-            )
-        for piece in pieces(values):
-            self.mean.add(piece)
-
-    def result(self) -> dict[str, float | None]:
-        """JSON values; None where no vertex has a value."""
-        defined = self.mean.count > 0
-        return {
-            "min": self.low if defined else None,
-            "max": self.high if defined else None,
-            "mean": self.mean.value() if defined else None,
-            "inside_fraction": self.inside / self.all,
-        }
 
 
 def _rows(result: dict[str, Any], volume: Volume) -> list[tuple[str, str]]:
