@@ -76,7 +76,7 @@ def test_ctrl_c_is_one_line_and_130(
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fhash_codec.Volume, "read", stopped)
+    monkeypatch.setattr(fhash_codec.Volume, "read_steps", stopped)
     result = fhash("decode", run)
     assert (result.exit_code, result.stdout, result.stderr) == (
         130,
@@ -91,7 +91,7 @@ def test_an_error_of_ours_asks_for_a_report_and_shows_its_origin_only_on_request
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("by\nzero")
 
-    monkeypatch.setattr(fhash_codec.Volume, "read", broken)
+    monkeypatch.setattr(fhash_codec.Volume, "read_steps", broken)
     result = fhash("decode", run)
     assert result.exit_code == 1
     assert result.stderr == (

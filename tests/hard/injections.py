@@ -68,26 +68,26 @@ def user(number: int) -> None:
 
 
 def _at_progress(stage: str, done: int, act: Callable[[], None]) -> None:
-    """Call `act` once, when a stage first reports `done` parts."""
+    """Call `act` once, when a stage first reports at least `done` parts."""
     from fhash_cli.output import Progress
 
     listen, acts = Progress.__call__, [act]
 
     def listening(self: Progress, now: str, count: int, *rest: Any) -> None:
         listen(self, now, count, *rest)
-        if (now, count) == (stage, done) and acts:
+        if now == stage and count >= done and acts:
             acts.pop()()
 
     Progress.__call__ = listening  # type: ignore[method-assign]
 
 
 def signal_at(stage: str, done: int, number: int) -> None:
-    """Send a signal to this process when a stage reports `done` parts."""
+    """Send a signal to this process when a stage reports at least `done` parts."""
     _at_progress(stage, done, lambda: signal.raise_signal(number))
 
 
 def no_memory_at(stage: str, done: int) -> None:
-    """Raise MemoryError when a stage reports `done` parts."""
+    """Raise MemoryError when a stage reports at least `done` parts."""
 
     def act() -> None:
         raise MemoryError

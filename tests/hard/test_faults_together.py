@@ -169,7 +169,7 @@ PLACES = [
     ("encode paper", "fhash_codec.paper.training.checkpoint", "load_checkpoint"),
     ("encode paper", "fhash_codec.paper.training.train", "train"),
     ("encode paper", "fhash_codec.paper.encode", "write_tables"),
-    ("decode h5", "fhash_codec.volume", "Volume.read"),
+    ("decode h5", "fhash_codec.volume", "Volume.read_steps"),
     ("decode h5", "fhash_formats.writers.hdf5", "_create"),
     ("decode zarr", "fhash_formats.writers.zarr_store", "_flush"),
     ("decode nc", "fhash_formats.container.reader", "Container.open"),
