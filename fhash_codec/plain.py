@@ -29,6 +29,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.container.named import ARRAY, DIMENSIONS
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
@@ -94,7 +95,11 @@ class _Export:
     def __init__(self, volume: Volume, writer: ContainerWriter, progress: Progress) -> None:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
-        self._header = dict(volume.container.header)
+        header = volume.container.header
+        # Levels of plain tables have no names in the source.
+        self._header = {
+            name: value for name, value in header.items() if name not in (ARRAY, DIMENSIONS)
+        }
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:

@@ -18,8 +18,9 @@ from fhash_formats.container import StoredArray, coordinate_features, describe_c
 from fhash_formats.container.apart import HEAD_ARRAY, TABLE, place_head
 from fhash_formats.container.coding import CRC32C, HEAD, transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
+from fhash_formats.container.named import Names
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXIS_NAMES, Coordinate
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 from fhash_formats.transform.parts import FEATURE, head_parameters
 
 __all__ = ["GrowingFile"]
@@ -61,11 +62,13 @@ class GrowingFile:
         self._layers = self._nonzero = 0
         self._range: ValueRange | None = None
         self._container = GrowingContainer(path, force=force, continues=continues)
+        frame = tuple(coords[axis].values.size for axis in ("z", "y", "x"))
+        self._container.names = self._names(frame)
         head = coder.settings.head
         codec, *checks = transform_codecs(coder.settings)
         self._array = GrowingArray(
             name=TABLE,
-            frame=tuple(coords[axis].values.size for axis in ("z", "y", "x")),
+            frame=frame,
             dtype=coder.dtype,
             tile=coder.tile,
             codecs=[codec if head is None else place_head(codec), *checks],
@@ -139,6 +142,7 @@ class GrowingFile:
     def publish(self) -> None:
         """Make the file complete, with the layers so far."""
         mark = self._container.mark()
+        self._container.names = self._names(self._array.frame)
         self._container.describe(self._array, self.steps)
         coords = {**self._coords, "t": self._time()}
         described = describe_coordinates(coords)
@@ -151,6 +155,11 @@ class GrowingFile:
                     attributes={**coordinate.attributes, "name": coordinate.name},
                 )
         self._container.publish(self._full_header(described), mark)
+
+    def _names(self, frame: Sequence[int]) -> Names:
+        """The names of the arrays, which stay the same for any number of steps."""
+        coordinates = [self._coords[axis].name for axis in AXES]
+        return Names.of(self._header["variable"], coordinates, (self.steps, *frame))
 
     def _time(self) -> Coordinate:
         known = self._coords["t"]

@@ -77,17 +77,18 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
+    source = describe_source(series, selection.scanned.value_range, config)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,
             series,
             selection.scanned,
             selection.extent.key_frames,
+            variable=source["variable"],
             brief=True,
             everything=any(isinstance(feature, Everything) for feature in selection.features),
         )
     mark = writer.mark()
-    source = describe_source(series, selection.scanned.value_range, config)
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):

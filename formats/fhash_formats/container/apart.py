@@ -15,7 +15,15 @@ from fhash_formats.container.sharding import SHARDING
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.apart import without_names
 
-__all__ = ["HEAD_ARRAY", "MASK_ARRAY", "TABLE", "inline", "place_head", "place_masks"]
+__all__ = [
+    "HEAD_ARRAY",
+    "MASK_ARRAY",
+    "TABLE",
+    "inline",
+    "place_head",
+    "place_masks",
+    "transform_settings",
+]
 
 TABLE = "tables/level_1"
 """Array of the table."""
@@ -45,9 +53,9 @@ def inline(documents: Mapping[str, Document], chunk: Callable[[str], bytes]) -> 
         codec = _first(document.get("codecs")).get("name")
         if codec in (HEAD, MASK) and (name, codec) not in _PARTS.values():
             raise DamagedFileError(f"array {name} is coded by {codec} but belongs to no table")
-        if name != TABLE and without_names(_settings(document.get("codecs")))[1]:
+        if name != TABLE and without_names(transform_settings(document.get("codecs")))[1]:
             raise DamagedFileError(f"array {name} has no head or masks in other arrays")
-    settings = _settings(documents.get(TABLE, {}).get("codecs"))
+    settings = transform_settings(documents.get(TABLE, {}).get("codecs"))
     whole = without_names(settings)[0]
     replaced: dict[str, Any] = {}
     for key, (array, codec) in _PARTS.items():
@@ -95,8 +103,8 @@ def _first(codecs: object) -> Mapping[str, Any]:
     return first if isinstance(first, Mapping) else {}
 
 
-def _settings(codecs: object) -> Mapping[str, Any]:
-    """The configuration of `fhash.transform`; an empty one for other codecs."""
+def transform_settings(codecs: object) -> Mapping[str, Any]:
+    """The configuration of `fhash.transform`, in shards or not; an empty one for other codecs."""
     first = _first(codecs)
     configuration = first.get("configuration")
     is_transform = first.get("name") == TRANSFORM and isinstance(configuration, Mapping)

@@ -19,7 +19,7 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.support.number_types import DTYPES
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 7)
+FORMAT_VERSION = (1, 8)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -37,6 +37,7 @@ KNOWN_FEATURES = frozenset(
         "labels",
         "many-labels",
         "mask",
+        "named",
         "predictor",
         SPARSE_FEATURE,
         "trellis",
