@@ -15,13 +15,12 @@ from fhash_codec.appending.layers import CodedLayer, LayerCoder
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import StoredArray, coordinate_features, describe_coordinates
-from fhash_formats.container.apart import HEAD_ARRAY, TABLE, place_head
-from fhash_formats.container.coding import CRC32C, HEAD, transform_codecs
+from fhash_formats.container.apart import TABLE
+from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
 from fhash_formats.container.named import Names
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
-from fhash_formats.transform.parts import FEATURE, head_parameters
 
 __all__ = ["GrowingFile"]
 
@@ -64,14 +63,12 @@ class GrowingFile:
         self._container = GrowingContainer(path, force=force, continues=continues)
         frame = tuple(coords[axis].values.size for axis in ("z", "y", "x"))
         self._container.names = self._names(frame)
-        head = coder.settings.head
-        codec, *checks = transform_codecs(coder.settings)
         self._array = GrowingArray(
             name=TABLE,
             frame=frame,
             dtype=coder.dtype,
             tile=coder.tile,
-            codecs=[codec if head is None else place_head(codec), *checks],
+            codecs=transform_codecs(coder.settings),
         )
 
     def __enter__(self) -> GrowingFile:
@@ -130,8 +127,6 @@ class GrowingFile:
                 f"{self.path} has {len(self._times)} steps; a file has at most {MAX_STEPS}: "
                 "begin another"
             )
-        if not self._layers:
-            self._write_head()
         self._container.add_layer(self._array, self._layers, streams)
         self._layers += 1
         self._times.extend(times)
@@ -166,31 +161,13 @@ class GrowingFile:
         values = np.array(self._times, dtype=np.float64)
         return Coordinate(name=known.name, values=values, attributes=known.attributes)
 
-    def _write_head(self) -> None:
-        """Write the head of the tiles, which lies in an array of its own."""
-        head = self.coder.settings.head
-        if head is None:
-            return
-        packed = head.to_bytes()
-        shape = head_parameters(packed).shape
-        self._container.add_array(
-            HEAD_ARRAY,
-            shape=shape,
-            dtype=np.float32,
-            chunk_shape=shape,
-            chunks=[packed],
-            codecs=[{"name": HEAD}, CRC32C],
-        )
-
     def _full_header(self, described: Mapping[str, Any]) -> dict[str, Any]:
         """The header of the file as it is now. described: the positions that it tells."""
         assert self._range is not None
         settings = self.coder.settings
         shape = [self.steps, *self._array.frame]
-        weights = 0
-        if settings.head is not None:
-            weights = sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
-        features = ["transform", *([] if settings.head is None else [FEATURE]), *settings.features]
+        weights = 0 if settings.head is None else settings.head.size
+        features = ["transform", *settings.features]
         header = {
             **self._header,
             "required_features": features + coordinate_features(described),

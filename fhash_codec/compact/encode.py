@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -93,9 +92,6 @@ def encode_compact(
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
         parts = table.parts
-        if writer.one_of_several:
-            # A library that shows the array decodes it by what the array itself says.
-            parts = replace(parts, apart=False)
         with stage("writing", "tiles"):
             parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None

@@ -48,6 +48,7 @@ class Hierarchy:
         header: attribute "fhash" of the root, checked by `validate_header`.
         arrays: metadata by name of the array; by path in a file of several variables.
         chunks: members by the same name, and index of the chunk.
+        paths: by the same name.
         variables: of a file of several; none in others.
         attributes: of the root beside the header.
     """
@@ -55,6 +56,7 @@ class Hierarchy:
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
     chunks: dict[str, dict[tuple[int, ...], Member]]
+    paths: Mapping[str, str]
     variables: tuple[VariablePlaces, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -107,6 +109,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
             header=header,
             arrays={name: arrays[path] for name, path in paths.items()},
             chunks={name: chunks[path] for name, path in paths.items()},
+            paths=paths,
             attributes=attributes,
         )
     variables, others = read_variables(header, documents.keys())
@@ -119,6 +122,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
         header=header,
         arrays={name: arrays[name] for name in documents},
         chunks=_place_chunks(arrays, chunk_members),
+        paths={name: name for name in documents},
         variables=tuple(variables),
         attributes=attributes,
     )

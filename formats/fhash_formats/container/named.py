@@ -32,8 +32,10 @@ __all__ = [
 
 FEATURE = "named"
 """Feature of files whose table and coordinates have the names of the source."""
-ARRAY, DIMENSIONS = "array", "dimensions"
-"""Keys of the header: path of the table, and names of its axes."""
+ARRAY = "array"
+"""Key of the header: path of the table."""
+DIMENSIONS = "dimensions"
+"""Key of the header: names of its axes."""
 SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
 """Attributes of a variable that its array has for libraries that show it."""
 TAKEN = (

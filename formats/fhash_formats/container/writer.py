@@ -232,6 +232,8 @@ class ContainerWriter:
             dimension_names, attributes = self.names.axes(shape), self.names.attributes
         elif name.startswith("coords/") and self.names is not None:
             dimension_names = [self.names.path(name)]
+        elif name == "key_frames" and self.names is not None:
+            dimension_names = [name]
         try:
             metadata = ArrayMetadata(
                 shape=tuple(int(n) for n in shape),

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container import ContainerWriter
 from fhash_formats.container.named import ARRAY, DIMENSIONS, Names, paths_of, shows_values
 from fhash_formats.errors import DamagedFileError
 
@@ -93,7 +92,7 @@ def test_arrays_lie_at_their_names_and_are_read_by_those_of_the_format(
 )
 def test_names_that_are_not_allowed_are_damage(change: dict[str, Any]) -> None:
     header = {"required_features": ["named"], **names().header(), **change}
-    with pytest.raises(DamagedFileError, match="array|dimensions"):
+    with pytest.raises(DamagedFileError, match=r"array|dimensions"):
         paths_of(header, ["u"])
 
 
