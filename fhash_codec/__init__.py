@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume
+    from fhash_codec.zarr_chunks.pack import pack
+    from fhash_codec.zarr_chunks.unpack import unpack
     from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
@@ -65,7 +67,9 @@ _MODULES = {
     "export_plain": "plain",
     "merge": "appending.merging",
     "open": "dataset",
+    "pack": "zarr_chunks.pack",
     "render": "rendering",
+    "unpack": "zarr_chunks.unpack",
     "zarr_store": "zarr_view.store",
 }
 """Public names that load on first use, with their modules in this package."""
@@ -97,7 +101,9 @@ __all__ = [
     "export_plain",
     "merge",
     "open",
+    "pack",
     "render",
+    "unpack",
     "zarr_store",
 ]
 

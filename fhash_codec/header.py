@@ -116,7 +116,7 @@ def write_series(
         return {"coordinates": described} if brief else {}
     if brief and everything and len(key_frames) == series.shape[0]:
         return {"coordinates": described, "missing": OUTSIDE}
-    _write_missing(writer, series.shape, scanned)
+    write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
 
 
@@ -134,7 +134,7 @@ def _storable(coordinate: Coordinate) -> Coordinate:
     )
 
 
-def _write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
+def write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
     """Write one row of bits per step, 1 = not finite, several rows to a chunk."""
     steps = shape[0]
     empty = np.zeros(-(-prod(shape[1:]) // 8), dtype=np.uint8)

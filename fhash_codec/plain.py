@@ -241,10 +241,11 @@ class _Export:
             dimension_names=TABLE_AXES[: 4 + len(extra)],
         )
 
-    @staticmethod
-    def _table(array: StoredArray, index: Index) -> npt.NDArray[Any]:
+    def _table(self, array: StoredArray, index: Index) -> npt.NDArray[Any]:
         region = chunk_region(index, array.chunk_shape, array.shape)
-        return array.decode_table(index)[tuple(slice(0, a.stop - a.start) for a in region)]
+        table = array.decode_table(index)[tuple(slice(0, a.stop - a.start) for a in region)]
+        # Tiles with settings of their own may each have another working type.
+        return table.astype(self._volume.tables[0].dtype, copy=False)
 
     def _write_axes(self) -> None:
         """Write positions and key frames as arrays, and arrays of the source beside the values."""
@@ -326,6 +327,8 @@ class _Export:
             region = tuple(slice(0, n) for n in table.shape)
             values = array.decode_chunk(index)[region]
             correction = correction_of(values, predicted(table, head, array.dtype))
+            if values.dtype.kind == "f":
+                correction[np.isnan(values)] = 0
             if array.masked:
                 region = chunk_region(index, array.chunk_shape, array.shape)
                 correction[~array.read_mask(region)] = 0

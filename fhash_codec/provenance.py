@@ -15,7 +15,21 @@ from fhash_formats.container import SOURCE, Container, describe_metadata, read_m
 from fhash_formats.series import AXES, Coordinate, Series
 from fhash_formats.source_metadata import SourceMetadata, with_history
 
-__all__ = ["date_of", "history_line", "metadata_of", "source_parts"]
+__all__ = [
+    "PACKED",
+    "date_of",
+    "figure_attributes",
+    "history_line",
+    "metadata_of",
+    "source_attributes",
+    "source_parts",
+]
+
+PACKED = "pack"
+"""Command in the header's `encoder` of a file whose tiles come from a Zarr store."""
+
+FIGURES = {"fhash_max_error": "max_abs_error", "fhash_psnr": "psnr"}
+"""Attributes of a variable that say how well the file holds it, and their names in its header."""
 
 MAX_OPTION = 80
 """Letters of the value of an option in a line of the history; a longer one is cut."""
@@ -44,6 +58,18 @@ def date_of(config: EncodeConfig) -> dict[str, str]:
     return {"date": f"{now.isoformat()}Z"} if config.timings else {}
 
 
+def figure_attributes(header: Mapping[str, Any]) -> dict[str, float]:
+    """Attributes of a variable that say how well the file holds it, as far as it tells."""
+    found = {key: header["quality"].get(name) for key, name in FIGURES.items()}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def source_attributes(metadata: SourceMetadata) -> dict[str, str]:
+    """Attributes of a file that name its source and the digest of it, as far as they are known."""
+    named = {"fhash_source": metadata.file, "fhash_source_digest": metadata.digest}
+    return {key: text for key, text in named.items() if text}
+
+
 def metadata_of(container: Container, coords: Mapping[str, Coordinate]) -> SourceMetadata | None:
     """The source as a container tells it, with a line of history for the encoding.
 
@@ -65,8 +91,11 @@ def history_line(header: Mapping[str, Any]) -> str:
     source = header.get(SOURCE, {})
     date = f"{source['date']} " if isinstance(source.get("date"), str) else ""
     name = f" {source['file']}" if isinstance(source.get("file"), str) else ""
+    begun = f"{date}fhash {header['encoder']['version']}: fhash"
+    if header["encoder"].get("command") == PACKED:
+        return f"{begun} pack{name}"
     words = "".join(f" {word}" for word in _options(header))
-    return f"{date}fhash {header['encoder']['version']}: fhash encode{name}{words}"
+    return f"{begun} encode{name}{words}"
 
 
 def _options(header: Mapping[str, Any]) -> list[str]:

@@ -25,7 +25,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.labelled import labelled_series
 from fhash_codec.encoding import encode
 from fhash_codec.lazy_array import FhashArray, Form
-from fhash_codec.provenance import history_line
+from fhash_codec.provenance import figure_attributes, history_line, source_attributes
 from fhash_codec.shared_volumes import acquire, place_of
 from fhash_codec.value_type import holds
 from fhash_codec.volume import OUTSIDE, Volume
@@ -42,8 +42,6 @@ FILLS = ("_FillValue", "missing_value")
 """Attributes that say which number stands for a missing value."""
 VALID = ("valid_min", "valid_max", "valid_range")
 """Attributes that xarray leaves where they are."""
-FIGURES = {"fhash_max_error": "max_abs_error", "fhash_psnr": "psnr"}
-"""Attributes of a variable that say how well the file holds it, and their names in its header."""
 
 
 class FhashBackend(BackendEntrypoint):
@@ -169,8 +167,7 @@ class Shown:
         metadata, volume = self._metadata, self._volume
         if metadata is None:
             return with_history({}, history_line(volume.container.header))
-        named = {"fhash_source": metadata.file, "fhash_source_digest": metadata.digest}
-        return {**metadata.attributes, **{key: text for key, text in named.items() if text}}
+        return {**metadata.attributes, **source_attributes(metadata)}
 
     def packing(self) -> dict[str, Any]:
         """The packing of the source, for `encoding`.
@@ -225,9 +222,7 @@ class Shown:
                 found[FILLS[0]] = volume.dtype.type(fill)
         if self.form.lod is not None:
             return found  # the figures are those of all vertices
-        quality = volume.container.header["quality"]
-        figures = {key: quality.get(name) for key, name in FIGURES.items()}
-        return found | {key: value for key, value in figures.items() if value is not None}
+        return found | figure_attributes(volume.container.header)
 
 
 def _invented(volume: Volume) -> dict[str, str]:

@@ -29,7 +29,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("writers",),
     ),
     "fhash_formats.transform": (
-        ("apart", "values"),
+        ("apart", "array_axes", "values"),
         ("entropy",),
         ("axes", "head"),
         ("tile",),
@@ -57,6 +57,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("lazy_array",),
         ("encoding",),
         ("appending", "dataset_encoding", "plain", "xarray_backend"),
+        ("zarr_chunks",),
         ("selftest",),
         ("bench",),
         ("cost",),

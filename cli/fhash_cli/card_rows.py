@@ -75,6 +75,8 @@ def _tables(
     numbers = f"{levels[0]['shape'][4]} at each {vertex}, {levels[0]['dtype']}"
     paths = stored[0]["path"] + (f" to {stored[-1]['path']}" if len(stored) > 1 else "")
     parameters = f"{model['parameters']:,} parameters in the model"
+    if not model["parameters"]:
+        parameters = "parameters were not counted"
     where = f"{paths}, {stored[0]['coding']}, {size(total)}"
     rows = [("tables", f"{first}; {numbers}; {where}; {parameters}")]
     if verbose:

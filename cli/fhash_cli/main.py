@@ -26,6 +26,8 @@ COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
     "merge": "join the parts that `fhash encode --part` wrote",
     "append": "code further steps behind those of RUN.fhz",
+    "pack": "make RUN.fhz of coded Zarr arrays, without coding again",
+    "unpack": "make coded Zarr arrays of RUN.fhz, without coding again",
     "decode": "rebuild a region of RUN.fhz, at any time",
     "render": "draw a picture of RUN.fhz",
     "info": "say what RUN.fhz holds and how good it is",

@@ -63,7 +63,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     for step, frame in enumerate(series.frames()):
         count = 0
         for piece in pieces(frame):
-            piece_count, piece_low, piece_high = _scan_piece(piece, mean)
+            piece_count, piece_low, piece_high = scan_piece(piece, mean)
             extremes.add(piece, piece_count, piece_low, piece_high)
             if ranks is not None:
                 ranks.add(piece)
@@ -91,7 +91,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     )
 
 
-def _scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
+def scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
     """Number, minimum and maximum of the finite values of a piece; they are added to the mean."""
     if piece.dtype.kind != "f":
         mean.add(piece)

@@ -209,6 +209,14 @@ def test_merge(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     check("merge", parsed(fhash("merge", *parts, "-o", tmp_path / "a.fhz", "--json", "-q")))
 
 
+def test_pack_and_unpack(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    run, store = tmp_path / "run.fhz", tmp_path / "run.zarr"
+    assert fhash("encode", data, "-o", run, "--max-error", "0.1", "--effort", "1").exit_code == 0
+    check("unpack", parsed(fhash("unpack", run, "-o", store, "--json", "-q")))
+    words = ["pack", store, "-o", run, "--force", "--json", "-q"]
+    check("pack", parsed(fhash(*words)))
+
+
 def test_render(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     words = ["render", run, "--size", "16x16", "--json", "-q", "-o", tmp_path / "a.png"]
     check(

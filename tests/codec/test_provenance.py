@@ -13,9 +13,10 @@ from cf_files import KINDS, Kind, smooth
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.provenance import history_line
+from fhash_codec.provenance import figure_attributes, history_line, source_attributes
 from fhash_formats import open_series
 from fhash_formats.series import ArraySeries
+from fhash_formats.source_metadata import SourceMetadata
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
 PAPER = EncodeConfig(profile="paper", epochs=1, width=8, timings=False)
@@ -110,3 +111,20 @@ def test_a_foreign_header_has_a_line_as_well() -> None:
         "config": {"profile": "paper", "timings": False, "other": 1, "features": ["all"]},
     }
     assert history_line(header) == "fhash 9: fhash encode --profile paper --no-timings"
+
+
+def test_a_file_of_copied_tiles_says_that_it_was_packed() -> None:
+    header = {
+        "encoder": {"version": "0.9", "seed": 0, "command": "pack"},
+        "source": {"file": "run.zarr", "date": "2026-01-02T03:04:05Z"},
+        "config": {"max_error": 0.5},
+        "model": {"profile": "compact"},
+    }
+    assert history_line(header) == "2026-01-02T03:04:05Z fhash 0.9: fhash pack run.zarr"
+
+
+def test_attributes_tell_what_the_file_knows() -> None:
+    assert figure_attributes({"quality": {}}) == {}
+    known = {"quality": {"max_abs_error": 0.5, "psnr": None}}
+    assert figure_attributes(known) == {"fhash_max_error": 0.5}
+    assert source_attributes(SourceMetadata(dimensions={}, file="a.nc")) == {"fhash_source": "a.nc"}

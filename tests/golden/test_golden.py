@@ -37,6 +37,7 @@ COMPACT = [
     "compact-1.5-signs",
     "compact-1.5-trellis",
     "compact-1.7-source",
+    "compact-1.8-axes",
 ]
 NAMES = [
     "paper-1.0-plain",

@@ -16,7 +16,15 @@ from fhash_formats.container.sharding import SHARDING
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.apart import without_names
 
-__all__ = ["HEAD_ARRAY", "MASK_ARRAY", "TABLE", "inline", "transform_settings", "with_settings"]
+__all__ = [
+    "HEAD_ARRAY",
+    "MASK_ARRAY",
+    "TABLE",
+    "inline",
+    "is_transform",
+    "transform_settings",
+    "with_settings",
+]
 
 TABLE = "tables/level_1"
 """Array of the table."""
@@ -89,8 +97,14 @@ def transform_settings(codecs: object) -> Mapping[str, Any]:
     """The configuration of `fhash.transform`, in shards or not; an empty one for other codecs."""
     first = _first(codecs)
     configuration = first.get("configuration")
-    is_transform = first.get("name") == TRANSFORM and isinstance(configuration, Mapping)
-    return configuration if is_transform and isinstance(configuration, Mapping) else {}
+    if not is_transform(codecs) or not isinstance(configuration, Mapping):
+        return {}
+    return configuration
+
+
+def is_transform(codecs: object) -> bool:
+    """Whether `fhash.transform` codes an array, in shards or not."""
+    return _first(codecs).get("name") == TRANSFORM
 
 
 def with_settings(codecs: Sequence[Codec], settings: Mapping[str, Any]) -> list[Codec]:

@@ -205,6 +205,11 @@ class CheckedCoder:
         """Settings that all chunks share, of a coder that has some (`TileSettings`); else None."""
         return getattr(self._coder, "settings", None)
 
+    @property
+    def axes(self) -> Any:
+        """Axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones."""
+        return getattr(self._coder, "axes", None)
+
     def decode_table(
         self, data: memoryview, lod: int = 0, mask: memoryview | None = None
     ) -> npt.NDArray[Any]:

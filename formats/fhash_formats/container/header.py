@@ -22,6 +22,8 @@ FORMAT = "fhash"
 FORMAT_VERSION = (1, 8)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
+AXES_FEATURE = "axes"
+"""Feature of tables whose tiles are coded along other axes than (t, z, y, x)."""
 PLAIN_FEATURE = "plain"
 """Feature of a file of the profile compact whose tables are plain numbers."""
 KNOWN_FEATURES = frozenset(
@@ -29,6 +31,7 @@ KNOWN_FEATURES = frozenset(
         TRANSFORM_FEATURE,
         PLAIN_FEATURE,
         "apart",
+        AXES_FEATURE,
         "clip",
         "coded-occupancy",
         "coder-linear",
@@ -162,6 +165,10 @@ def _check_source(top: Record) -> np.dtype[Any]:
     encoder.integer("seed", -(2**63), 2**64 - 1)
     encoder.number_or_null("seconds")
     encoder.number_or_null("took_seconds")
+    if encoder.has("command"):
+        encoder.text("command")
+    if encoder.has("codec"):
+        encoder.record("codec")
     if encoder.has("predicted"):
         predicted = encoder.record("predicted")
         for figure in ("seconds", "bytes", "psnr"):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.container.apart import TABLE, transform_settings
+from fhash_formats.container.apart import TABLE, is_transform, transform_settings
 from fhash_formats.container.coding import Codec
 from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.record import Record
@@ -59,8 +59,10 @@ def shows_values(dtype: np.dtype[Any], codecs: Sequence[Codec]) -> bool:
     a number that looks like one.
     """
     settings = transform_settings(codecs)
-    masked_integers = dtype.kind in "iu" and "mask" in settings
-    return bool(settings) and not without_names(settings)[1] and not masked_integers
+    if not is_transform(codecs) or without_names(settings)[1]:
+        return False
+    # Tiles with settings of their own may have masks of which the codec says nothing.
+    return dtype.kind == "f" or ("step" in settings and "mask" not in settings)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -177,6 +177,11 @@ class StoredArray:
         return self._metadata.coder.settings
 
     @property
+    def axes(self) -> Any:
+        """Axes of tiles along which the array is coded; None for the usual ones."""
+        return self._metadata.coder.axes
+
+    @property
     def coding(self) -> str:
         """Name of the first codec, that of inner chunks where there are shards."""
         return self._metadata.coding

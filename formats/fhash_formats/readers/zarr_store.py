@@ -54,10 +54,10 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
     is undone (cf_packing.py). Consolidated metadata is ignored: an outdated copy would hide
     appended steps.
     """
-    store, found = _open_tree(path, request)
+    store, found = open_tree(path, request)
     try:
         with refusing(f"{path} cannot be read as zarr"):
-            return _series(found.root, store, found)
+            return series_in(found.root, store, found)
     except BaseException:
         store.close()
         raise
@@ -65,7 +65,7 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
 
 def list_zarr(path: Path, request: Request) -> list[Listed]:
     """The variables of a zarr hierarchy."""
-    store, found = _open_tree(path, replace(request, raw_values=False))
+    store, found = open_tree(path, replace(request, raw_values=False))
     try:
         with refusing(f"{path} cannot be read as zarr"):
             return listing(found.source, found.variables, found.dimensions, request, found.packing)
@@ -73,8 +73,8 @@ def list_zarr(path: Path, request: Request) -> list[Listed]:
         store.close()
 
 
-def _open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
-    """The store at a path, open, and what is in it."""
+def open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
+    """The store at a path, open, and what is in it. Raises InputError."""
     from zarr.storage import LocalStore, ZipStore
 
     source = str(path)
@@ -99,7 +99,7 @@ def _open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
             if alone and metadata_of(place.parent) is not None:
                 # an array of a group, named by its folder: its coordinates are beside it
                 store.close()
-                return _open_tree(place.parent, replace(request, var=place.name))
+                return open_tree(place.parent, replace(request, var=place.name))
             return store, ZarrTree(path, arrays, groups, failed, request)
     except BaseException:
         store.close()
@@ -216,7 +216,8 @@ def _dimension(columns: Sequence[Mapping[str, Column]], name: str | None, length
     return Dimension(name=name, length=length, role=role, column=fitting)
 
 
-def _series(root: Path, store: Any, found: ZarrTree) -> FileSeries:
+def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
+    """The series of the wanted variable of an open hierarchy, which closes its store."""
     request = found.request
     variable = choose(
         found.source,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.transform.apart import apart_message, without_names
+from fhash_formats.transform.array_axes import KEY, TILE_AXES, take_axes
 from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
@@ -36,6 +37,7 @@ class TransformCoder:
         parted: whether a part of a chunk may be had sooner than all of it.
         apart: arrays that hold the head or the masks. Such a coder does not decode; a container
             gives its coder these parts.
+        axes: axis of the tile for each axis of a chunk; None for the last ones of t, z, y, x.
     """
 
     def __init__(
@@ -64,19 +66,23 @@ class TransformCoder:
                 f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}"
             )
         configuration, self.apart = without_names(codecs[0].get("configuration", {}))
+        t, z, y, x = (1,) * (4 - len(shape)) + shape
+        self._tile_shape: Shape = (t, z, y, x)
         try:
+            configuration, self.axes = take_axes(configuration)
             self.settings = (
                 TileSettings.from_dict(configuration) if "transform" in configuration else None
             )
+            if self.axes is not None:
+                self._tile_shape = self.axes.tile_shape(shape)
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
-        self.features = () if self.settings is None else self.settings.features
+        own = () if self.settings is None else self.settings.features
+        self.features = own if self.axes is None else (*own, KEY)
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
-        t, z, y, x = (1,) * (4 - len(shape)) + shape
-        self._tile_shape: Shape = (t, z, y, x)
         has_head = self.settings is not None and self.settings.head is not None
-        self.parted = has_head and not self.masked and len(shape) == 4
+        self.parted = has_head and not self.masked and len(shape) == 4 and self.axes is None
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk."""
@@ -85,6 +91,8 @@ class TransformCoder:
                 "fhash.transform without settings only decodes here; "
                 "fhash_formats.transform.zarr_codec chooses them"
             )
+        if self.axes is not None:
+            return encode_tile(self.axes.to_tile(chunk), self.settings).data
         return encode_tile(chunk.reshape(self._tile_shape), self.settings).data
 
     def decode(self, data: memoryview | bytes, lod: int = 0) -> npt.NDArray[Any]:
@@ -92,18 +100,14 @@ class TransformCoder:
 
         Raises DamagedFileError.
         """
-        self._check_complete()
-        values = decode_tile(data, self._tile_shape, self._dtype, self.settings, lod)
-        return values.reshape(values.shape[4 - len(self._shape) :])
+        return self._decoded(decode_tile, data, lod)
 
     def decode_table(self, data: memoryview | bytes, lod: int = 0) -> npt.NDArray[Any]:
         """The table of the full chunk, see `decode_tile_table`; `lod` as in `decode`.
 
         Raises DamagedFileError.
         """
-        self._check_complete()
-        values = decode_tile_table(data, self._tile_shape, self._dtype, self.settings, lod)
-        return values.reshape(values.shape[4 - len(self._shape) :])
+        return self._decoded(decode_tile_table, data, lod)
 
     def uncorrected(
         self, data: memoryview | bytes, part: tuple[slice, ...]
@@ -131,7 +135,27 @@ class TransformCoder:
         """The full chunk, and which of its values are occupied. Raises DamagedFileError."""
         self._check_complete()
         values, mask = decode_tile_mask(data, self._tile_shape, self._dtype, self.settings)
+        if self.axes is not None:
+            return self.axes.from_tile(values), self.axes.from_tile(mask)
         return values.reshape(self._shape), mask.reshape(self._shape)
+
+    def _decoded(
+        self, decode: Callable[..., npt.NDArray[Any]], data: memoryview | bytes, lod: int
+    ) -> npt.NDArray[Any]:
+        """The chunk of what `decode` makes of a tile at a level of detail.
+
+        Tiles have less detail along their own z, y and x. Where one of these is the first axis of
+        the array, along which a level of detail has every position, all of the tile is decoded.
+        """
+        self._check_complete()
+        whole = self.axes is not None and self.axes.names[0] != TILE_AXES[0]
+        level = 0 if whole else lod
+        values = decode(data, self._tile_shape, self._dtype, self.settings, level)
+        if self.axes is None:
+            return values.reshape(values.shape[4 - len(self._shape) :])
+        chunk = self.axes.from_tile(values)
+        every = slice(None, None, 1 << lod)
+        return chunk[..., every, every, every] if whole and lod else chunk
 
     def _check_complete(self) -> None:
         """Raise InputError where a head or masks are missing, so that no wrong value comes out."""

@@ -18,7 +18,7 @@ value, since it takes no part in the range and hardly any bytes.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -27,6 +27,7 @@ from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
 from fhash_formats.transform.apart import apart_message, without_names
+from fhash_formats.transform.array_axes import KEY, ArrayAxes, take_axes
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
 from fhash_formats.transform.tile.decoding import decode_tile
@@ -64,6 +65,9 @@ class TransformCodec(ArrayBytesCodec):
             whose configuration is empty.
         apart: a configuration that names arrays of the container for its head or masks. Such a
             codec shows its array, but raises InputError when values are asked for.
+        axes: for each axis of the array, the axis "t", "z", "y" or "x" of its tiles, or "" for one
+            along which chunks have length 1. By default the last four axes are these, and those
+            before them are taken together with t.
 
     Raises InputError for other combinations.
     """
@@ -77,8 +81,11 @@ class TransformCodec(ArrayBytesCodec):
     settings: TileSettings | None = None
     reading: bool = False
     apart: Mapping[str, Any] | None = None
+    axes: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
+        if self.axes is not None:
+            object.__setattr__(self, "axes", ArrayAxes.of(self.axes).names)
         if self.apart is not None:
             TileSettings.from_dict(without_names(self.apart)[0])
         elif self.settings is None and not self.reading:
@@ -100,18 +107,20 @@ class TransformCodec(ArrayBytesCodec):
             raise InputError(
                 f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}"
             )
+        configuration, given = take_axes(configuration)
+        axes = None if given is None else given.names
         if without_names(configuration)[1]:
-            return cls(apart=configuration)
+            return cls(apart=configuration, axes=axes)
         if "center" in configuration:
-            return cls(settings=TileSettings.from_dict(configuration))
+            return cls(settings=TileSettings.from_dict(configuration), axes=axes)
         if not configuration:
-            return cls(reading=True)
+            return cls(reading=True, axes=axes)
         keys = ("max_error", "max_error_rel", "step", "transform")
         unknown = [key for key in configuration if key not in keys]
         if unknown:
             raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(keys)}")
         values: dict[str, Any] = dict(configuration)
-        return cls(**values)
+        return cls(**values, axes=axes)
 
     def to_dict(self) -> dict[str, JSON]:
         """The inverse of `from_dict`."""
@@ -129,6 +138,8 @@ class TransformCodec(ArrayBytesCodec):
             configuration = {**quality.to_dict()}
             if isinstance(self.transform, TransformSpec):
                 configuration["transform"] = self.transform.to_dict()
+        if self.axes is not None:
+            configuration[KEY] = list(self.axes)
         return {"name": NAME, "configuration": configuration}
 
     def validate(
@@ -138,8 +149,10 @@ class TransformCodec(ArrayBytesCodec):
         dtype: ZDType[TBaseDType, TBaseScalar],
         chunk_grid: ChunkGrid,
     ) -> None:
-        """Raises InputError for a type that is not coded."""
+        """Raises InputError for a type that is not coded, and for axes of another array."""
         supported(dtype.to_native_dtype())
+        if self.axes is not None and len(self.axes) != len(shape):
+            raise InputError(f"{NAME}: axes {list(self.axes)} of an array with {len(shape)} axes")
 
     def __repr__(self) -> str:
         """One line: the settings of tiles hold a base64 text of all weights of a head."""
@@ -175,6 +188,8 @@ class TransformCodec(ArrayBytesCodec):
                 "give max_error, max_error_rel or step to write"
             )
         values = np.asarray(chunk_array.as_ndarray_like())
+        if self.axes is not None:
+            values = ArrayAxes.of(self.axes).to_tile(values)
         if self.settings is None:
             data = encode_chunk(
                 values,
@@ -194,14 +209,14 @@ class TransformCodec(ArrayBytesCodec):
         self._check_complete()
         data, shape = chunk_data.to_bytes(), chunk_spec.shape
         dtype = chunk_spec.dtype.to_native_dtype()
+        axes = None if self.axes is None else ArrayAxes.of(self.axes)
+        tile = tile_shape(shape) if axes is None else axes.tile_shape(shape)
         if self.settings is None:
-            values = decode_chunk(data, shape, dtype)
+            values = decode_chunk(data, tile, dtype)
         else:
-            values = (
-                decode_tile(data, tile_shape(shape), supported(dtype), self.settings)
-                .reshape(shape)
-                .astype(dtype, copy=False)
-            )
+            values = decode_tile(data, tile, supported(dtype), self.settings)
+            values = values.astype(dtype, copy=False)
+        values = values.reshape(shape) if axes is None else axes.from_tile(values)
         return chunk_spec.prototype.nd_buffer.from_numpy_array(values)
 
     def _check_complete(self) -> None:

@@ -27,7 +27,7 @@ from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape,
 FILL = "_FillValue"
 
 
-def _flush(memory: dict[str, Any], folder: Path) -> None:
+def flush(memory: dict[str, Any], folder: Path) -> None:
     """Move the chunks that zarr wrote from memory to files."""
     while memory:
         key, buffer = memory.popitem()
@@ -51,7 +51,7 @@ def _attributes(region: Region, outline: Outline) -> dict[str, Any]:
     return attributes
 
 
-def _add(root: Any, beside: SourceVariable) -> None:
+def add_beside(root: Any, beside: SourceVariable) -> None:
     """Write an array beside the values."""
     values = beside.values
     if values.dtype.kind in "OU":
@@ -64,6 +64,16 @@ def _add(root: Any, beside: SourceVariable) -> None:
     root.create_array(
         beside.name, data=values, dimension_names=list(beside.dimensions), attributes=attributes
     )
+
+
+def consolidate(store: Any) -> None:
+    """Write the metadata of all arrays into those of the root, where xarray looks for them."""
+    import zarr
+
+    # that this is not yet in Zarr's specification; xarray warns where it is not there
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        zarr.consolidate_metadata(store)
 
 
 @contextmanager
@@ -82,7 +92,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         # types of texts are not yet in Zarr's specification
         warnings.simplefilter("ignore")
         for each in outline.variables:
-            _add(root, each)
+            add_beside(root, each)
     values = root.create_array(
         outline.name,
         shape=outline.shape,
@@ -95,16 +105,13 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
             "write_empty_chunks": True
         },  # a chunk that is missing is then always a fault, not a frame of fill values
     )
-    # that this is not yet in Zarr's specification; xarray looks for it and warns where it is not
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Consolidated metadata")
-        zarr.consolidate_metadata(store)
-    _flush(memory, folder)
+    consolidate(store)
+    flush(memory, folder)
 
     def put(step: int, frame: Frame) -> None:
         place, ordered = outline.place(step, frame)
         values[place] = ordered
-        _flush(memory, folder)
+        flush(memory, folder)
 
     yield put
 

@@ -117,3 +117,14 @@ def test_mean_neither_overflows_nor_drifts(parts, mean) -> None:
         total.add(np.array(part))
     assert total.count == sum(map(len, parts))
     assert math.isclose(total.value(), mean, rel_tol=1e-15)
+
+
+def test_means_of_parts_make_that_of_the_whole() -> None:
+    values = np.random.default_rng(2).normal(1e6, 3, 1000)
+    whole, parts = Mean(), Mean()
+    for part in np.split(values, [10, 10, 700]):
+        whole.add(part)
+        one = Mean()
+        one.add(part)
+        parts.include(one)
+    assert (parts.count, parts.value()) == (whole.count, whole.value())

@@ -58,6 +58,9 @@ def test_a_table_is_hidden_where_its_codec_lacks_something() -> None:
     assert not shows_values(floats, [apart])
     assert not shows_values(floats, [shards])
     assert not shows_values(floats, [{"name": "bytes"}])
+    own_settings = {"name": "fhash.transform"}
+    assert shows_values(floats, [own_settings])
+    assert not shows_values(integers, [own_settings])
     assert names().hidden().path("tables/level_1") == "tables/level_1"
     assert names().hidden().path("coords/x") == "lon"
 

@@ -68,3 +68,52 @@ def test_other_configurations_are_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         TransformCoder(codecs, FLOAT, shape)
+
+
+AXES = ("y", "x", "t", "z")
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, None])
+def test_a_chunk_is_coded_along_the_axes_that_are_named(settings: TileSettings | None) -> None:
+    order = ["tzyx".index(axis) for axis in AXES]
+    values = wave().transpose(order)
+    configuration = {**({} if settings is None else settings.to_dict()), "axes": list(AXES)}
+    named = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
+    coded = encode_tile(wave(), SETTINGS, Coding(own_settings=settings is None))
+    assert "axes" in named.features
+    assert not named.parted
+    assert same(named.decode(coded.data), coded.decoded.transpose(order))
+    if settings is not None:
+        assert named.encode(values) == coded.data
+
+
+def test_a_level_of_detail_keeps_every_position_along_the_first_axis() -> None:
+    plain, data = coder(SETTINGS), encode_tile(wave(), SETTINGS).data
+    time_first = {**SETTINGS.to_dict(), "axes": ["t", "x", "y", "z"]}
+    shape = tuple(wave().transpose(0, 3, 2, 1).shape)
+    named = TransformCoder([{"configuration": time_first}], FLOAT, shape)
+    assert same(named.decode(data, lod=1), plain.decode(data, lod=1).transpose(0, 3, 2, 1))
+    swapped = {**SETTINGS.to_dict(), "axes": ["z", "t", "y", "x"]}
+    shape = tuple(wave().transpose(1, 0, 2, 3).shape)
+    named = TransformCoder([{"configuration": swapped}], FLOAT, shape)
+    everything = plain.decode(data).transpose(1, 0, 2, 3)
+    assert same(named.decode(data, lod=1), everything[:, ::2, ::2, ::2])
+
+
+def test_axes_come_with_masks() -> None:
+    settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
+    configuration = {**settings.to_dict(), "axes": ["x", "z", "y", "t"]}
+    shape = tuple(wave().transpose(3, 1, 2, 0).shape)
+    named = TransformCoder([{"configuration": configuration}], FLOAT, shape)
+    coded = encode_tile(wave(), settings, in_coreset=occupied)
+    values, mask = named.decode_masked(coded.data)
+    assert same(values, coded.decoded.transpose(3, 1, 2, 0))
+    assert np.array_equal(mask, occupied.transpose(3, 1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    "axes", [["t", "z", "y"], ["t", "t", "y", "x"], "tzyx", ["", "z", "y", "x"]]
+)
+def test_axes_that_do_not_fit_are_damage(axes: object) -> None:
+    with pytest.raises(DamagedFileError, match=r"axes|chunks"):
+        TransformCoder([{"configuration": {"axes": axes}}], FLOAT, SHAPE)

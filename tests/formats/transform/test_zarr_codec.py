@@ -16,6 +16,7 @@ from specs import spec_of
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
@@ -214,3 +215,35 @@ def test_a_codec_is_shown_in_one_short_line() -> None:
         (TransformCodec(apart=head), "TransformCodec(step=0.05, head=True)"),
     ):
         assert repr(codec) == shown
+
+
+@pytest.mark.parametrize(
+    "codec",
+    [
+        TransformCodec(max_error=0.01, axes=("t", "y", "x")),
+        TransformCodec(settings=SHARED, axes=("t", "y", "x")),
+        TransformCodec(reading=True, axes=["t", "y", "x"]),
+    ],
+    ids=["quality", "settings", "reading"],
+)
+def test_axes_stand_in_the_metadata(codec: TransformCodec) -> None:
+    document = json.loads(json.dumps(codec.to_dict()))
+    assert document["configuration"]["axes"] == ["t", "y", "x"]
+    assert TransformCodec.from_dict(document).to_dict() == codec.to_dict()
+
+
+def test_an_array_is_coded_along_the_axes_that_are_named(tmp_path: Path) -> None:
+    values = field((6, 9, 12))
+    codec = TransformCodec(max_error=0.01, axes=("t", "y", "x"))
+    create(tmp_path / "a.zarr", values, (3, 9, 6), serializer=codec)
+    assert np.abs(zarr.open_array(tmp_path / "a.zarr", mode="r")[...] - values).max() <= 0.01
+    tile = np.ascontiguousarray(values[:3, :, :6])[:, None]
+    assert (tmp_path / "a.zarr" / "c" / "0" / "0" / "0").read_bytes() == encode_chunk(
+        tile, max_error=0.01
+    )
+
+
+def test_axes_of_another_array_are_refused(tmp_path: Path) -> None:
+    codec = TransformCodec(max_error=0.01, axes=("t", "x"))
+    with pytest.raises(InputError, match="with 3 axes"):
+        create(tmp_path / "a.zarr", field((6, 9, 12)), (3, 9, 6), serializer=codec)
