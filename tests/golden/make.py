@@ -12,9 +12,10 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from grouped import WRITERS
 
 import fhash_codec
-from fhash_codec import EncodeConfig, encoding
+from fhash_codec import Dataset, EncodeConfig, encoding
 from fhash_codec.compact import encode as compact
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_formats.series import ArraySeries, Coordinate
@@ -303,7 +304,9 @@ SERIES = {
 
 def make(name: str, path: Path) -> None:
     """Write a golden; those of PLAIN are made last, since each is made of another one."""
-    if name in PLAIN:
+    if name in WRITERS:
+        WRITERS[name](path)
+    elif name in PLAIN:
         fhash_codec.export_plain(HERE / f"{PLAIN[name]}.fhz", path)
     elif name.endswith(("-head", "-cross")):
         encode_with_head(name, path, GOLDENS[name])
@@ -312,16 +315,19 @@ def make(name: str, path: Path) -> None:
 
 
 def main() -> None:
-    for name in (*GOLDENS, *PLAIN):
+    for name in (*GOLDENS, *PLAIN, *WRITERS):
         path = HERE / f"{name}.fhz"
         if path.exists():  # goldens are never replaced
             continue
         make(name, path)
-        with fhash_codec.open(path) as volume:
-            between = np.stack([volume.read(t) for t in (0.5, 3.75)])
-            np.savez_compressed(
-                HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE
-            )
+        with fhash_codec.open(path) as opened:
+            volumes = opened.items() if isinstance(opened, Dataset) else [("", opened)]
+            arrays: dict[str, Any] = {"tolerance": TOLERANCE}
+            for variable, volume in volumes:
+                start, last = f"{variable}:" if variable else "", volume.shape[0] - 1.25
+                arrays[f"{start}whole"] = volume[...]
+                arrays[f"{start}between"] = np.stack([volume.read(t) for t in (0.5, last)])
+        np.savez_compressed(HERE / f"{name}.npz", **arrays)
 
 
 if __name__ == "__main__":
