@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 import zarr
 from zarr.storage import ZipStore
 
@@ -119,6 +120,11 @@ def test_a_golden_of_several_variables_has_them_in_order(name: str) -> None:
     with fhash_codec.open(HERE / f"{name}.fhz") as dataset:
         assert list(dataset) == SEVERAL[name]
         dataset.verify()
+        shown = {dataset[variable].name: dataset[variable][...] for variable in dataset}
+    with xarray.open_dataset(HERE / f"{name}.fhz", engine="fhash", mask_and_scale=False) as opened:
+        assert set(opened.data_vars) >= set(shown)
+        for variable, values in shown.items():
+            np.testing.assert_array_equal(opened[variable].values.reshape(values.shape), values)
 
 
 def test_variables_of_a_golden_share_coordinates_of_two_dimensions() -> None:
