@@ -275,13 +275,16 @@ def _global_attributes(volumes: Mapping[str, Volume]) -> dict[str, Any]:
     """Attributes of the whole file: a mapping's own, and those of all sources."""
     own = getattr(volumes, "attributes", None) or {}
     metadata = [volume.metadata for volume in volumes.values()]
-    sources = [{} if each is None else each.attributes for each in metadata]
+    sources = [
+        {} if each is None else json_attributes(each.attributes, without=DROPPED)
+        for each in metadata
+    ]
     common = {
         name: value
         for name, value in (sources[0] if sources else {}).items()
         if all(name in each and each[name] == value for each in sources)
     }
-    return json_attributes({**common, **own}, without=DROPPED)
+    return {**common, **json_attributes(own, without=DROPPED)}
 
 
 def _values(

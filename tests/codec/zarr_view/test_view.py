@@ -299,3 +299,10 @@ def test_what_cannot_be_opened_is_refused(tmp_path: Path, whole: Path) -> None:
     opened.close()
     with pytest.raises(InputError, match="closed"):
         view.get("density/c/0/0/0/0")
+
+
+def test_attributes_of_the_file_may_be_arrays(view_of: ViewOf) -> None:
+    golden = Path(__file__).resolve().parents[2] / "golden"
+    attributes = document(view_of(golden / "compact-1.7-source.fhz"), "")["attributes"]
+    assert attributes["title"] == "golden"
+    assert attributes["range"][0] == pytest.approx(0.1)
