@@ -127,8 +127,8 @@ class FhashBackend(BackendEntrypoint):
         if decode_coords:
             decoded = decoded.set_coords([name for name in coordinates if name in decoded])
         for name, encoding in packed.items():
-            if name in decoded:
-                decoded[name].encoding |= encoding
+            if name in decoded.variables:
+                decoded.variables[name].encoding |= encoding
         decoded.set_close(partial(_release, arrays))
         return decoded
 
