@@ -115,6 +115,7 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
+        header = chance.choice(header.get("variables", [header]))
         for axis in chance.sample(("time", "z", "y", "x"), chance.choice((1, 1, 2, 4))):
             length = header["domain"]["shape"][("time", "z", "y", "x").index(axis)]
             listed = {
