@@ -36,9 +36,6 @@ half-written. A command that is not refused did not need the operation.""",
 Ctrl-C, SIGTERM and SIGHUP in each stage: the command prints one line and leaves nothing
 half-written, and the older output stays.""",
     "a signal at an operation": "The same signals at file operations.",
-    "a file that grows": """\
-Each file operation of a `Writer` fails as on a full disk, or meets a signal or kill -9. The file
-has whole layers, those that were written before.""",
     "a source that changes": """\
 The source grows, shrinks, is rewritten or vanishes while it is read: the command is refused.""",
     "two at once": "Two processes write one output. The result is complete and of one of them.",
