@@ -21,7 +21,7 @@ from fhash_codec.paper.model import PaperModel
 from fhash_codec.provenance import metadata_of
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
-from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY
+from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import SourceMetadata
@@ -130,7 +130,7 @@ class Card:
                 "activation": self.mlp.activation if number < count else "linear",
                 **self._place(
                     HEAD_ARRAY if HEAD_ARRAY in self.container.arrays else f"mlp/weight_{number}",
-                    "packed in the codec of tables/level_1",
+                    f"packed in the codec of {self._table_path}",
                 ),
             }
             for number, weights in enumerate(self.mlp.weights, start=1)
@@ -153,9 +153,15 @@ class Card:
                 place = self._place(name, "")
                 place["bytes"] += own
                 return {"shape": shape, **place, "apart": names if apart else []}
-        masked = self.container.arrays["tables/level_1"].masked
-        coding = "in the tiles of tables/level_1" if masked else "every vertex of the box"
+        masked = self.container.arrays[TABLE].masked
+        coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
+
+    @property
+    def _table_path(self) -> str:
+        """The path of the table in the file."""
+        arrays = self.container.arrays
+        return arrays[TABLE].name if TABLE in arrays else TABLE
 
     def _place(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""

@@ -30,7 +30,8 @@ from fhash_formats.container import (
     describe_coordinates,
 )
 from fhash_formats.container.header import MISSING
-from fhash_formats.series import AXIS_NAMES, Coordinate, Series
+from fhash_formats.container.named import Names
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 
 MISSING_CHUNK_BYTES = 1 << 20
@@ -82,17 +83,22 @@ def write_series(
     scanned: Scan,
     key_frames: Sequence[int],
     *,
+    variable: Mapping[str, Any] | None = None,
     brief: bool = False,
     everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
+    variable: header entry after which the table is named, and the coordinates after those of the
+        series; None for the names that the format has for them.
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
     allows, but for the coordinates of one of several variables, which share their arrays.
     everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
     coords = _storable_coords(series)
+    if variable is not None:
+        writer.names = Names.of(variable, (coords[axis].name for axis in AXES), series.shape)
     for name, array in source_parts(series, coords, {})[1].items():
         writer.add_whole(name, array)
     described = describe_coordinates(coords) if brief and not writer.one_of_several else {}

@@ -29,6 +29,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.container.named import ARRAY, DIMENSIONS
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
@@ -94,7 +95,11 @@ class _Export:
     def __init__(self, volume: Volume, writer: ContainerWriter, progress: Progress) -> None:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
-        self._header = dict(volume.container.header)
+        header = volume.container.header
+        # Levels of plain tables have no names in the source.
+        self._header = {
+            name: value for name, value in header.items() if name not in (ARRAY, DIMENSIONS)
+        }
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:
@@ -107,12 +112,16 @@ class _Export:
             if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
         ]
         rewritten = (*(f"tables/level_{table.level}/" for table in coded), f"{MASK_ARRAY}/")
-        copied = [a for name, a in self._arrays.items() if not f"{name}/".startswith(rewritten)]
+        copied = {
+            name: array
+            for name, array in self._arrays.items()
+            if not f"{name}/".startswith(rewritten)
+        }
         keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
-        self._total = sum(prod(array.grid) for array in copied) + keys
+        self._total = sum(prod(array.grid) for array in copied.values()) + keys
         self._total += sum(map(_chunk_count, coded))
-        for array in copied:
-            self._copy(array)
+        for name, array in copied.items():
+            self._copy(name, array)
         for table in coded:
             self._write_table(table)
         if keys:
@@ -163,17 +172,17 @@ class _Export:
         self._done += 1
         self._progress("exporting", self._done, self._total, what)
 
-    def _copy(self, array: StoredArray) -> None:
+    def _copy(self, name: str, array: StoredArray) -> None:
         """Write the values of an array as plain numbers, chunk by chunk."""
 
         def chunks() -> Iterator[npt.NDArray[Any]]:
             for index in product(*map(range, array.grid)):
                 region = chunk_region(index, array.chunk_shape, array.shape)
                 yield array.decode_chunk(index)[tuple(slice(0, a.stop - a.start) for a in region)]
-                self._tick(array.name)
+                self._tick(name)
 
         self._writer.add_array(
-            array.name,
+            name,
             shape=array.shape,
             dtype=array.dtype,
             chunk_shape=array.chunk_shape,
@@ -252,7 +261,7 @@ class _Export:
             # the mask of missing values, and what belongs to the variable in its source
             if name == "missing/bits" or name.startswith(AUXILIARY):
                 self._total += prod(array.grid)
-                self._copy(array)
+                self._copy(name, array)
 
     def _write_head(self, head: NeighbourHead | None) -> None:
         """Write weights and biases as the numbers that they are; `scale` is their unit."""

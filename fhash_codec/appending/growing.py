@@ -15,12 +15,12 @@ from fhash_codec.appending.layers import CodedLayer, LayerCoder
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import StoredArray, coordinate_features, describe_coordinates
-from fhash_formats.container.apart import HEAD_ARRAY, TABLE, place_head
-from fhash_formats.container.coding import CRC32C, HEAD, transform_codecs
+from fhash_formats.container.apart import TABLE
+from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
+from fhash_formats.container.named import Names
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXIS_NAMES, Coordinate
-from fhash_formats.transform.parts import FEATURE, head_parameters
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
 __all__ = ["GrowingFile"]
 
@@ -61,14 +61,14 @@ class GrowingFile:
         self._layers = self._nonzero = 0
         self._range: ValueRange | None = None
         self._container = GrowingContainer(path, force=force, continues=continues)
-        head = coder.settings.head
-        codec, *checks = transform_codecs(coder.settings)
+        frame = tuple(coords[axis].values.size for axis in ("z", "y", "x"))
+        self._container.names = self._names(frame)
         self._array = GrowingArray(
             name=TABLE,
-            frame=tuple(coords[axis].values.size for axis in ("z", "y", "x")),
+            frame=frame,
             dtype=coder.dtype,
             tile=coder.tile,
-            codecs=[codec if head is None else place_head(codec), *checks],
+            codecs=transform_codecs(coder.settings),
         )
 
     def __enter__(self) -> GrowingFile:
@@ -127,8 +127,6 @@ class GrowingFile:
                 f"{self.path} has {len(self._times)} steps; a file has at most {MAX_STEPS}: "
                 "begin another"
             )
-        if not self._layers:
-            self._write_head()
         self._container.add_layer(self._array, self._layers, streams)
         self._layers += 1
         self._times.extend(times)
@@ -139,6 +137,7 @@ class GrowingFile:
     def publish(self) -> None:
         """Make the file complete, with the layers so far."""
         mark = self._container.mark()
+        self._container.names = self._names(self._array.frame)
         self._container.describe(self._array, self.steps)
         coords = {**self._coords, "t": self._time()}
         described = describe_coordinates(coords)
@@ -152,36 +151,23 @@ class GrowingFile:
                 )
         self._container.publish(self._full_header(described), mark)
 
+    def _names(self, frame: Sequence[int]) -> Names:
+        """The names of the arrays, which stay the same for any number of steps."""
+        coordinates = [self._coords[axis].name for axis in AXES]
+        return Names.of(self._header["variable"], coordinates, (self.steps, *frame))
+
     def _time(self) -> Coordinate:
         known = self._coords["t"]
         values = np.array(self._times, dtype=np.float64)
         return Coordinate(name=known.name, values=values, attributes=known.attributes)
-
-    def _write_head(self) -> None:
-        """Write the head of the tiles, which lies in an array of its own."""
-        head = self.coder.settings.head
-        if head is None:
-            return
-        packed = head.to_bytes()
-        shape = head_parameters(packed).shape
-        self._container.add_array(
-            HEAD_ARRAY,
-            shape=shape,
-            dtype=np.float32,
-            chunk_shape=shape,
-            chunks=[packed],
-            codecs=[{"name": HEAD}, CRC32C],
-        )
 
     def _full_header(self, described: Mapping[str, Any]) -> dict[str, Any]:
         """The header of the file as it is now. described: the positions that it tells."""
         assert self._range is not None
         settings = self.coder.settings
         shape = [self.steps, *self._array.frame]
-        weights = 0
-        if settings.head is not None:
-            weights = sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
-        features = ["transform", *([] if settings.head is None else [FEATURE]), *settings.features]
+        weights = 0 if settings.head is None else settings.head.size
+        features = ["transform", *settings.features]
         header = {
             **self._header,
             "required_features": features + coordinate_features(described),

@@ -256,7 +256,14 @@ class _Whole:
         for name, array in first.container.arrays.items():
             if name.startswith(WHOLE):
                 writer.add_whole(name.removeprefix(WHOLE), array.read())
-        described = write_series(writer, series, scan, range(self.shape[0]), brief=True)
+        described = write_series(
+            writer,
+            series,
+            scan,
+            range(self.shape[0]),
+            variable=header["variable"],
+            brief=True,
+        )
         table = TableParts(
             shape=(self.shape[0], *first.table.shape[1:]),
             dtype=first.table.dtype,

@@ -197,7 +197,6 @@ class _Job:
             tile=blocks.tile,
             settings=self.table.plan.settings,
             streams=self.table.streams,
-            apart=False,  # the whole decides whether head and masks lie apart
         )
         parts.write(writer)
         header = self._header(steps, described, parts)

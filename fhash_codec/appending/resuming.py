@@ -192,7 +192,8 @@ def _keep(growing: GrowingFile, container: Container, kept: int, value_range: Va
     times = container.coordinate("time").values
     layer = table.chunk_shape[0]
     told = container.header["model"]["parameters"]
-    weights = sum(a.shape[0] for n, a in container.arrays.items() if n == HEAD_ARRAY)
+    head = growing.coder.settings.head
+    weights = 0 if head is None else head.size
     for number in range(kept // layer):
         first = number * layer
         tiles = product(*map(range, table.grid[1:]))

@@ -53,9 +53,7 @@ class CodedTable:
 def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
     """Return what the header of a compact file says of its model."""
     blocks, head = table.plan.blocks, table.plan.settings.head
-    weights = 0
-    if head is not None:
-        weights = sum(layer.weights.size + layer.biases.size for layer in head.layers)
+    weights = 0 if head is None else head.size
     return {
         "profile": "compact",
         "levels": [list(blocks.shape)],

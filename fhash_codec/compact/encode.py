@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -77,24 +76,22 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
+    source = describe_source(series, selection.scanned.value_range, config)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,
             series,
             selection.scanned,
             selection.extent.key_frames,
+            variable=source["variable"],
             brief=True,
             everything=any(isinstance(feature, Everything) for feature in selection.features),
         )
     mark = writer.mark()
-    source = describe_source(series, selection.scanned.value_range, config)
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
         parts = table.parts
-        if writer.one_of_several:
-            # A library that shows the array decodes it by what the array itself says.
-            parts = replace(parts, apart=False)
         with stage("writing", "tiles"):
             parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
-from fhash_codec.compact.choices.head_prospects import head_bytes
+from fhash_codec.compact.choices.head_prospects import HEAD_BYTES
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE
 from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
@@ -299,7 +299,7 @@ def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bo
         without = total(list(map_ahead(workers, measure, jobs, 2 * usable_threads())))
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
     size = table.outcome.size
-    own = len(settings.head.to_bytes()) + head_bytes(size)
+    own = len(settings.head.to_bytes()) + HEAD_BYTES
     return size * (2 ** (gain / EXCHANGE) - 1) > own
 
 

@@ -206,14 +206,14 @@ def tiling_text(info: dict[str, Any]) -> str:
     """The price of the tiles and the time for a region, as far as the header says them."""
     told = info["model"].get("tiling", {})
     text = ""
-    if "price" in told:
-        best = told["best"]
+    if told.get("price") is not None:
+        best = told.get("best", info["model"]["levels"][0])
         against = "one tile" if best == info["model"]["levels"][0] else f"tiles of {extent(best)}"
         more = told["price"] - 1
         text = f", {more:.0%} above {against}" if more > 0 else ", the fewest bytes of all tried"
-        if not told["tried"]:
+        if not told.get("tried"):
             text = f", at most about {more:.0%} above {against}" if more > 0 else ""
-    if "region_ms" in told:
+    if told.get("region_ms") is not None:
         text += f"; regions {number(told['region_ms'], 'ms', digits=2)}"
     return text
 

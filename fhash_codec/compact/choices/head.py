@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 from fhash_codec.compact.choices.head_prospects import (
     EFFORTS,
+    HEAD_BYTES,
     TRIAL_BUDGET,
     TRIAL_HEAD,
     Budget,
     Shape,
     expected_gain,
-    head_bytes,
     likely_heads,
 )
 from fhash_codec.compact.choices.head_samples import Pair
@@ -175,7 +175,7 @@ class _Compared:
     def extra_bytes(self, candidate: _Candidate) -> float:
         """Return the bytes more than without a head, at the same quality."""
         size = candidate.outcome.size
-        own_bytes = len(candidate.trained.head.to_bytes()) + head_bytes(size)
+        own_bytes = len(candidate.trained.head.to_bytes()) + HEAD_BYTES
         extra: float = size - self.outcome.size + own_bytes
         if self.aim is None:
             return extra

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fhash_formats.container.table_parts import APART_BYTES
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 
 __all__ = [
     "EFFORTS",
+    "HEAD_BYTES",
     "PERCEPTRON",
     "TRIAL_BUDGET",
     "TRIAL_HEAD",
@@ -17,7 +17,6 @@ __all__ = [
     "Shape",
     "best_widths",
     "expected_gain",
-    "head_bytes",
     "likely_heads",
     "most_saved",
 ]
@@ -123,21 +122,10 @@ LIKELY_OF_TRIAL = (0.85, 1.1)
 """Such multiples that nearly all gains of perceptrons lie between."""
 WEIGHT_BYTES = 0.7
 """Bytes that each weight of a head adds to the file."""
-ARRAY_BYTES = 540
-"""Bytes that describe the array of a head: two documents and three places of a ZIP. In a small file
-there is none."""
-HISTORY_BYTES = 60
-"""Bytes of the training history and of the description of a head in the file."""
+HEAD_BYTES = 60
+"""Bytes that a head adds to the file besides its weights: its history and description."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
-
-
-def head_bytes(size: float) -> float:
-    """Return the bytes that a head adds to the file besides its weights.
-
-    size: bytes of the coded tiles.
-    """
-    return HISTORY_BYTES + (ARRAY_BYTES if size >= APART_BYTES else 0)
 
 
 def expected_gain(gain_of_trial: float) -> float:
@@ -190,4 +178,4 @@ def most_saved(size: float, gain: float, octave: float) -> float:
 def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
     """Return the bytes that a head of this gain in dB saves, less those that it takes."""
     share = 1 - 2 ** (-gain / octave) - WEIGHT_TIME * shape.weights
-    return size * share - WEIGHT_BYTES * shape.weights - head_bytes(size)
+    return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES

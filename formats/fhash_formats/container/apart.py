@@ -1,7 +1,8 @@
 """Parts of a coded table that lie in arrays of their own: its head and its masks.
 
-The codec of the table names these arrays (FORMAT.md, Parts apart). A reader puts the head back into
-the settings of the codec when a file is opened, and each mask behind the stream of its tile.
+Writers of the versions 1.4 to 1.7 put them there in large files. The codec of the table names these
+arrays (FORMAT.md, Parts apart). A reader puts the head back into the settings of the codec when a
+file is opened, and each mask behind the stream of its tile.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from fhash_formats.container.sharding import SHARDING
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.apart import without_names
 
-__all__ = ["HEAD_ARRAY", "MASK_ARRAY", "TABLE", "inline", "place_head", "place_masks"]
+__all__ = ["HEAD_ARRAY", "MASK_ARRAY", "TABLE", "inline", "transform_settings", "with_settings"]
 
 TABLE = "tables/level_1"
 """Array of the table."""
@@ -45,9 +46,9 @@ def inline(documents: Mapping[str, Document], chunk: Callable[[str], bytes]) -> 
         codec = _first(document.get("codecs")).get("name")
         if codec in (HEAD, MASK) and (name, codec) not in _PARTS.values():
             raise DamagedFileError(f"array {name} is coded by {codec} but belongs to no table")
-        if name != TABLE and without_names(_settings(document.get("codecs")))[1]:
+        if name != TABLE and without_names(transform_settings(document.get("codecs")))[1]:
             raise DamagedFileError(f"array {name} has no head or masks in other arrays")
-    settings = _settings(documents.get(TABLE, {}).get("codecs"))
+    settings = transform_settings(documents.get(TABLE, {}).get("codecs"))
     whole = without_names(settings)[0]
     replaced: dict[str, Any] = {}
     for key, (array, codec) in _PARTS.items():
@@ -67,19 +68,8 @@ def inline(documents: Mapping[str, Document], chunk: Callable[[str], bytes]) -> 
     result = dict(documents)
     if replaced:
         table = documents[TABLE]
-        result[TABLE] = {**table, "codecs": _with_settings(table["codecs"], replaced)}
+        result[TABLE] = {**table, "codecs": with_settings(table["codecs"], replaced)}
     return result
-
-
-def place_head(codec: Codec) -> Codec:
-    """The codec of a table, with the name of an array in the place of the head."""
-    return _with_settings([codec], {"head": {"array": HEAD_ARRAY}})[0]
-
-
-def place_masks(codec: Codec) -> Codec:
-    """The codec of a table, with the name of the array that holds the masks."""
-    mask = codec["configuration"]["mask"]
-    return _with_settings([codec], {"mask": {"array": MASK_ARRAY, **mask}})[0]
 
 
 def _first(codecs: object) -> Mapping[str, Any]:
@@ -95,19 +85,19 @@ def _first(codecs: object) -> Mapping[str, Any]:
     return first if isinstance(first, Mapping) else {}
 
 
-def _settings(codecs: object) -> Mapping[str, Any]:
-    """The configuration of `fhash.transform`; an empty one for other codecs."""
+def transform_settings(codecs: object) -> Mapping[str, Any]:
+    """The configuration of `fhash.transform`, in shards or not; an empty one for other codecs."""
     first = _first(codecs)
     configuration = first.get("configuration")
     is_transform = first.get("name") == TRANSFORM and isinstance(configuration, Mapping)
     return configuration if is_transform and isinstance(configuration, Mapping) else {}
 
 
-def _with_settings(codecs: Sequence[Codec], settings: Mapping[str, Any]) -> list[Codec]:
+def with_settings(codecs: Sequence[Codec], settings: Mapping[str, Any]) -> list[Codec]:
     """Codecs whose `fhash.transform`, within shards or without, has other settings as well."""
     first, *others = codecs
     configuration = first["configuration"]
     if first["name"] == SHARDING:
-        inner = _with_settings(configuration["codecs"], settings)
+        inner = with_settings(configuration["codecs"], settings)
         return [{**first, "configuration": {**configuration, "codecs": inner}}, *others]
     return [{**first, "configuration": {**configuration, **settings}}, *others]

@@ -138,7 +138,7 @@ class GrowingContainer(ContainerWriter):
         if array.is_sharded:
             present = np.ones(len(parts), dtype=bool)
             parts.append(pack_index([len(part) for part in parts], present))
-        self._add(f"{array.name}/c/{number}/0/0/0", parts)
+        self._add(array.name, f"c/{number}/0/0/0", parts)
 
     def describe(self, array: GrowingArray, steps: int) -> ArrayMetadata:
         """Write the metadata of an array of so many steps, whose layers were added before."""

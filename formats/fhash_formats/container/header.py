@@ -19,7 +19,7 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.support.number_types import DTYPES
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 7)
+FORMAT_VERSION = (1, 8)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -37,6 +37,7 @@ KNOWN_FEATURES = frozenset(
         "labels",
         "many-labels",
         "mask",
+        "named",
         "predictor",
         SPARSE_FEATURE,
         "trellis",
@@ -306,6 +307,8 @@ def _check_model(
             "head",
             "an object or null",
         )
+        if model.has("tiling"):
+            _check_tiling(model.record("tiling"))
     model.need(profile == COMPACT or not plain, "profile", f"{COMPACT} in a plain file")
     if plain:
         _check_plain(model)
@@ -316,6 +319,16 @@ def _check_model(
         f"one level in the profile {COMPACT}",
     )
     return profile
+
+
+def _check_tiling(tiling: Record) -> None:
+    """Check `model.tiling`, each of whose keys may be missing."""
+    for key in ("price", "region_ms"):
+        tiling.number_or_null(key)
+    if tiling.has("best"):
+        tiling.integers("best", 4, 1, MAX_LENGTH)
+    if tiling.has("tried"):
+        tiling.integer("tried", 0, MAX_LENGTH)
 
 
 def _check_levels(model: Record, steps: int, box: Sequence[int]) -> None:

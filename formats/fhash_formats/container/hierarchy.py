@@ -18,6 +18,7 @@ from fhash_formats.container.array import ArrayMetadata, attributes_of, check_ke
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.header import validate_header
 from fhash_formats.container.layout import Member
+from fhash_formats.container.named import paths_of
 from fhash_formats.container.source import Source
 from fhash_formats.container.variables import (
     CONSOLIDATED,
@@ -45,8 +46,9 @@ class Hierarchy:
 
     Attributes:
         header: attribute "fhash" of the root, checked by `validate_header`.
-        arrays: metadata by name of the array.
-        chunks: members by name of the array and index of the chunk.
+        arrays: metadata by name of the array; by path in a file of several variables.
+        chunks: members by the same name, and index of the chunk.
+        paths: by the same name.
         variables: of a file of several; none in others.
         attributes: of the root beside the header.
     """
@@ -54,6 +56,7 @@ class Hierarchy:
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
     chunks: dict[str, dict[tuple[int, ...], Member]]
+    paths: Mapping[str, str]
     variables: tuple[VariablePlaces, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -99,16 +102,19 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     attributes = {name: value for name, value in groups[""].items() if name != "fhash"}
     if not is_several(header):
         validate_header(header)
-        arrays = _read_arrays(source, members, documents)
+        paths = paths_of(header, documents.keys())
+        arrays = _read_arrays(source, members, documents, paths)
+        chunks = _place_chunks(arrays, chunk_members)
         return Hierarchy(
             header=header,
-            arrays=arrays,
-            chunks=_place_chunks(arrays, chunk_members),
+            arrays={name: arrays[path] for name, path in paths.items()},
+            chunks={name: chunks[path] for name, path in paths.items()},
+            paths=paths,
             attributes=attributes,
         )
     variables, others = read_variables(header, documents.keys())
     _check_consolidated(group_documents, documents)
-    arrays = _read_arrays(source, members, {name: documents[name] for name in others})
+    arrays = _read_arrays(source, members, documents, {name: name for name in others})
     for variable in variables:
         with variable_named(variable.name):
             arrays |= _read_arrays(source, members, documents, variable.places)
@@ -116,6 +122,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
         header=header,
         arrays={name: arrays[name] for name in documents},
         chunks=_place_chunks(arrays, chunk_members),
+        paths={name: name for name in documents},
         variables=tuple(variables),
         attributes=attributes,
     )
@@ -160,15 +167,12 @@ def _read_arrays(
     source: Source,
     members: Mapping[str, Member],
     documents: Mapping[str, Mapping[str, Any]],
-    places: Mapping[str, str] | None = None,
+    places: Mapping[str, str],
 ) -> dict[str, ArrayMetadata]:
     """The metadata of arrays by path. Raises errors that name the member.
 
-    places: path by the name that the array has in a file of one variable; None where that is the
-        path of each.
+    places: path by the name that the format has for the array.
     """
-    if places is None:
-        places = {name: name for name in documents}
 
     def only_chunk(name: str) -> bytes:
         chunk = f"{places[name]}/c/0"

@@ -166,12 +166,12 @@ class Container:
         )
 
     def _stored_arrays(self, tree: Hierarchy) -> dict[str, StoredArray]:
-        """The arrays by path."""
+        """The arrays by name; each knows its path."""
         arrays = {}
         for name, metadata in tree.arrays.items():
             kind = MaskArray if metadata.coding == MASK else StoredArray
             arrays[name] = kind(
-                self.path, name, metadata, tree.chunks[name], self._source, self._cache
+                self.path, tree.paths[name], metadata, tree.chunks[name], self._source, self._cache
             )
         return arrays
 

@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from fhash_formats.container.apart import TABLE
 from fhash_formats.container.chunks import Coded
-from fhash_formats.container.coding import TRANSFORM, Codec
+from fhash_formats.container.coding import Codec
 from fhash_formats.container.header import POSITIONS
+from fhash_formats.container.named import SHOWN_ATTRIBUTES, shows_values
 from fhash_formats.container.reader import Container
 from fhash_formats.container.variables import (
     AUXILIARY,
@@ -25,10 +26,7 @@ from fhash_formats.container.writer import ContainerWriter, Mark
 from fhash_formats.errors import InputError
 from fhash_formats.support.plain_json import plain_json
 
-__all__ = ["SHOWN_ATTRIBUTES", "SeveralWriter", "VariableWriter"]
-
-SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
-"""Attributes of a variable that its array has for libraries that show it."""
+__all__ = ["SeveralWriter", "VariableWriter"]
 
 _COORDINATES = "coords/"
 
@@ -257,12 +255,9 @@ class VariableWriter(ContainerWriter):
     ) -> tuple[str, Sequence[str | None] | None, dict[str, Any]]:
         """Path, names of the axes and attributes of an array of this variable.
 
-        The table is shown at the root where its numbers are the values. In integers, vertices
-        without a value have a number that looks like one: those tables lie with the parts.
+        The table is shown at the root where its numbers are the values; others lie with the parts.
         """
-        coded = codecs[0] if codecs else {}
-        gaps = "mask" in coded.get("configuration", {}) and np.dtype(dtype).kind in "iu"
-        if name != TABLE or coded.get("name") != TRANSFORM or gaps:
+        if name != TABLE or codecs is None or not shows_values(np.dtype(dtype), codecs):
             return part_place(self._node, name), dimension_names, dict(attributes or {})
         names = [
             self._dimension(axis, length) for axis, length in zip(POSITIONS, shape, strict=True)

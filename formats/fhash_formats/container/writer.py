@@ -15,12 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import strict_json
+from fhash_formats.container.apart import TABLE
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.chunks import Coded, coded_chunk, cut, expect_end, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
 from fhash_formats.container.header import FORMAT, FORMAT_VERSION
 from fhash_formats.container.hierarchy import GROUP
 from fhash_formats.container.layout import Member, document_member, ending, local_header
+from fhash_formats.container.named import FEATURE as NAMED
+from fhash_formats.container.named import Names, shows_values
 from fhash_formats.container.reader import Container
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
@@ -59,6 +62,8 @@ class ContainerWriter:
         path: name that the file takes.
         attributes: of the root beside the header, JSON values; they may be set until `commit`.
         one_of_several: whether the arrays are those of one variable among several in the file.
+        names: of the table and the coordinates in the source, where they are to be paths in the
+            hierarchy; they may be set until the first of these arrays is written.
     """
 
     one_of_several = False
@@ -72,6 +77,7 @@ class ContainerWriter:
         self._arrays: dict[str, dict[str, Any]] = {}
         self._position = 0
         self.attributes: Mapping[str, Any] = {}
+        self.names: Names | None = None
 
     def __enter__(self) -> ContainerWriter:
         with ExitStack() as stack:
@@ -105,7 +111,7 @@ class ContainerWriter:
         """Write an array chunk by chunk; never more than one chunk is held.
 
         Args:
-            name: path in the hierarchy.
+            name: path in the hierarchy, unless `names` has another one for it.
             shape: length of each axis.
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
@@ -132,7 +138,7 @@ class ContainerWriter:
                     f"array {name}: chunk {index} was not given; the grid has {metadata.grid}"
                 )
             coded = coded_chunk(name, metadata, index, chunk)
-            self._add(f"{name}/{metadata.chunk_key(index)}", [coded])
+            self._add(name, metadata.chunk_key(index), [coded])
         expect_end(name, metadata, remaining)
 
     def add_sharded(
@@ -177,10 +183,8 @@ class ContainerWriter:
         assert metadata.sharding is not None
         remaining = iter(chunks)
         for shard in product(*(range(n) for n in metadata.grid)):
-            self._add(
-                f"{name}/{metadata.chunk_key(shard)}",
-                shard_parts(name, metadata, metadata.sharding, shard, remaining),
-            )
+            parts = shard_parts(name, metadata, metadata.sharding, shard, remaining)
+            self._add(name, metadata.chunk_key(shard), parts)
         expect_end(name, metadata, remaining)
 
     def add_whole(
@@ -222,6 +226,14 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None,
     ) -> ArrayMetadata:
         """Write the metadata of an array."""
+        if name == TABLE and self.names is not None:
+            if not shows_values(dtype, codecs):
+                self.names = self.names.hidden()
+            dimension_names, attributes = self.names.axes(shape), self.names.attributes
+        elif name.startswith("coords/") and self.names is not None:
+            dimension_names = [self.names.path(name)]
+        elif name == "key_frames" and self.names is not None:
+            dimension_names = [name]
         try:
             metadata = ArrayMetadata(
                 shape=tuple(int(n) for n in shape),
@@ -236,9 +248,10 @@ class ContainerWriter:
             ArrayMetadata.from_dict(strict_json.loads(document))
         except DamagedFileError as error:
             raise InputError(f"array {name} cannot be stored: {error}") from error
-        self._check_name(name)
-        self._arrays[name] = metadata.to_dict()
-        member, data = document_member(f"{name}/{DOCUMENT}", self._position, document)
+        path = self._path(name)
+        self._check_name(path)
+        self._arrays[path] = metadata.to_dict()
+        member, data = document_member(f"{path}/{DOCUMENT}", self._position, document)
         self._write(member, [data])
         return metadata
 
@@ -329,6 +342,9 @@ class ContainerWriter:
             "format": FORMAT,
             "format_version": list(FORMAT_VERSION),
         }
+        if self.names is not None:
+            complete["required_features"] = [*complete["required_features"], NAMED]
+            complete.update(self.names.header())
         attributes = {**plain_json(self.attributes), "fhash": complete}
         root: dict[str, Any] = {**GROUP, "attributes": attributes}
         if is_several(complete):
@@ -356,17 +372,22 @@ class ContainerWriter:
         if name in self._arrays:
             raise InputError(f"array {name} is there already")
 
-    def _add(self, name: str, parts: Sequence[bytes]) -> None:
-        """Write the member of a chunk, whose data are `parts`, one after the other."""
+    def _path(self, name: str) -> str:
+        """The path of an array in the hierarchy."""
+        return name if self.names is None else self.names.path(name)
+
+    def _add(self, name: str, key: str, parts: Sequence[bytes]) -> None:
+        """Write the member of a chunk of an array, whose data are `parts`, one after the other."""
         size, crc = sum(len(part) for part in parts), 0
+        member = f"{self._path(name)}/{key}"
         if size > MAX_MEMBER:
             raise InputError(
-                f"{name} takes {size} bytes; the limit is {MAX_MEMBER}; "
+                f"{member} takes {size} bytes; the limit is {MAX_MEMBER}; "
                 "take smaller chunks or shards"
             )
         for part in parts:
             crc = zlib.crc32(part, crc)
-        self._write(Member(name=name, offset=self._position, size=size, crc=crc), parts)
+        self._write(Member(name=member, offset=self._position, size=size, crc=crc), parts)
 
     def _write(self, member: Member, parts: Sequence[bytes]) -> None:
         if self._file.closed:

@@ -6,11 +6,14 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import Result
+
+from fhash_cli.commands.info import tiling_text
 
 PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
 Fhash = Callable[..., Result]
@@ -229,3 +232,17 @@ def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Pa
     printed = fhash("info", tmp_path / "a.fhz").stdout
     assert "wind.nc, SHA-256 " in printed
     assert "(lev, lat, lon); beside it height" in " ".join(printed.split())
+
+
+@pytest.mark.parametrize(
+    ("told", "text"),
+    [
+        ({}, ""),
+        ({"price": 1.25}, ", at most about 25% above one tile"),
+        ({"price": 1.25, "tried": 3}, ", 25% above one tile"),
+        ({"price": 1.0, "tried": 3, "best": [2, 3, 4, 5]}, ", the fewest bytes of all tried"),
+        ({"region_ms": 3.25, "price": None}, "; regions 3.2 ms"),
+    ],
+)
+def test_any_key_of_the_tiles_may_be_missing(told: dict[str, Any], text: str) -> None:
+    assert tiling_text({"model": {"levels": [[4, 3, 4, 5]], "tiling": told}}) == text

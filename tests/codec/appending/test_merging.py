@@ -14,7 +14,7 @@ from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
 from fhash_codec.appending.merging import merge
 from fhash_codec.appending.parts import Part, encode_part
 from fhash_formats import open_series
-from fhash_formats.container import Container, ContainerWriter, table_parts
+from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import OutputExistsError
 from fhash_formats.series import ArraySeries, Coordinate
@@ -57,12 +57,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", [*CASES, "masks apart"])
-def test_merged_parts_are_the_whole_byte_for_byte(tmp_path, monkeypatch, case) -> None:
-    apart = case == "masks apart"
-    if apart:  # those of a large file, which its smaller parts would not have
-        monkeypatch.setattr(table_parts, "APART_BYTES", 1)
-        case = "a feature and missing values"
+@pytest.mark.parametrize("case", CASES)
+def test_merged_parts_are_the_whole_byte_for_byte(tmp_path, case) -> None:
     make, options = CASES[case]
     source, config = make(), settings(**options)
     fhash_codec.encode(source, tmp_path / "whole.fhz", config)
@@ -72,7 +68,6 @@ def test_merged_parts_are_the_whole_byte_for_byte(tmp_path, monkeypatch, case) -
     assert (report["parts"], report["steps"], report["tiles"]) == (3, 7, 8)
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         assert volume.verify()
-        assert ("apart" in volume.info["required_features"]) == apart
 
 
 def test_a_part_is_a_sound_file_of_its_steps(tmp_path) -> None:

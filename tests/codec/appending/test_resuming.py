@@ -96,7 +96,7 @@ def test_files_that_cannot_grow(tmp_path, field) -> None:
 
 def test_a_damaged_tile_is_found_before_anything_is_written(run) -> None:
     data = bytearray(run.read_bytes())
-    data[data.index(b"tables/level_1/c/0") + 40] ^= 1
+    data[data.index(b"/c/0/0/0/0") + 40] ^= 1
     run.write_bytes(data)
     with pytest.raises(DamagedFileError, match=r"run\.fhz"), continued(run):
         pass

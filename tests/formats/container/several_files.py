@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from table_files import table_parts
+from table_files import PartsApart, table_parts
 
 from fhash_formats.container import ContainerWriter, SeveralWriter
 
@@ -41,7 +40,9 @@ def write_several(path: Path, samples: Any, *, apart: bool = True, paper: bool =
         writer.attributes = {"title": "four winds"}
         several = SeveralWriter(writer, names)
         for name in names[:3]:
-            parts = replace(table_parts(head=name != "w"), apart=apart and name == "u")
+            parts = table_parts(head=name != "w")
+            if apart and name == "u":
+                parts = PartsApart.of(parts)
             variable = several.variable(name, {"units": "m s-1", "flag": 1})
             add_coordinates(variable, shift=0.25 if name == "w" else 0)
             parts.write(variable)

@@ -15,8 +15,7 @@ from fhash_formats.container.apart import (
     MASK_ARRAY,
     TABLE,
     inline,
-    place_head,
-    place_masks,
+    with_settings,
 )
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.sharding import sharding_codecs
@@ -28,7 +27,8 @@ SETTINGS = {**PLAIN.to_dict(), "mask": MASK.to_dict()}
 def documents(*, shards: bool) -> dict[str, dict[str, Any]]:
     """The documents of a table with both parts apart, as far as `inline` looks at them."""
     codec = {"name": "fhash.transform", "configuration": SETTINGS}
-    codecs: Any = [place_masks(place_head(codec)), {"name": "crc32c"}]
+    places = {"head": {"array": HEAD_ARRAY}, "mask": {"array": MASK_ARRAY, **MASK.to_dict()}}
+    codecs: Any = [*with_settings([codec], places), {"name": "crc32c"}]
     if shards:
         codecs = sharding_codecs([1, 2, 3, 4], codecs)
     return {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from several_files import add_coordinates, compact_header, write_several
@@ -44,7 +42,9 @@ def test_each_variable_is_what_a_file_of_its_own_would_be(tmp_path, samples) -> 
 
 
 def test_coordinates_are_there_once_and_others_have_their_own(tmp_path, samples) -> None:
-    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+    with Container.open(
+        write_several(tmp_path / "a.fhz", samples, apart=False, paper=False)
+    ) as file:
         shared = [name for name in file.arrays if "parts" not in name]
         assert shared == ["time", "z", "y", "lon_deg_", "u", "group_v", "lon_deg__of_w", "w"]
         u, v, w = file.variables.values()
@@ -59,7 +59,9 @@ def test_coordinates_are_there_once_and_others_have_their_own(tmp_path, samples)
 
 
 def test_arrays_show_the_axes_that_are_whole(tmp_path, samples) -> None:
-    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+    with Container.open(
+        write_several(tmp_path / "a.fhz", samples, apart=False, paper=False)
+    ) as file:
         # The box of the samples has 4 of 5 vertices along y.
         names = file.arrays["u"].dimension_names, file.arrays["w"].dimension_names
         assert names == (
@@ -71,7 +73,7 @@ def test_arrays_show_the_axes_that_are_whole(tmp_path, samples) -> None:
 
 
 def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
-    parts, sizes = replace(table_parts(), apart=False), []
+    parts, sizes = table_parts(), []
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         several = SeveralWriter(writer, ["u", "v"])
         for name in "uv":
@@ -97,7 +99,9 @@ def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
 
 
 def test_variables_do_not_share_cached_chunks(tmp_path, samples) -> None:
-    with Container.open(write_several(tmp_path / "a.fhz", samples, paper=False)) as file:
+    with Container.open(
+        write_several(tmp_path / "a.fhz", samples, apart=False, paper=False)
+    ) as file:
         region = tuple(slice(0, 2) for _ in range(4))
         values = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
         again = {n: v.arrays["tables/level_1"].read(region) for n, v in file.variables.items()}
@@ -127,7 +131,7 @@ def test_a_variable_alone_is_not_committed(tmp_path) -> None:
 
 
 def test_a_coordinate_never_takes_the_place_of_a_variable(tmp_path, samples) -> None:
-    parts = replace(table_parts(), apart=False)
+    parts = table_parts()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         several = SeveralWriter(writer, ["u", "z", "y_box_u", "parts"])
         for name in several.nodes:
@@ -163,7 +167,7 @@ def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, sa
             variable = several.variable(name)
             add_coordinates(variable)
             variable.add_whole("auxiliary/lat", places + (name == "w"))
-            parts = replace(table_parts(), apart=False)
+            parts = table_parts()
             parts.write(variable)
             variable.finish(compact_header(samples, parts))
         several.commit()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from table_files import HEAD, SHAPE, table_parts, write_table
 
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.table_parts import APART_BYTES
 
 
 @pytest.mark.parametrize(("head", "mask"), list(product([True, False], repeat=2)))
@@ -76,26 +74,20 @@ def vars_of(parts):
     return {name: getattr(parts, name) for name in ("shape", "dtype", "tile", "settings")}
 
 
-def test_a_small_table_keeps_its_parts_unless_told_otherwise(tmp_path, samples) -> None:
+def test_a_table_keeps_its_parts_itself(tmp_path, samples) -> None:
     parts = table_parts()
     assert parts.features == ["transform", "mask"]
     header = samples.compact_header()
-    with ContainerWriter(tmp_path / "small.fhz") as writer:
+    with ContainerWriter(tmp_path / "whole.fhz") as writer:
         parts.write(writer)
-        small = writer.commit({**header, "required_features": parts.features})
-    large = write_table(tmp_path / "large.fhz", header, parts, apart=True).stat().st_size
-    assert small < large - 1000
-    with Container.open(tmp_path / "small.fhz") as container:
+        whole = writer.commit({**header, "required_features": parts.features})
+    apart = write_table(tmp_path / "apart.fhz", header, parts, apart=True).stat().st_size
+    assert whole < apart - 1000
+    with Container.open(tmp_path / "whole.fhz") as container:
         assert set(container.arrays) == {"tables/level_1"}
         table = container.arrays["tables/level_1"]
         values, masks = table.read(), table.read_mask()
-    with Container.open(tmp_path / "large.fhz") as container:
+    with Container.open(tmp_path / "apart.fhz") as container:
         table = container.arrays["tables/level_1"]
         np.testing.assert_array_equal(values, table.read())
         np.testing.assert_array_equal(masks, table.read_mask())
-
-
-def test_a_large_table_has_its_parts_apart() -> None:
-    parts = replace(table_parts(mask=False), streams=[bytes(APART_BYTES)])
-    assert parts.features == ["transform", "apart"]
-    assert replace(parts, streams=[bytes(APART_BYTES - 1)]).features == ["transform"]

@@ -197,6 +197,11 @@ class NeighbourHead:
         """The widths of the hidden layers."""
         return tuple(len(layer.biases) for layer in self.layers[:-1])
 
+    @property
+    def size(self) -> int:
+        """Number of weights and biases."""
+        return sum(layer.weights.size + layer.biases.size for layer in self.layers)
+
     @cached_property
     def _constants(self) -> _Constants:
         sigma, low, high = np.float32(self.sigma), np.float32(self.low), np.float32(self.high)
