@@ -149,6 +149,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "compact-1.7-variables": write_variables,
     "compact-1.7-curvilinear": write_curvilinear,
     "compact-1.7-grown": write_grown,
+    "compact-1.8-grown": write_grown,
     "compact-1.7-part-1": part_writer(1),
     "compact-1.7-part-2": part_writer(2),
 }

@@ -128,6 +128,9 @@ GOLDENS = {
         key_frames="0,1,4",
     ),
     "compact-1.7-source": EncodeConfig(psnr=50.0, effort=1, timings=False),
+    "compact-1.8-named": EncodeConfig(
+        max_error=0.02, effort=1, timings=False, features=("interval:0.5:2",)
+    ),
 }
 
 PLAIN = {
@@ -256,6 +259,14 @@ def cells() -> ArraySeries:
     return ArraySeries(plain.values, name="density", units="kg m-3", coords={"t": TIME, **coords})
 
 
+def long_axis() -> ArraySeries:
+    """A line of `series` again and again along x, at positions that need an array."""
+    values = np.tile(series().values[:, 2:3, 3:4], (1, 1, 1, 115))
+    along = np.cumsum(np.random.default_rng(0).integers(1, 9, values.shape[3])) / 7
+    x = Coordinate(name="range", values=along, attributes={"units": "km"})
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME, "x": x})
+
+
 def head(name: str) -> NeighbourHead:
     """A head of random weights that hardly changes a value: one layer, or two with a cross."""
     chance = np.random.default_rng(3)
@@ -298,6 +309,7 @@ SERIES = {
     "compact-1.5-linear": fronts,
     "compact-1.5-trellis": fronts,
     "compact-1.7-source": with_source,
+    "compact-1.8-named": long_axis,
 }
 """Sources of the goldens that are not made from `series`."""
 

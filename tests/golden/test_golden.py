@@ -38,6 +38,7 @@ COMPACT = [
     "compact-1.5-signs",
     "compact-1.5-trellis",
     "compact-1.7-source",
+    "compact-1.8-named",
 ]
 NAMES = [
     "paper-1.0-plain",
@@ -56,7 +57,7 @@ SEVERAL = {
     "compact-1.7-curvilinear": ["u", "v"],
 }
 """Variables of the goldens of several."""
-APPENDED = ["compact-1.7-grown", "compact-1.7-part-1", "compact-1.7-part-2"]
+APPENDED = ["compact-1.7-grown", "compact-1.8-grown", "compact-1.7-part-1", "compact-1.7-part-2"]
 """A file that grew, and the two parts of a series."""
 
 

@@ -196,7 +196,9 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
 def _array(chance: random.Random, parts: Parts) -> Parts:
     """Change the type, shapes or codecs of one array."""
     arrays = [
-        name for name, data in parts if name.endswith(DOCUMENT) and b'"node_type":"array"' in data
+        name
+        for name, data in parts
+        if name.endswith(f"/{DOCUMENT}") and b'"node_type":"array"' in data
     ]
 
     def change(values: dict[str, Any]) -> None:

@@ -108,7 +108,8 @@ def _errors(chance: random.Random, parts: Parts) -> Parts:
 def _grown(chance: random.Random, parts: Parts) -> Parts:
     """Change what the next layers depend on: promise, range, figures, tiles, times, history."""
     root, header = _root(parts)
-    document = documents_of(parts).get(TABLE)
+    table = header.get("array", TABLE)
+    document = documents_of(parts).get(table)
     growing = document is not None and coding(document) == "fhash.transform"
     if not growing or "max_error" not in header.get("config", {}) or "part" in header:
         raise NothingFitsError
@@ -157,13 +158,14 @@ def _grown(chance: random.Random, parts: Parts) -> Parts:
     else:
         holder, key = chance.choice(list(places(quality))) if quality else (header, "quality")
         holder[key] = hostile(chance, holder[key])
-    return replaced(parts, {f"{TABLE}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
+    return replaced(parts, {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
 def _beside(chance: random.Random, parts: Parts) -> Parts:
     """Add an array that a growing file would have to carry on."""
     name = chance.choice(("extra", "steps/errors", "auxiliary/a", "occupancy/bits", "coords/x"))
-    length = chance.choice((1, 7, prod(tile_of(documents_of(parts)[TABLE])), 1 << 24))
+    table = _root(parts)[1].get("array", TABLE)
+    length = chance.choice((1, 7, prod(tile_of(documents_of(parts)[table])), 1 << 24))
     added = array_of_zeros(name, [length], chance.choice(("float64", "uint8")))
     if "/" in name:
         group = b'{"zarr_format":3,"node_type":"group"}'

@@ -168,6 +168,41 @@ def _places(chance: random.Random, parts: Parts) -> Parts:
     return [*changed.items(), (DOCUMENT, root_document)]
 
 
+def is_named(parts: Parts) -> bool:
+    """Whether a sound file has the names of its source."""
+    header = json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
+    return "named" in header["required_features"]
+
+
+def _named(chance: random.Random, parts: Parts) -> Parts:
+    """Change the names of the source in a file of one variable, or put an array elsewhere."""
+    if not is_named(parts):
+        raise NothingFitsError
+    root = json.loads(dict(parts)[DOCUMENT])
+    header, turn = root["attributes"]["fhash"], chance.randrange(6)
+    table, dimensions = header["array"], header["dimensions"]
+    others = (*NODES, "tables/level_1", "missing", "whole", *dimensions, table)
+    if turn == 0:
+        header["array"] = chance.choice((*others, hostile(chance, table)))
+    elif turn == 1:
+        header["dimensions"] = chance.choice(
+            (dimensions[::-1], dimensions[:3], [*dimensions, "w"], chance.choices(others, k=4), 3)
+        )
+    elif turn == 2:
+        features = header["required_features"]
+        header["required_features"] = [name for name in features if name != "named"]
+    elif turn == 3:
+        del header[chance.choice(("array", "dimensions"))]
+    else:
+        old = chance.choice([name for name in documents_of(parts) if name])
+        new = chance.choice([name for name in others if name])
+        moved = [(name.replace(f"{old}/", f"{new}/", 1), data) for name, data in parts]
+        parts = [*dict(moved if turn == 4 else [*moved[:-1], *parts]).items()]
+        if turn == 5:
+            header["array"] = chance.choice((table, new))
+    return replaced(parts, {DOCUMENT: dumped(root)})
+
+
 def _consolidated(chance: random.Random, parts: Parts) -> Parts:
     """Change the copies of the documents in the root, or the original of one."""
     root, _ = root_of(parts)
@@ -246,4 +281,5 @@ KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
     "consolidated": _consolidated,
     "many variables": _many,
     "variables length": _large,
+    "named path": _named,
 }

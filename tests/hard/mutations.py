@@ -94,6 +94,8 @@ def _mutation(number: int, golden: str, kind: str) -> Mutation:
     data, parts = goldens()[golden]
     if kind in OF_ONE and mutated_variables.is_several(parts):
         raise mutated_payload.NothingFitsError
+    if kind in UNNAMED and mutated_variables.is_named(parts):
+        raise mutated_payload.NothingFitsError
     if kind in DAMAGES:
         return Mutation(
             number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data)
@@ -204,7 +206,7 @@ APART_KINDS = frozenset(mutated_apart.KINDS)
 """Kinds that change parts of a table that lie in arrays of their own, only."""
 SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
 """Kinds that change tables of needed vertices only."""
-SEVERAL_KINDS = frozenset(mutated_variables.KINDS)
+SEVERAL_KINDS = frozenset(mutated_variables.KINDS) - {"named path"}
 """Kinds that change files of several variables only."""
 SOURCE_KINDS = frozenset(mutated_source.KINDS)
 """Kinds that change metadata of a source only."""
@@ -214,6 +216,10 @@ OF_ONE = frozenset(
     ("length", "domain", "header", "giant", "clip", "integers", "apart", "occupancy", "grown")
 ) | (PLAIN_KINDS | SPARSE_KINDS)
 """Kinds that change files of one variable only."""
+UNNAMED = frozenset(("giant", "clip", "integers", "apart"))
+"""Kinds that change the table under its internal name only."""
+NAMED_KINDS = frozenset(("named path",))
+"""Kinds that change files with the names of their source only."""
 
 
 def header_of(parts: Parts) -> Any:

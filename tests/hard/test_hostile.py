@@ -25,6 +25,7 @@ PARTIAL = (
     | mutations.SEVERAL_KINDS
     | mutations.SOURCE_KINDS
     | mutations.PART_KINDS
+    | mutations.NAMED_KINDS
 )
 """Kinds that pass over goldens without what they change."""
 MANY = 12_000

@@ -213,7 +213,8 @@ class GrowingContainer(ContainerWriter):
         # A signal may come between any two lines: `close` removes the file from here on.
         self._temporary, self._opening = hidden, True
         try:
-            file = self._file = hidden.open("xb" if self._spare is None else "r+b")
+            self._file = hidden.open("xb" if self._spare is None else "r+b")  # type: ignore[assignment]
+            file = self._file
             try:
                 file.truncate(common)
                 file.seek(common)
