@@ -69,7 +69,9 @@ class Dataset(Mapping[str, Volume]):
             if name not in self.container.variables:
                 listed = ", ".join(self.container.variables)[:400]
                 raise KeyError(f"{self.path} has no variable {name!r:.80}; it holds {listed}")
-            self._volumes[name] = Volume(self.container.variables[name], fill=self._fill)
+            volume = Volume(self.container.variables[name], fill=self._fill)
+            # Another thread may have made it meanwhile.
+            return self._volumes.setdefault(name, volume)
         return self._volumes[name]
 
     def __iter__(self) -> Iterator[str]:

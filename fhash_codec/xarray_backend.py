@@ -27,6 +27,7 @@ from fhash_codec.encoding import encode
 from fhash_codec.lazy_array import FhashArray, Form
 from fhash_codec.provenance import figure_attributes, history_line, source_attributes
 from fhash_codec.shared_volumes import acquire, place_of
+from fhash_codec.side_by_side import SideBySide, shown_names
 from fhash_codec.value_type import holds
 from fhash_codec.volume import OUTSIDE, Volume
 from fhash_formats.container import is_container
@@ -92,21 +93,27 @@ class FhashBackend(BackendEntrypoint):
         names = list(handle.volumes)
         if variable is not None and variable not in names:
             raise InputError(f"{place} has no variable {variable!r}; it has {', '.join(names)}")
-        dataset = xr.Dataset()
+        chosen = {
+            name: Shown(handle.volumes[name], lod, outside)
+            for name in (names if variable is None else [variable])
+        }
+        shown_as = shown_names({name: handle.volumes[name].name for name in chosen})
+        joined = SideBySide(
+            {shown_as[name]: shown.form.dimensions for name, shown in chosen.items()}
+        )
+        attributes: dict[str, Any] = {}
         coordinates: set[str] = set()
         arrays: list[FhashArray] = []
         packed: dict[str, dict[str, Any]] = {}
-        for name in names if variable is None else [variable]:
-            volume = handle.volumes[name]
-            shown = Shown(volume, lod, outside)
+        for name, shown in chosen.items():
             array = FhashArray(place, name, shown.form, storage_options)
-            dataset = dataset.merge(shown.dataset(array, place), join="exact", compat="override")
-            dataset.attrs = shown.attributes()
-            coordinates |= shown.coordinates
-            packed[name] = shown.packing()
+            beside = joined.add(shown_as[name], shown.values(array, place), shown.beside())
+            attributes = shown.attributes()
+            coordinates |= {beside[each] for each in shown.coordinates} - set(shown_as.values())
+            packed[shown_as[name]] = shown.packing()
             arrays.append(array)
         decoded = xr.conventions.decode_cf(
-            dataset,
+            xr.Dataset(joined.variables, attrs=attributes),
             concat_characters=concat_characters,  # type: ignore[arg-type]
             mask_and_scale=mask_and_scale,  # type: ignore[arg-type]
             decode_times=decode_times,
@@ -118,8 +125,8 @@ class FhashBackend(BackendEntrypoint):
         if decode_coords:
             decoded = decoded.set_coords([name for name in coordinates if name in decoded])
         for name, encoding in packed.items():
-            if name in decoded:
-                decoded[name].encoding |= encoding
+            if name in decoded.variables:
+                decoded.variables[name].encoding |= encoding
         decoded.set_close(partial(_release, arrays))
         return decoded
 
@@ -145,22 +152,23 @@ class Shown:
         self._beside = self._variables()
         self.coordinates = {each.name for each in self._beside if each.is_coordinate}
 
-    def dataset(self, array: FhashArray, place: str) -> xr.Dataset:
-        """The values and what belongs to them, not decoded."""
-        volume = self._volume
+    def values(self, array: FhashArray, place: str) -> xr.Variable:
+        """The values, not decoded."""
         encoding = {
-            "preferred_chunks": self.form.chunks(volume),
+            "preferred_chunks": self.form.chunks(self._volume),
             "source": place,
         }
         lazy = indexing.LazilyIndexedArray(array)
-        values = xr.Variable(
+        return xr.Variable(
             tuple(self.form.dimensions), lazy, self._variable_attributes(), encoding=encoding
         )
-        beside = {
+
+    def beside(self) -> dict[str, xr.Variable]:
+        """The arrays beside the values, not decoded."""
+        return {
             each.name: xr.Variable(each.dimensions, each.values, dict(each.attributes))
             for each in self._beside
         }
-        return xr.Dataset({volume.name: values, **beside})
 
     def attributes(self) -> dict[str, Any]:
         """Attributes of the file: those of the source, its name and digest, and the history."""

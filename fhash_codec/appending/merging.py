@@ -36,6 +36,12 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["merge"]
 
+SIMILARITY = 8
+"""Number in a row of errors that is the sum of the SSIM; the next one is its count."""
+SIMILAR = 1.001
+"""Largest SSIM of a vertex, rounding included."""
+MOST_ERROR = 4.0
+"""Largest error, and square of one, with the range of the values scaled to at most 1."""
 OWN = ("coordinates", "domain", "quality", "required_features", SOURCE, PART)
 """Keys of a part's header that differ from part to part."""
 OWN_MODEL = ("levels", "parameters", "gains")
@@ -112,7 +118,7 @@ class _Piece:
             raise DamagedFileError(f"{self.path}: header key model.gains is missing or no list")
         self.table, self.settings = table, table.settings
         self.errors = errors.read()
-        if not np.isfinite(self.errors).all() or (self.errors[:, COUNTS] < 0).any():
+        if not _are_sums(self.errors, prod(header["domain"]["shape"][1:])):
             raise DamagedFileError(f"{self.path}: array {ERRORS} has numbers that are no errors")
 
     @cached_property
@@ -134,6 +140,18 @@ class _Piece:
             "time": (time.name, time.attributes),
             "parts": (self.of, self.steps, self.ssim_steps),
         }
+
+
+def _are_sums(errors: npt.NDArray[np.float64], vertices: int) -> bool:
+    """Whether numbers can be sums of the errors of steps of so many vertices, see `_row`."""
+    counts, others = errors[:, COUNTS], np.delete(errors, [*COUNTS, SIMILARITY], axis=1)
+    similarity = np.abs(errors[:, SIMILARITY])
+    return bool(
+        np.isfinite(errors).all()
+        and ((counts >= 0) & (counts <= vertices) & (counts == np.rint(counts))).all()
+        and ((others >= 0) & (others <= MOST_ERROR * (1 + vertices))).all()
+        and (similarity <= errors[:, SIMILARITY + 1] * SIMILAR).all()
+    )
 
 
 def _require_whole(parts: Sequence[_Piece]) -> None:

@@ -6,7 +6,7 @@ and arrays whose name or lengths another array of the group has.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, MutableMapping
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ def shown_axes(volume: Volume) -> tuple[int, ...]:
 
 
 def arrays_beside(
-    volume: Volume, level: Level, dimensions: Mapping[str, str], lengths: dict[str, int]
+    volume: Volume, level: Level, dimensions: Mapping[str, str], lengths: MutableMapping[str, int]
 ) -> Iterator[tuple[str, ViewArray]]:
     """Yield the arrays beside the values of a level, with their names.
 
@@ -80,7 +80,7 @@ def arrays_beside(
         found = dict(zip(names, values.shape, strict=True))
         if any(lengths.get(name, n) != n for name, n in found.items()):
             continue
-        lengths |= found
+        lengths.update(found)
         yield variable.name, _array(values, names, variable.attributes)
 
 

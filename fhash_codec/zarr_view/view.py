@@ -16,10 +16,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import ChainMap, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fhash_codec.dataset import open as open_file
 from fhash_codec.volume import Volume
@@ -35,7 +38,6 @@ from fhash_codec.zarr_view.surroundings import (
     shown_axes,
 )
 from fhash_formats.series import AXES
-from fhash_formats.source_metadata import NAMING
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.writers.common.labels import (
     DROPPED,
@@ -81,11 +83,17 @@ class ZarrView:
         self.volumes = volumes
         self.arrays: dict[str, ViewArray] = {}
         self.names: dict[str, str] = {}
+        # Of each group: its arrays by name, and the lengths of its dimensions.
+        self._inside: defaultdict[str, dict[str, ViewArray]] = defaultdict(dict)
+        self._lengths: defaultdict[str, dict[str, int]] = defaultdict(dict)
+        self._shared: defaultdict[Any, list[str]] = defaultdict(list)
+        self._counts: dict[tuple[str, str], int] = {}
         groups: dict[str, dict[str, Any]] = {"": _global_attributes(volumes), LEVELS: {}}
         scales = []
         used = {"": {LEVELS, DOCUMENT}}
         for key, volume in volumes.items():
             self.names[key] = _unique(safe_name(volume.name or key), used[""])
+        self._shown = {LEVELS, DOCUMENT, *self.names.values()}
         for key, volume in volumes.items():
             name = self.names[key]
             levels = [Level(volume, lod) for lod in range(level_count(volume))]
@@ -94,7 +102,7 @@ class ZarrView:
                 taken = used.setdefault(group, {DOCUMENT, *self.names.values()})
                 dimensions = self._add_coordinates(group, volume, level, taken)
                 beside = self._add_beside(group, volume, level, dimensions)
-                self.arrays[_join(group, name)] = _values(volume, level, dimensions, beside)
+                self._put(group, name, _values(volume, level, dimensions, beside))
             paths = {f"{level.lod}/{name}": level for level in levels}
             axes = dict(zip(self._axes(volume), self.arrays[name].dimension_names, strict=True))
             if len(axes.keys() - {"t"}) > 1:
@@ -187,58 +195,57 @@ class ZarrView:
             values = values[level.vertices(number - 1)] if number else values
             attributes = coordinate_attributes(axis, coordinate)
             wanted = safe_name(coordinate.name or axis)
-            name, count = wanted, 1
-            while name in used and (
-                name in names.values() or not self._is_same(_join(group, name), values, attributes)
-            ):
-                count += 1
-                name = f"{wanted}_{count}"
-            if name not in used:
-                used.add(name)
-                self.arrays[_join(group, name)] = _positions(name, values, attributes)
+            digest = hashlib.sha256(np.ascontiguousarray(values).tobytes()).digest()
+            told = json.dumps(attributes, sort_keys=True)
+            shared = self._shared[group, wanted, values.dtype.str, digest, told]
+            name = next((one for one in shared if one not in names.values()), None)
+            if name is None:
+                name = self._free(group, wanted, used)
+                shared.append(name)
+                self._put(group, name, _positions(name, values, attributes))
             names[axis] = name
         return names
+
+    def _free(self, group: str, wanted: str, used: set[str]) -> str:
+        """A name that is not used in a group yet: the wanted one, or with a number."""
+        count = self._counts.get((group, wanted), 1)
+        name = wanted if count == 1 else f"{wanted}_{count}"
+        while name in used or name in self._inside[group]:
+            count += 1
+            name = f"{wanted}_{count}"
+        self._counts[group, wanted] = count
+        used.add(name)
+        return name
+
+    def _put(self, group: str, name: str, array: ViewArray) -> None:
+        """Put an array into a group."""
+        self.arrays[_join(group, name)] = self._inside[group][name] = array
+        self._lengths[group].update(zip(array.dimension_names, array.shape, strict=True))
 
     def _add_beside(
         self, group: str, volume: Volume, level: Level, dimensions: Mapping[str, str]
     ) -> dict[str, Any]:
         """Add the arrays beside the values; return the attributes by which the values name them."""
-        inside = {
-            path.rpartition("/")[2]: array
-            for path, array in self.arrays.items()
-            if path.rpartition("/")[0] == group
-        }
-        lengths = {
-            name: n
-            for array in inside.values()
-            for name, n in zip(array.dimension_names, array.shape, strict=True)
-        }
-        taken = {LEVELS, DOCUMENT, *self.names.values(), *inside}
-        there = set()
-        for name, array in arrays_beside(volume, level, dimensions, lengths):
-            if name not in taken:
-                self.arrays[_join(group, name)] = array
-            if name not in taken or (name in inside and inside[name].is_same(array)):
-                there.add(name)
         if volume.metadata is None:
             return {}
+        inside, shown = self._inside[group], self._shown
+        lengths = ChainMap({}, self._lengths[group])
+        there = set()
+        for name, array in list(arrays_beside(volume, level, dimensions, lengths)):
+            if name in inside:
+                if inside[name].is_same(array):
+                    there.add(name)
+            elif name not in shown:
+                self._put(group, name, array)
+                there.add(name)
         for dimension, axis in volume.metadata.dimensions.items():
             source = volume.metadata.named(dimension)
             if source is not None and axis in dimensions:
-                path = _join(group, dimensions[axis])
+                array = inside[dimensions[axis]]
                 named = naming_attributes(source.attributes, there)
-                attributes = {**self.arrays[path].attributes, **named}
-                self.arrays[path] = replace(self.arrays[path], attributes=attributes)
+                attributes = {**array.attributes, **named}
+                self._put(group, dimensions[axis], replace(array, attributes=attributes))
         return naming_attributes(volume.metadata.variable_attributes, there)
-
-    def _is_same(self, path: str, values: Any, attributes: Any) -> bool:
-        """Whether a path holds these positions already."""
-        array = self.arrays.get(path)
-        if array is None:
-            return False
-        plain = {key: value for key, value in array.attributes.items() if key not in NAMING}
-        there = replace(array, attributes=plain)
-        return there.is_same(_positions(path.rpartition("/")[2], values, attributes))
 
     def _write_documents(self, groups: Mapping[str, dict[str, Any]]) -> dict[str, bytes]:
         """All metadata documents by key; those of groups hold all metadata below them."""
@@ -275,13 +282,16 @@ def _global_attributes(volumes: Mapping[str, Volume]) -> dict[str, Any]:
     """Attributes of the whole file: a mapping's own, and those of all sources."""
     own = getattr(volumes, "attributes", None) or {}
     metadata = [volume.metadata for volume in volumes.values()]
-    sources = [{} if each is None else each.attributes for each in metadata]
+    sources = [
+        {} if each is None else json_attributes(each.attributes, without=DROPPED)
+        for each in metadata
+    ]
     common = {
         name: value
         for name, value in (sources[0] if sources else {}).items()
         if all(name in each and each[name] == value for each in sources)
     }
-    return json_attributes({**common, **own}, without=DROPPED)
+    return {**common, **json_attributes(own, without=DROPPED)}
 
 
 def _values(

@@ -23,6 +23,7 @@ __all__ = [
     "SourceVariable",
     "is_plain_name",
     "references",
+    "renamed",
     "with_history",
     "without_names",
 ]
@@ -161,6 +162,23 @@ def references(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
                 yield key, word
             elif key == "grid_mapping":
                 yield key, word[:-1]
+
+
+def renamed(attributes: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Attributes that name other variables by their new names. names: new by old ones."""
+
+    def word(old: str) -> str:
+        bare = old.removesuffix(":")
+        return names.get(bare, bare) + old[len(bare) :]
+
+    changed = {
+        key: " ".join(
+            word(old) if key == "grid_mapping" or not old.endswith(":") else old
+            for old in attributes[key].split()
+        )
+        for key in dict.fromkeys(key for key, name in references(attributes) if name in names)
+    }
+    return {**attributes, **changed}
 
 
 def with_history(attributes: Mapping[str, Any], line: str) -> dict[str, Any]:

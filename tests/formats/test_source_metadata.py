@@ -10,6 +10,7 @@ from fhash_formats.source_metadata import (
     SourceVariable,
     is_plain_name,
     references,
+    renamed,
     with_history,
     without_names,
 )
@@ -92,3 +93,19 @@ def test_history_gets_one_line_more() -> None:
 def test_other_names_are_not_plain(name: object) -> None:
     assert not is_plain_name(name)
     assert is_plain_name("Größe m-2")
+
+
+def test_attributes_follow_the_new_names_of_arrays() -> None:
+    names = {"lat": "lat_2", "crs": "crs_2", "a": "a_2"}
+    attributes = {
+        "coordinates": "lat lon",
+        "grid_mapping": "crs: lat lon",
+        "formula_terms": "a: a b: b",
+        "long_name": "lat",
+    }
+    assert renamed(attributes, names) == {
+        "coordinates": "lat_2 lon",
+        "grid_mapping": "crs_2: lat_2 lon",
+        "formula_terms": "a: a_2 b: b",
+        "long_name": "lat",
+    }

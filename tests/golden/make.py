@@ -14,9 +14,10 @@ from unittest import mock
 
 import numpy as np
 import zarr
+from grouped import WRITERS
 
 import fhash_codec
-from fhash_codec import EncodeConfig, encoding
+from fhash_codec import Dataset, EncodeConfig, encoding
 from fhash_codec.compact import encode as compact
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_formats.series import ArraySeries, Coordinate
@@ -130,6 +131,9 @@ GOLDENS = {
         key_frames="0,1,4",
     ),
     "compact-1.7-source": EncodeConfig(psnr=50.0, effort=1, timings=False),
+    "compact-1.8-named": EncodeConfig(
+        max_error=0.02, effort=1, timings=False, features=("interval:0.5:2",)
+    ),
 }
 
 PLAIN = {
@@ -261,6 +265,14 @@ def cells() -> ArraySeries:
     return ArraySeries(plain.values, name="density", units="kg m-3", coords={"t": TIME, **coords})
 
 
+def long_axis() -> ArraySeries:
+    """A line of `series` again and again along x, at positions that need an array."""
+    values = np.tile(series().values[:, 2:3, 3:4], (1, 1, 1, 115))
+    along = np.cumsum(np.random.default_rng(0).integers(1, 9, values.shape[3])) / 7
+    x = Coordinate(name="range", values=along, attributes={"units": "km"})
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME, "x": x})
+
+
 def head(name: str) -> NeighbourHead:
     """A head of random weights that hardly changes a value: one layer, or two with a cross."""
     chance = np.random.default_rng(3)
@@ -303,6 +315,7 @@ SERIES = {
     "compact-1.5-linear": fronts,
     "compact-1.5-trellis": fronts,
     "compact-1.7-source": with_source,
+    "compact-1.8-named": long_axis,
 }
 """Sources of the goldens that are not made from `series`."""
 
@@ -330,7 +343,9 @@ def pack(path: Path) -> None:
 
 def make(name: str, path: Path) -> None:
     """Write a golden; those of PLAIN are made last, since each is made of another one."""
-    if name in PACKED:
+    if name in WRITERS:
+        WRITERS[name](path)
+    elif name in PACKED:
         pack(path)
     elif name in PLAIN:
         fhash_codec.export_plain(HERE / f"{PLAIN[name]}.fhz", path)
@@ -341,16 +356,19 @@ def make(name: str, path: Path) -> None:
 
 
 def main() -> None:
-    for name in (*GOLDENS, *PACKED, *PLAIN):
+    for name in (*GOLDENS, *PACKED, *PLAIN, *WRITERS):
         path = HERE / f"{name}.fhz"
         if path.exists():  # goldens are never replaced
             continue
         make(name, path)
-        with fhash_codec.open(path) as volume:
-            between = np.stack([volume.read(t) for t in (0.5, 3.75)])
-            np.savez_compressed(
-                HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE
-            )
+        with fhash_codec.open(path) as opened:
+            volumes = opened.items() if isinstance(opened, Dataset) else [("", opened)]
+            arrays: dict[str, Any] = {"tolerance": TOLERANCE}
+            for variable, volume in volumes:
+                start, last = f"{variable}:" if variable else "", volume.shape[0] - 1.25
+                arrays[f"{start}whole"] = volume[...]
+                arrays[f"{start}between"] = np.stack([volume.read(t) for t in (0.5, last)])
+        np.savez_compressed(HERE / f"{name}.npz", **arrays)
 
 
 if __name__ == "__main__":

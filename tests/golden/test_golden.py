@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 import zarr
 from zarr.storage import ZipStore
 
@@ -38,6 +39,7 @@ COMPACT = [
     "compact-1.5-trellis",
     "compact-1.7-source",
     "compact-1.8-axes",
+    "compact-1.8-named",
 ]
 NAMES = [
     "paper-1.0-plain",
@@ -51,6 +53,13 @@ NAMES = [
     "paper-1.6-sparse-untrained",
     *COMPACT,
 ]
+SEVERAL = {
+    "compact-1.7-variables": ["u", "v", "surface/rain rate", "basin", "tracer"],
+    "compact-1.7-curvilinear": ["u", "v"],
+}
+"""Variables of the goldens of several."""
+APPENDED = ["compact-1.7-grown", "compact-1.8-grown", "compact-1.7-part-1", "compact-1.7-part-2"]
+"""A file that grew, and the two parts of a series."""
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -80,6 +89,79 @@ def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
         fhash_codec.open(HERE / f"{name}.fhz") as volume,
     ):
         np.testing.assert_array_equal(volume[...], expected["whole"])
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize(
+    ("name", "variable"),
+    [
+        *((name, variable) for name, variables in SEVERAL.items() for variable in variables),
+        *((name, None) for name in APPENDED),
+    ],
+)
+def test_variables_files_that_grew_and_parts_decode_to_their_values(
+    name: str, variable: str | None, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    start = f"{variable}:" if variable else ""
+    with (
+        np.load(HERE / f"{name}.npz") as expected,
+        fhash_codec.open(HERE / f"{name}.fhz", variable=variable) as volume,
+    ):
+        low, high = volume.info["value_range"]
+        same = {"atol": float(expected["tolerance"]) * (high - low), "rtol": 0}
+        whole, between = volume[...], [volume.read(t) for t in (0.5, volume.shape[0] - 1.25)]
+        np.testing.assert_allclose(np.stack(between), expected[f"{start}between"], **same)
+        if volume.profile == "compact":
+            np.testing.assert_array_equal(whole, expected[f"{start}whole"])
+        np.testing.assert_allclose(whole, expected[f"{start}whole"], **same)
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_a_golden_of_several_variables_has_them_in_order(name: str) -> None:
+    with fhash_codec.open(HERE / f"{name}.fhz") as dataset:
+        assert list(dataset) == SEVERAL[name]
+        dataset.verify()
+        shown = {dataset[variable].name: dataset[variable][...] for variable in dataset}
+    with xarray.open_dataset(HERE / f"{name}.fhz", engine="fhash", mask_and_scale=False) as opened:
+        assert set(opened.data_vars) >= set(shown)
+        for variable, values in shown.items():
+            np.testing.assert_array_equal(opened[variable].values.reshape(values.shape), values)
+
+
+def test_variables_of_a_golden_share_coordinates_of_two_dimensions() -> None:
+    y, x = np.meshgrid(np.arange(18.0), np.arange(20.0), indexing="ij")
+    with fhash_codec.open(HERE / "compact-1.7-curvilinear.fhz") as dataset:
+        for volume in dataset.values():
+            found = {each.name: each for each in volume.metadata.variables}
+            np.testing.assert_array_equal(found["lat"].values, 50 + y + x * y / 99)
+            assert found["lon"].values.dtype == np.float32
+            assert found["lon"].attributes == {"units": "degrees_east"}
+            assert volume.metadata.variable_attributes["grid_mapping"] == "crs"
+
+
+def test_a_golden_that_grew_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    path.write_bytes((HERE / "compact-1.7-grown.fhz").read_bytes())
+    with fhash_codec.open(path) as volume:
+        before = volume[...]
+    with fhash_codec.Writer.resume(path, steps=6) as writer:
+        writer.append(before[6])
+    with fhash_codec.open(path) as volume:
+        np.testing.assert_array_equal(volume[:6], before[:6])
+        np.testing.assert_allclose(volume[6], before[6], atol=0.02)
+        assert (volume.name, volume.units, volume.shape) == ("density", "kg m-3", before.shape)
+
+
+def test_golden_parts_become_one_file(tmp_path: Path) -> None:
+    paths = [HERE / f"compact-1.7-part-{number}.fhz" for number in (2, 1)]
+    fhash_codec.merge(paths, tmp_path / "whole.fhz")
+    parts = [np.load(path.with_suffix(".npz"))["whole"] for path in reversed(paths)]
+    with fhash_codec.open(tmp_path / "whole.fhz") as volume:
+        np.testing.assert_array_equal(volume[...], np.concatenate(parts))
+        assert volume.coords["t"].values.tolist() == [0.0, 0.5, 2.0, 2.25, 9.0]
+        assert volume.metadata.variables[0].values.tolist() == (np.arange(300.0) ** 1.5).tolist()
+        volume.verify()
 
 
 def test_the_source_of_a_golden_comes_back() -> None:
@@ -113,7 +195,8 @@ def test_the_source_of_a_golden_comes_back() -> None:
 
 
 def test_no_golden_is_left_untested() -> None:
-    assert sorted(path.stem for path in HERE.glob("*.fhz")) == sorted(NAMES)
+    names = [*NAMES, *SEVERAL, *APPENDED]
+    assert sorted(path.stem for path in HERE.glob("*.fhz")) == sorted(names)
 
 
 @pytest.mark.parametrize("name", NAMES)

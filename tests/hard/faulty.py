@@ -13,6 +13,7 @@ from reporting import LONG
 Listing = dict[str, bytes | None]
 
 COMPACT = ("--effort", "1", "--no-timings", "-q")
+BOUND = ("--max-error", "0.05", "--tile", "2x9x10x12", *COMPACT)
 PAPER = ("--profile", "paper", "--epochs", "2", "--width", "4", "--no-timings", "-q")
 PROFILES = {"compact": COMPACT, "paper": PAPER}
 FORMATS = ("npy", "h5", "nc", "zarr", "raw", "vti", "vtr", "pvd", "vtkhdf")
@@ -57,6 +58,7 @@ class Bench:
             self._succeed(
                 ["encode", self._place("in", number), "-o", self._place("run", number), *COMPACT]
             )
+        self._write_more()
         self._known: dict[str, tuple[Listing, Listing, int]] = {}
 
     def words(self, name: str, number: int = 0) -> list[str]:
@@ -64,6 +66,10 @@ class Bench:
         places = {
             "in": self._place("in", number),
             "run": self._place("run", number),
+            "several": self.folder / str(number) / "several.h5",
+            "part1": self.folder / str(number) / "part1.fhz",
+            "part2": self.folder / str(number) / "part2.fhz",
+            "more": self.folder / "more.npy",
             "out": self.out,
         }
         return [word.format_map(places) for word in COMMANDS[name]]
@@ -111,7 +117,10 @@ class Bench:
         if name not in self._known:
             outputs = []
             self.empty()
-            for number in (1, 0):
+            if name in GROWING:
+                shutil.copy(self.folder / "grown.fhz", self.out / "a.fhz")
+                outputs.append(self.now())
+            for number in (0,) if outputs else (1, 0):
                 counted = self.folder / "operations"
                 self._succeed(self.words(name, number), ("at_operation", self.out, 0, 0, counted))
                 outputs.append(self.now())
@@ -124,12 +133,28 @@ class Bench:
         ended = self.server.run(*words, inject=inject)
         assert ended.code == 0, ended.output
 
+    def _write_more(self) -> None:
+        """Write the inputs of commands on several variables, parts and files that grow."""
+        import h5py
+
+        for number in range(2):
+            folder = self.folder / str(number)
+            with h5py.File(folder / "several.h5", "w") as file:
+                file["u"], file["v"] = values(number), values(number + 5)
+            for part in (1, 2):
+                words = ("encode", folder / "in.npy", "-o", folder / f"part{part}.fhz")
+                self._succeed([*words, "--part", f"{part}/2", *BOUND])
+        np.save(self.folder / "more.npy", values(3))
+        self._succeed(["encode", self._place("in", 1), "-o", self.folder / "grown.fhz", *BOUND])
+
     def _place(self, kind: str, number: int) -> Path:
         return (
             self.folder / str(number) / ("in.npy" if kind == "in" else "run.fhz")
         )  # the variable is called after the file
 
 
+GROWING = ("append",)
+"""Commands that change a file which is there before."""
 COMMANDS = {
     **{
         f"encode {name}": ("encode", "{in}", "-o", "{out}/a.fhz", "--force", *words)
@@ -139,6 +164,11 @@ COMMANDS = {
         f"decode {suffix}": ("decode", "{run}", "-o", f"{{out}}/a.{suffix}", "--force", "-q")
         for suffix in FORMATS
     },
+    "encode several": (
+        *("encode", "{several}", "--var", "all", "-o", "{out}/a.fhz", "--force", *COMPACT),
+    ),
+    "merge": ("merge", "{part1}", "{part2}", "-o", "{out}/a.fhz", "--force", "-q"),
+    "append": ("append", "{out}/a.fhz", "{more}", "--keep", "4", "-q"),
     "decode vtp": (
         "decode",
         "{run}",

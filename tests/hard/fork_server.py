@@ -24,6 +24,9 @@ from fhash_cli.main import main
 
 OWN = (
     "fhash_codec",
+    "fhash_codec.appending.merging",
+    "fhash_codec.appending.writer",
+    "fhash_codec.dataset_encoding",
     "fhash_codec.encoding",
     "fhash_codec.compact.tiles_to_promise",
     "fhash_codec.isosurface",
@@ -60,6 +63,8 @@ def run(words: list[str], log: str, inject: list[list[Any]]) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         for name, *arguments in inject:
             getattr(injections, name)(*arguments)
+        if words[0] == "writer":
+            injections.write_steps(*words[1:])
         sys.argv = ["fhash", *words]
         main()
     except SystemExit as end:

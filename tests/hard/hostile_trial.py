@@ -26,6 +26,7 @@ from typing import Any
 import mutations
 import numpy as np
 from containers import unpack
+from further_trials import Further
 from PIL import Image
 
 import fhash_cli.main
@@ -52,14 +53,19 @@ class Trial:
         self.path, self.folder = folder / "run.fhz", folder
         self.path.write_bytes(self.mutation.data)
         self.ends: list[dict[str, Any]] = []
+        self.variable: str | None = None
         self.shape = self._declared()
 
     def _declared(self) -> tuple[int, ...]:
         """Return the shape of the volume that the file declares; the golden's if it cannot be
-        opened."""
+        opened. Of several variables, the number of the mutation chooses one."""
+        self.variable = variable_of(self.mutation.golden, self.mutation.number)
         try:
             with Container.open(self.path) as container:
-                return tuple(container.header["domain"]["shape"])
+                names = list(container.variables)
+                self.variable = names[self.mutation.number % len(names)] if names else None
+                header = container.variables[self.variable].header if self.variable else {}
+                return tuple((header or container.header)["domain"]["shape"])
         except FhashError:
             return tuple(
                 mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"]
@@ -75,28 +81,36 @@ class Trial:
         all_values, values, picture = (
             str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png")
         )
+        chosen = [] if self.variable is None else ["--var", self.variable]
         self._command("info", ["info", run])
-        self._command("info --json", ["info", run, "--json"])
+        self._command("info --json", ["info", run, "--json", *chosen])
         self._command("verify", ["verify", run, "-q"])
         if self._small():
             self._command(
                 "decode",
-                ["decode", run, "-o", all_values, "--force", "-q"],
+                ["decode", run, "-o", all_values, "--force", "-q", *chosen],
                 lambda: self._values(all_values, self.shape, "whole"),
             )
         sizes = [high - low for low, high in region]
         check = lambda: self._values(values, sizes, "part", region)  # noqa: E731
         self._command(
             "decode region",
-            ["decode", run, "--roi", roi, "--t", steps, "-o", values, "--force", "-q"],
+            ["decode", run, "--roi", roi, "--t", steps, "-o", values, "--force", "-q", *chosen],
             check,
         )
-        self._end("sample", self._sample)
+        self._end("sample", lambda: said(self._sample))
         self._command(
             "render",
-            ["render", run, "-o", picture, "--size", "32x32", "--force", "-q"],
+            ["render", run, "-o", picture, "--size", "32x32", "--force", "-q", *chosen],
             lambda: self._picture(picture),
         )
+        further = Further(self.path, self.folder, self.mutation, self.variable, region)
+        self._end("xarray", lambda: said(further.by_xarray))
+        self._end("zarr", lambda: said(further.by_zarr))
+        if further.grows:
+            self._end("append", lambda: said(further.append))
+        if further.is_part:
+            self._end("merge", lambda: said(further.merge))
         return {
             "number": self.mutation.number,
             "kind": self.mutation.kind,
@@ -175,8 +189,9 @@ class Trial:
             and lines[0].startswith("fhash: error: out of memory")
         ):
             return None
-        # The usual scene may show nothing of a sound file with strange values.
-        if code == 2 and self.mutation.sealed and name == "render":
+        # The usual scene may show nothing of a sound file with strange values; other sound files
+        # do not grow, or do not belong together.
+        if code == 2 and self.mutation.sealed and name in ("render", "append", "merge"):
             return None
         return None if code == 4 else f"exit code {code}: {lines[0][:300]}"
 
@@ -209,7 +224,7 @@ class Trial:
         if self.mutation.kind == "clip" and self._beyond(values):
             return f"{what}: values beyond the range to which they are clipped"
         if not self.mutation.sealed:
-            expected = expected_values(self.mutation.golden)
+            expected = expected_values(self.mutation.golden, self.variable)
             if region is not None:
                 expected = expected[tuple(slice(low, high) for low, high in region)]
             if not np.array_equal(values, expected, equal_nan=True):
@@ -233,19 +248,14 @@ class Trial:
         )
 
     def _sample(self) -> str | None:
-        """Sample points between vertices with the API; an error ends as on the command line."""
+        """Sample points between vertices with the API."""
         chance = np.random.default_rng(self.mutation.number)
         # Points lie within a few vertices, since a sample decodes the vertices between its points,
         # too.
         points = [chance.uniform(low, high - 1, 9) for low, high in self._region()]
-        try:
-            with fhash_codec.open(self.path) as volume:
-                t, z, y, x = points
-                values, slopes = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
-        except Exception as error:
-            line, code = describe_error(error)
-            say(f"error: {line}")
-            raise SystemExit(code) from error
+        with fhash_codec.open(self.path, variable=self.variable) as volume:
+            t, z, y, x = points
+            values, slopes = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
         # A derivative may overflow its type.
         return (
             "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
@@ -265,11 +275,29 @@ def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
     say(f"{kind}: {' '.join(str(message).split())}")
 
 
+def said(work: Callable[[], str | None]) -> str | None:
+    """Do work with the API; an error ends as on the command line."""
+    try:
+        return work()
+    except Exception as error:
+        line, code = describe_error(error)
+        say(f"error: {line}")
+        raise SystemExit(code) from error
+
+
 @cache
-def expected_values(golden: str) -> Any:
+def expected_values(golden: str, variable: str | None) -> Any:
     """Return all values of a golden."""
-    with fhash_codec.open(mutations.GOLDENS / f"{golden}.fhz") as volume:
+    with fhash_codec.open(mutations.GOLDENS / f"{golden}.fhz", variable=variable) as volume:
         return volume[...]
+
+
+@cache
+def variable_of(golden: str, number: int) -> str | None:
+    """Return one of the variables of a golden of several; None for other goldens."""
+    with Container.open(mutations.GOLDENS / f"{golden}.fhz") as container:
+        names = list(container.variables)
+        return names[number % len(names)] if names else None
 
 
 def _resident(key: str) -> int:
@@ -298,7 +326,6 @@ def worker(folder: Path) -> None:
     fhash_cli.main.warn = _warned  # type: ignore[assignment]
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     for golden in mutations.goldens():
-        expected_values(golden)
         warm = Trial(0, folder)
         warm.mutation = mutations.Mutation(
             number=0, golden=golden, kind="none", sealed=True, data=mutations.goldens()[golden][0]

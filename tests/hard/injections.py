@@ -12,6 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+SHAPE = (4, 8, 9)
+"""Vertices (z, y, x) of a frame of `write_steps`."""
+BOUND = 1e-2
+"""Bound of the error of `write_steps`."""
+
 
 def at_operation(folder: str, number: int, code: int, counted: str = "") -> None:
     """Disturb the n-th operation on files below a folder.
@@ -37,6 +42,51 @@ def at_operation(folder: str, number: int, code: int, counted: str = "") -> None
             leave(code)
 
         sys.exit = end  # type: ignore[assignment]
+
+
+def write_steps(path: str, count: str, resumes: str) -> None:
+    """Write a file by `Writer`, step by step, and end as the command line does.
+
+    Args:
+        path: of the file.
+        count: number of steps.
+        resumes: "yes" to go on with a file whose last layer is whole.
+    """
+    import fhash_codec
+    from fhash_cli.output import describe_error, say
+
+    first = 0
+    try:
+        if resumes == "yes":
+            writer = fhash_codec.Writer.resume(path)
+            first = writer.steps
+        else:
+            writer = fhash_codec.Writer(path, shape=SHAPE, config=_grown_settings(), force=True)
+        with writer:
+            for step in range(first, int(count)):
+                writer.append(frame(step))
+    except KeyboardInterrupt:
+        say("error: interrupted")
+        sys.exit(130)
+    except Exception as error:
+        line, code = describe_error(error)
+        say(f"error: {line}")
+        sys.exit(code)
+    sys.exit(0)
+
+
+def frame(step: int) -> Any:
+    """Return the values (z, y, x) of a step of `write_steps`."""
+    import numpy as np
+
+    z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
+    return (np.sin(x / 3 + step) + np.cos(y / 2) + z / 4).astype(np.float32)
+
+
+def _grown_settings() -> Any:
+    from fhash_codec import EncodeConfig
+
+    return EncodeConfig(max_error=BOUND, effort=1, tile="2x4x8x9", timings=False)
 
 
 def file_limit(size: int) -> None:

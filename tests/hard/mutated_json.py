@@ -115,6 +115,7 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
+        header = chance.choice(header.get("variables", [header]))
         for axis in chance.sample(("time", "z", "y", "x"), chance.choice((1, 1, 2, 4))):
             length = header["domain"]["shape"][("time", "z", "y", "x").index(axis)]
             listed = {
@@ -195,7 +196,9 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
 def _array(chance: random.Random, parts: Parts) -> Parts:
     """Change the type, shapes or codecs of one array."""
     arrays = [
-        name for name, data in parts if name.endswith(DOCUMENT) and b'"node_type":"array"' in data
+        name
+        for name, data in parts
+        if name.endswith(f"/{DOCUMENT}") and b'"node_type":"array"' in data
     ]
 
     def change(values: dict[str, Any]) -> None:

@@ -52,8 +52,8 @@ from fhash_formats.transform.tile.sections import (
     PREDICTED,
 )
 
-CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE})
-"""Features of files with coded tiles: all but that of plain files, whose headers differ."""
+CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE, "variables", "named"})
+"""Features of files with coded tiles: all but those of files whose headers differ."""
 
 
 def _flags(chance: random.Random, parts: Parts) -> Parts:
@@ -95,7 +95,11 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         tile_of(document),
     )
     root = json.loads(dict(parts)[DOCUMENT])
-    root["attributes"]["fhash"]["required_features"] = CODED_FEATURES
+    header = root["attributes"]["fhash"]
+    own = [name for name in ("variables", "named") if name in header["required_features"]]
+    header["required_features"] = [*CODED_FEATURES, *own]
+    for variable in header.get("variables", ()):
+        variable["required_features"] = CODED_FEATURES
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 

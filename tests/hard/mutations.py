@@ -7,6 +7,7 @@ reaches the code behind them. A sealed file may even be sound.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 from collections.abc import Callable
@@ -18,10 +19,13 @@ from typing import Any
 import mutated_apart
 import mutated_json
 import mutated_labels
+import mutated_parts
 import mutated_payload
 import mutated_plain
 import mutated_settings
+import mutated_source
 import mutated_sparse
+import mutated_variables
 import mutated_zip
 from containers import Parts, pack, unpack
 
@@ -88,6 +92,10 @@ def mutation(number: int) -> Mutation:
 def _mutation(number: int, golden: str, kind: str) -> Mutation:
     chance = random.Random(number)
     data, parts = goldens()[golden]
+    if kind in OF_ONE and mutated_variables.is_several(parts):
+        raise mutated_payload.NothingFitsError
+    if kind in UNNAMED and mutated_variables.is_named(parts):
+        raise mutated_payload.NothingFitsError
     if kind in DAMAGES:
         return Mutation(
             number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data)
@@ -160,8 +168,19 @@ DAMAGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
 def _packed(
     change: Callable[[random.Random, Parts], Parts],
 ) -> Callable[[random.Random, Parts], bytes]:
-    """Return a change of members as a change of the file."""
-    return lambda chance, parts: pack(change(chance, parts))
+    """Return a change of members as a change of the file.
+
+    Mostly the copies of documents in the root of a file of several variables are changed, too.
+    """
+
+    def changed(chance: random.Random, parts: Parts) -> bytes:
+        after = change(chance, parts)
+        with contextlib.suppress(ValueError, KeyError, RecursionError):
+            if chance.random() < 0.85:
+                after = mutated_variables.consolidated(after)
+        return pack(after)
+
+    return changed
 
 
 _MODULES = (
@@ -172,6 +191,9 @@ _MODULES = (
     mutated_plain,
     mutated_apart,
     mutated_sparse,
+    mutated_variables,
+    mutated_source,
+    mutated_parts,
 )
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
@@ -184,8 +206,23 @@ APART_KINDS = frozenset(mutated_apart.KINDS)
 """Kinds that change parts of a table that lie in arrays of their own, only."""
 SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
 """Kinds that change tables of needed vertices only."""
+SEVERAL_KINDS = frozenset(mutated_variables.KINDS) - {"named path"}
+"""Kinds that change files of several variables only."""
+SOURCE_KINDS = frozenset(mutated_source.KINDS)
+"""Kinds that change metadata of a source only."""
+PART_KINDS = frozenset(mutated_parts.KINDS)
+"""Kinds that change parts of a series or files that grew only."""
+OF_ONE = frozenset(
+    ("length", "domain", "header", "giant", "clip", "integers", "apart", "occupancy", "grown")
+) | (PLAIN_KINDS | SPARSE_KINDS)
+"""Kinds that change files of one variable only."""
+UNNAMED = frozenset(("giant", "clip", "integers", "apart"))
+"""Kinds that change the table under its internal name only."""
+NAMED_KINDS = frozenset(("named path",))
+"""Kinds that change files with the names of their source only."""
 
 
 def header_of(parts: Parts) -> Any:
-    """Return the header of a golden."""
-    return json.loads(dict(parts)["zarr.json"])["attributes"]["fhash"]
+    """Return the header of a golden; of several variables, that of the first."""
+    header = json.loads(dict(parts)["zarr.json"])["attributes"]["fhash"]
+    return header["variables"][0] if "variables" in header else header

@@ -6,18 +6,22 @@ The next call gives the result of an undisturbed call and removes what was left.
 from __future__ import annotations
 
 import random
+import shutil
 import signal
 import time
 from pathlib import Path
 
 import pytest
-from faulty import COMMANDS, PROFILES, Bench, Listing, moments
+from faulty import COMMANDS, GROWING, PROFILES, Bench, Listing, moments
 from reporting import LONG, record
 
 KILLED = (
     (
         "encode compact",
         "encode paper",
+        "encode several",
+        "merge",
+        "append",
         "decode h5",
         "decode zarr",
         "decode vti",
@@ -72,6 +76,8 @@ def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(
         assert (ended.code, ended.output) == (-signal.SIGKILL, ""), number
         check_killed(bench, name, before)
         left += bool(leftovers(bench.now()))
+        if name in GROWING:  # counts of coefficients are a share where steps are dropped
+            shutil.copy(bench.folder / "grown.fhz", bench.out / "a.fhz")
         ended = bench.run(name)
         assert ended.code == 0, (number, ended.output)
         assert bench.now() == bench.new(name), number

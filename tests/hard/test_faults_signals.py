@@ -17,6 +17,9 @@ EACH_ALONE = ("render pictures",)
 COMMITTED = (
     "encode compact",
     "encode paper",
+    "encode several",
+    "merge",
+    "append",
     "decode npy",
     "decode h5",
     "decode zarr",

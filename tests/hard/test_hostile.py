@@ -18,7 +18,15 @@ import mutations
 import pytest
 from reporting import LONG, record
 
-PARTIAL = mutations.PLAIN_KINDS | mutations.APART_KINDS | mutations.SPARSE_KINDS
+PARTIAL = (
+    mutations.PLAIN_KINDS
+    | mutations.APART_KINDS
+    | mutations.SPARSE_KINDS
+    | mutations.SEVERAL_KINDS
+    | mutations.SOURCE_KINDS
+    | mutations.PART_KINDS
+    | mutations.NAMED_KINDS
+)
 """Kinds that pass over goldens without what they change."""
 MANY = 12_000
 """Mutations; kinds and goldens take turns."""

@@ -94,7 +94,7 @@ class GrowingContainer(ContainerWriter):
         super().__init__(path, force=force or continues is not None)
         self._continues = continues
         self._target = Path(os.path.realpath(self.path))
-        self._awake = False
+        self._awake = self._opening = False
         # The file that has the name, and how many bytes from its beginning are lasting members.
         self._ours: tuple[int, int] | None = None
         self._lasting = 0
@@ -117,13 +117,15 @@ class GrowingContainer(ContainerWriter):
 
     def close(self) -> None:
         """Remove the hidden file; what was published stays."""
-        if self._awake:
-            with suppress(OSError):  # a full disk must not hide the first error
-                self._file.close()
-            leftovers.remove(self._temporary)
-        if self._spare is not None:
-            leftovers.remove(self._spare)
-        self._awake, self._spare = False, None
+        with signals_held():
+            if self._awake or self._opening:
+                with suppress(OSError, AttributeError):  # a full disk must not hide the first error
+                    self._file.close()
+                leftovers.remove(self._temporary)
+            if self._spare is not None:
+                leftovers.remove(self._spare)
+            self._awake = self._opening = False
+            self._spare = None
 
     def add_layer(self, array: GrowingArray, number: int, streams: Sequence[bytes]) -> None:
         """Write a layer of an array.
@@ -162,10 +164,10 @@ class GrowingContainer(ContainerWriter):
         that was published last then stays.
         """
         tail = self._tail(header)
-        # A file that fhash's reader would refuse is not written.
-        self._open(tail).close()
         size = self._position + len(tail)
         try:
+            # A file that fhash's reader would refuse is not written.
+            self._open(tail).close()
             self._file.write(tail)
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -208,8 +210,11 @@ class GrowingContainer(ContainerWriter):
         fresh = self._target.with_name(leftovers.new_stem(self._target.name) + leftovers.PARTIAL)
         hidden = self._spare or fresh
         common = 0 if self._spare is None else self._common
+        # A signal may come between any two lines: `close` removes the file from here on.
+        self._temporary, self._opening = hidden, True
         try:
-            file = hidden.open("xb" if self._spare is None else "r+b")
+            self._file = hidden.open("xb" if self._spare is None else "r+b")  # type: ignore[assignment]
+            file = self._file
             try:
                 file.truncate(common)
                 file.seek(common)
@@ -222,7 +227,7 @@ class GrowingContainer(ContainerWriter):
                 raise
         except OSError as error:
             raise self._explained(error) from error
-        self._temporary, self._file, self._spare, self._awake = hidden, file, None, True  # type: ignore[assignment]
+        self._spare, self._awake, self._opening = None, True, False
 
     def _copy(self, file: Any, start: int) -> None:
         """Copy lasting members from the file that has the name, from a position on."""

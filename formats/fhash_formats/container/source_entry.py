@@ -25,6 +25,7 @@ from fhash_formats.source_metadata import (
 )
 from fhash_formats.support.number_types import DTYPES
 from fhash_formats.support.typed_values import (
+    MAX_BYTES,
     attribute_value,
     inline_array,
     type_of_name,
@@ -46,8 +47,6 @@ AUXILIARY = "auxiliary/"
 """Prefix of the arrays."""
 MAX_VARIABLES = 1024
 """Arrays beside the data that a reader takes."""
-MAX_BYTES = 1 << 28
-"""Bytes of all arrays beside the data that a reader takes, decoded."""
 MAX_FURTHER = 16
 """Dimensions of the variable: four axes, and others of length 1."""
 
@@ -83,10 +82,29 @@ class _Entry:
     values: npt.NDArray[Any] | None = None
 
 
+class _Room:
+    """The bytes that all arrays and attributes beside the data may take, decoded.
+
+    Attributes:
+        left: those that are not taken yet.
+    """
+
+    def __init__(self) -> None:
+        self.left = MAX_BYTES
+
+    def take(self, size: int) -> None:
+        """Take some bytes; raises DamagedFileError where there are no more."""
+        self.left -= size
+        if self.left < 0:
+            raise DamagedFileError(
+                f"header key {SOURCE}: its values take more than {MAX_BYTES} bytes"
+            )
+
+
 def check_source(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> None:
     """Check the header's `source` and its arrays; raises DamagedFileError that names the key."""
     if has_source(header):
-        _parsed(header, arrays)
+        _parsed(header, arrays, _Room())
 
 
 def has_source(header: Mapping[str, Any]) -> bool:
@@ -103,7 +121,8 @@ def read_metadata(
     """
     if not has_source(header):
         return None
-    dimensions, entries = _parsed(header, arrays)
+    room = _Room()
+    dimensions, entries = _parsed(header, arrays, room)
     entry = header[SOURCE]
     variables = []
     for each in entries:
@@ -124,9 +143,11 @@ def read_metadata(
         )
     return SourceMetadata(
         dimensions=dimensions,
-        variable_attributes=_attributes(entry, "variable", header["variable"]["attributes"]),
+        variable_attributes=_attributes(
+            entry, "variable", header["variable"]["attributes"], _Room()
+        ),
         variables=tuple(variables),
-        attributes=_attributes(entry, "attributes", {}),
+        attributes=_attributes(entry, "attributes", {}, _Room()),
         stored=entry.get("stored"),
         file=entry.get("file"),
         digest=entry.get("digest"),
@@ -134,7 +155,7 @@ def read_metadata(
 
 
 def _parsed(
-    header: Mapping[str, Any], arrays: Mapping[str, Readable]
+    header: Mapping[str, Any], arrays: Mapping[str, Readable], room: _Room
 ) -> tuple[dict[str, str], list[_Entry]]:
     """The dimensions of the variable, and the arrays beside it, all checked."""
     top = Record(header, "header key ").record(SOURCE)
@@ -153,19 +174,18 @@ def _parsed(
             top.text(key)
     if top.has("stored"):
         top.choice("stored", tuple(DTYPES))
-    _attributes(header[SOURCE], "variable", header["variable"]["attributes"])
-    _attributes(header[SOURCE], "attributes", {})
+    _attributes(header[SOURCE], "variable", header["variable"]["attributes"], room)
+    _attributes(header[SOURCE], "attributes", {}, room)
     records = top.records("variables") if top.has("variables") else []
     top.need(len(records) <= MAX_VARIABLES, "variables", f"at most {MAX_VARIABLES} of them")
     entries: list[_Entry] = []
-    left = MAX_BYTES
+    taken = {header["variable"]["name"]}
     for record in records:
-        entry = _entry(record, header, arrays, names, dimensions, lengths)
-        taken = {each.name for each in entries} | {header["variable"]["name"]}
+        entry = _entry(record, header, arrays, names, dimensions, lengths, room)
         record.need(entry.name not in taken, "name" if record.has("name") else "axis", "one only")
         if entry.axis is None:
-            left -= prod(entry.shape) * type_of_name(entry.type_name).itemsize
-        top.need(left >= 0, "variables", f"at most {MAX_BYTES} bytes of values")
+            room.take(prod(entry.shape) * type_of_name(entry.type_name).itemsize)
+        taken.add(entry.name)
         entries.append(entry)
     return dimensions, entries
 
@@ -226,6 +246,7 @@ def _entry(
     names: Mapping[str, str],
     dimensions: Mapping[str, str],
     lengths: Mapping[str, int],
+    room: _Room,
 ) -> _Entry:
     """One entry of `variables`, checked."""
     axis = record.choice("axis", AXES) if record.has("axis") else None
@@ -250,7 +271,7 @@ def _entry(
         _check_array(array, arrays, shape or (1,), dtype)
     else:
         try:
-            values = inline_array(record.get("values"), kind, shape)
+            values = inline_array(record.get("values"), kind, shape, room.left)
         except DamagedFileError as error:
             raise DamagedFileError(f"header key {SOURCE}.variables: {name}: {error}") from error
     if record.has("coordinate"):
@@ -260,7 +281,9 @@ def _entry(
         dimensions=tuple(along),
         shape=shape,
         type_name=kind,
-        attributes=_changed(record.get("attributes") if record.has("attributes") else {}, base),
+        attributes=_changed(
+            record.get("attributes") if record.has("attributes") else {}, base, room
+        ),
         is_coordinate=record.get("coordinate") if record.has("coordinate") else axis is not None,
         axis=axis,
         array=array,
@@ -300,27 +323,35 @@ def narrowed(positions: npt.NDArray[np.float64], dtype: np.dtype[Any]) -> npt.ND
         return positions.astype(dtype)
 
 
-def _attributes(entry: Mapping[str, Any], key: str, base: Mapping[str, Any]) -> dict[str, Any]:
-    return _changed(entry.get(key, {}), base)
+def _attributes(
+    entry: Mapping[str, Any], key: str, base: Mapping[str, Any], room: _Room
+) -> dict[str, Any]:
+    return _changed(entry.get(key, {}), base, room)
 
 
-def _changed(changes: object, base: Mapping[str, Any]) -> dict[str, Any]:
+def _changed(changes: object, base: Mapping[str, Any], room: _Room) -> dict[str, Any]:
     """Attributes of a base, with some of them changed, added or, where null, left out."""
     if not isinstance(changes, Mapping):
         raise DamagedFileError(f"header key {SOURCE}: attributes are no object")
-    found = {name: _natural(value) for name, value in base.items() if name not in changes}
+    found = {}
+    for name, value in base.items():
+        if name not in changes:
+            found[name] = _natural(value, room)
     for name, value in changes.items():
         if value is None:
             continue
         if not is_plain_name(name):
             raise DamagedFileError(f"header key {SOURCE}: attribute {ascii(name)[:40]} has no name")
-        found[name] = attribute_value(value)
+        found[name] = attribute_value(value, room.left)
+        room.take(getattr(found[name], "nbytes", 0))
     return found
 
 
-def _natural(value: Any) -> Any:
+def _natural(value: Any, room: _Room) -> Any:
     """An attribute of a coordinate or variable of the header, which may be any JSON value."""
     try:
-        return attribute_value(value)
+        found = attribute_value(value, room.left)
     except DamagedFileError:
         return value
+    room.take(getattr(found, "nbytes", 0))
+    return found

@@ -130,6 +130,7 @@ def read_variables(
         else:
             others.append(array)
     shared = set()
+    free = frozenset(others)
     own = {name: tuple(found) for name, found in places.items()}
     for name, header in headers.items():
         for part, node in header.get(SHARES, {}).items():
@@ -138,7 +139,7 @@ def read_variables(
                 raise DamagedFileError(f"array {part_place(node, part)} is missing")
             _place(places[name], part, places[owner][part])
         for axis, dimension in zip(POSITIONS, header["dimensions"], strict=True):
-            if dimension not in others:
+            if dimension not in free:
                 raise DamagedFileError(f"array {dimension} is missing")
             places[name][f"{_COORDINATES}{axis}"] = dimension
             shared.add(dimension)
@@ -167,7 +168,7 @@ def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The headers of all variables by name, complete and checked."""
     top = Record(root, "header key ")
     check_format(top)
-    features = top.texts("required_features")
+    features = frozenset(top.texts("required_features"))
     headers: dict[str, dict[str, Any]] = {}
     nodes: set[str] = set()
     for entry, record in zip(top.get(FEATURE), top.records(FEATURE), strict=True):

@@ -20,6 +20,7 @@ from fhash_formats.support.number_types import DTYPES
 from fhash_formats.support.plain_json import UnknownValueError, attribute_json
 
 __all__ = [
+    "MAX_BYTES",
     "TEXT",
     "attribute_value",
     "inline_array",
@@ -35,6 +36,8 @@ JSON = "json"
 """Name of the type of attributes that are any JSON values, as Zarr has them."""
 MAX_BYTES_LENGTH = 1 << 16
 """Bytes of one text of a fixed length."""
+MAX_BYTES = 1 << 28
+"""Bytes of the values of one list: texts of a fixed length may take far more than in a file."""
 _BYTES = re.compile(r"bytes([1-9][0-9]{0,4})")
 _NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
@@ -82,11 +85,21 @@ def inline_values(values: npt.NDArray[Any], name: str) -> list[Any] | None:
     return listed if inline_array(listed, name, plain.shape).tobytes() == plain.tobytes() else None
 
 
-def inline_array(listed: object, name: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """The array of a list of JSON values; raises DamagedFileError where they are not its values."""
+def inline_array(
+    listed: object, name: str, shape: tuple[int, ...], most: int = MAX_BYTES
+) -> npt.NDArray[Any]:
+    """The array of a list of JSON values, of at most `most` bytes.
+
+    Raises DamagedFileError where they are not its values.
+    """
     dtype = type_of_name(name)
     if not isinstance(listed, list) or len(listed) != math.prod(shape):
         raise DamagedFileError(f"a list of {math.prod(shape)} values is needed")
+    if len(listed) * dtype.itemsize > most:
+        raise DamagedFileError(f"{len(listed)} values of type {name} take too many bytes")
+    plain = _numbers(listed, dtype)
+    if plain is not None:
+        return plain.reshape(shape)
     result: npt.NDArray[Any] = np.empty(len(listed), dtype=dtype)
     for number, value in enumerate(listed):
         result[number] = _stored(value, dtype)
@@ -123,8 +136,11 @@ def typed_attribute(value: Any) -> Any:
     return plain if natural is not None and finite else {name: plain}
 
 
-def attribute_value(value: Any) -> Any:
-    """The attribute that JSON values stand for; raises DamagedFileError for others."""
+def attribute_value(value: Any, most: int = MAX_BYTES) -> Any:
+    """The attribute that JSON values stand for, of at most `most` bytes.
+
+    Raises DamagedFileError for others.
+    """
     if isinstance(value, str | bool):
         return value
     if isinstance(value, int | float):
@@ -133,13 +149,13 @@ def attribute_value(value: Any) -> Any:
         if all(isinstance(each, str) for each in value):
             return list(value)
         whole = all(type(each) is int for each in value)
-        return inline_array(value, "int64" if whole else "float64", (len(value),))
+        return inline_array(value, "int64" if whole else "float64", (len(value),), most)
     if isinstance(value, Mapping) and len(value) == 1:
         ((name, inner),) = value.items()
         if name == JSON:
             return inner
         if isinstance(inner, list):
-            array = inline_array(inner, name, (len(inner),))
+            array = inline_array(inner, name, (len(inner),), most)
             return array.tolist() if name == TEXT else array
         return _scalar(inner, name)
     raise DamagedFileError(f"attribute {ascii(value)[:80]} has no known type")
@@ -148,6 +164,23 @@ def attribute_value(value: Any) -> Any:
 def _scalar(value: Any, name: str) -> Any:
     """One value of a type."""
     return inline_array([value], name, (1,))[0]
+
+
+def _numbers(listed: list[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any] | None:
+    """The numbers of a list at once; None where one of them needs a closer look."""
+    types = set(map(type, listed))
+    if dtype.kind in "iu" and types == {int}:
+        limits = np.iinfo(dtype)
+        inside = limits.min <= min(listed) and max(listed) <= limits.max
+        return np.array(listed, dtype=dtype) if inside else None
+    if dtype.kind != "f" or not types <= {int, float}:
+        return None
+    try:
+        with np.errstate(over="ignore"):
+            numbers = np.array(listed, dtype=np.float64).astype(dtype)
+    except OverflowError:
+        return None
+    return numbers if np.isfinite(numbers).all() else None
 
 
 def _number(value: Any) -> Any:

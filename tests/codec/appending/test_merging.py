@@ -165,6 +165,10 @@ def rewritten(path: Path, change) -> None:
         (lambda header, errors: header["model"].pop("gains"), "model.gains"),
         (lambda header, errors: errors.fill(np.nan), "steps/errors has numbers"),
         (lambda header, errors: errors.fill(-1), "steps/errors has numbers"),
+        *(
+            (lambda header, errors, at=at, new=new: errors.__setitem__((0, at), new), "no errors")
+            for at, new in ((0, 1e300), (0, 0.5), (1, -1e-9), (2, 1e200), (4, -1.0), (8, 1e9))
+        ),
     ],
 )
 def test_a_hostile_part_is_refused(tmp_path, change, message) -> None:

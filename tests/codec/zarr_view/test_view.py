@@ -16,6 +16,7 @@ from fhash_codec import EncodeConfig, Volume
 from fhash_codec.zarr_view.view import ZarrView, opened_view
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.source_metadata import SourceMetadata, SourceVariable
 
 ViewOf = Callable[..., ZarrView]
 
@@ -299,3 +300,29 @@ def test_what_cannot_be_opened_is_refused(tmp_path: Path, whole: Path) -> None:
     opened.close()
     with pytest.raises(InputError, match="closed"):
         view.get("density/c/0/0/0/0")
+
+
+def test_attributes_of_the_file_may_be_arrays(view_of: ViewOf) -> None:
+    golden = Path(__file__).resolve().parents[2] / "golden"
+    attributes = document(view_of(golden / "compact-1.7-source.fhz"), "")["attributes"]
+    assert attributes["title"] == "golden"
+    assert attributes["range"][0] == pytest.approx(0.1)
+
+
+def test_positions_do_not_take_the_place_of_an_array_beside_other_values(
+    view_of: ViewOf, tmp_path: Path
+) -> None:
+    """`lat` is an array of two dimensions of one variable, and the positions of another."""
+    first = ArraySeries(np.zeros((2, 1, 3, 4), np.float32), name="u")
+    first.metadata = SourceMetadata(
+        dimensions={"time": "t", "y": "y", "x": "x"},
+        variables=(SourceVariable(name="lat", dimensions=("y", "x"), values=np.eye(3, 4)),),
+    )
+    along = Coordinate(name="lat", values=np.arange(3) * 2.0)
+    second = ArraySeries(np.ones((2, 1, 3, 4), np.float32), name="v", coords={"y": along})
+    config = EncodeConfig(effort=1, max_error=0.0)
+    fhash_codec.encode_dataset({"u": first, "v": second}, tmp_path / "a.fhz", config)
+    view = view_of(tmp_path / "a.fhz")
+    assert view.arrays["lat"].shape == (3, 4)
+    assert view.arrays["v"].dimension_names[-2:] == ("lat_2", "x")
+    assert view.arrays["lat_2"].shape == (3,)

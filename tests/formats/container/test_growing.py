@@ -219,3 +219,35 @@ def test_the_grown_file_is_that_of_a_plain_writer_but_for_the_order_of_its_membe
         writer.commit(growing_header(4))
         size = grown.size
     assert (tmp_path / "b.fhz").stat().st_size == size
+
+
+def test_an_interrupt_while_the_hidden_file_is_made_leaves_none(tmp_path, monkeypatch) -> None:
+    """A signal may come after the file was made, and before anything knows of it."""
+
+    with GrowingContainer(tmp_path / "a.fhz") as growing:
+        add_layer(growing, 0)
+    made = Path.open
+
+    def opened(self, mode="r", **options):
+        file = made(self, mode, **options)
+        if mode == "xb":
+            file.close()
+            raise KeyboardInterrupt
+        return file
+
+    monkeypatch.setattr(Path, "open", opened)
+    with pytest.raises(KeyboardInterrupt), GrowingContainer(tmp_path / "b.fhz") as growing:
+        add_layer(growing, 0)
+    assert os.listdir(tmp_path) == ["a.fhz"]
+
+
+def test_a_full_disk_before_the_check_of_the_end_is_explained(tmp_path, monkeypatch) -> None:
+    def full(self, tail):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with GrowingContainer(tmp_path / "a.fhz") as growing:
+        add_layer(growing, 0)
+        monkeypatch.setattr(GrowingContainer, "_open", full)
+        with pytest.raises(OutputError, match=r"a\.fhz: no space left.*the layers before"):
+            add_layer(growing, 1)
+    assert check_layers(tmp_path / "a.fhz") == 1

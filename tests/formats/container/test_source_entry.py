@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -186,3 +187,25 @@ def test_mutations_are_damage_or_are_read() -> None:
 def test_no_object_is_damage() -> None:
     with pytest.raises(DamagedFileError, match="source"):
         check_source(header("text"), ARRAYS)
+
+
+def test_short_texts_of_a_long_type_take_no_memory_before_they_are_refused() -> None:
+    """65,536 bytes of memory for 3 in the file: attributes count as arrays do."""
+    texts = {"bytes65536": [""] * 3000}
+    hostile = [
+        put("attributes", "a", value={"bytes65536": [""] * 100_000}),
+        put("attributes", value={f"a{number}": texts for number in range(3)}),
+        put("variables", 1, "attributes", value={f"a{number}": texts for number in range(3)}),
+        put("lengths", value={"bnds": 2, "long": 100_000}),
+    ]
+    for number, change in enumerate(hostile):
+        source = copy.deepcopy(sound())
+        change(source)
+        if number == 3:
+            listed = {"name": "c", "dimensions": ["long"], "values": [""] * 100_000}
+            source["variables"].append({**listed, "dtype": "bytes65536"})
+        tracemalloc.start()
+        with pytest.raises(DamagedFileError, match="bytes"):
+            check_source(header(source), ARRAYS)
+        assert tracemalloc.get_traced_memory()[1] < 1.2 * MAX_BYTES, number
+        tracemalloc.stop()

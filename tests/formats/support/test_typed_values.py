@@ -123,3 +123,24 @@ def test_hostile_attributes_are_damage(value: Any) -> None:
     json.dumps(value)
     with pytest.raises(DamagedFileError):
         attribute_value(value)
+
+
+@pytest.mark.parametrize("name", ["int8", "uint64", "int64", "float16", "float32", "float64"])
+def test_long_lists_of_numbers_are_taken_as_single_ones_are(name: str) -> None:
+    numbers = [0, 1, 127, -1, 2**63, 2**64, 0.1, -0.0, 1e300, 10**300, 10**400, True, "NaN", None]
+    for number in numbers:
+        try:
+            single = attribute_value({name: number})
+        except DamagedFileError:
+            with pytest.raises(DamagedFileError):
+                inline_array([1, number, 1], name, (3,))
+        else:
+            found = inline_array([1, number, 1], name, (3,))
+            assert found[1:2].tobytes() == np.asarray(single).tobytes()
+            assert found.dtype == single.dtype
+
+
+def test_values_of_more_bytes_than_are_allowed_are_refused() -> None:
+    assert inline_array(["", "a"], "bytes4", (2,), 8).tolist() == [b"", b"a"]
+    with pytest.raises(DamagedFileError, match="too many bytes"):
+        inline_array(["", "a"], "bytes4", (2,), 7)
