@@ -43,6 +43,12 @@ def open_source(source: Source) -> Iterator[Series]:
         yield source if isinstance(source, Series) else array_series(source)
 
 
+def mask_files(config: EncodeConfig) -> list[str]:
+    """Paths of the masks among the features."""
+    prefix = "mask:"
+    return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]
+
+
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
     """The feature of a mask in memory; raises InputError for a shape other than the series'."""
     values = np.asarray(mask, dtype=bool)
