@@ -41,10 +41,17 @@ class Scan:
 
         shape: of a frame.
         """
-        if step not in self.missing:
-            return None
-        missing = np.unpackbits(self.missing[step], count=prod(shape)).view(np.bool_)
-        return ~missing.reshape(shape)
+        return finite_mask(self.missing, step, shape)
+
+
+def finite_mask(
+    missing: Mapping[int, npt.NDArray[np.uint8]], step: int, shape: tuple[int, int, int]
+) -> npt.NDArray[np.bool_] | None:
+    """The mask of `Scan.finite`, from `Scan.missing`."""
+    if step not in missing:
+        return None
+    bits = np.unpackbits(missing[step], count=prod(shape)).view(np.bool_)
+    return ~bits.reshape(shape)
 
 
 def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan:
@@ -69,11 +76,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
                 ranks.add(piece)
             count, low, high = count + piece_count, min(low, piece_low), max(high, piece_high)
         if count < frame.size:
-            bits = np.packbits(~np.isfinite(frame))
-            # A land mask is the same at every step: keep one copy of it.
-            if last_bits is None or not np.array_equal(bits, last_bits):
-                last_bits = bits
-            missing[step] = last_bits
+            missing[step] = last_bits = _missing_bits(frame, last_bits)
         progress("scanning", step + 1, steps, "")
     series.check()
     if mean.count == 0:
@@ -89,6 +92,48 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
         finite_count=mean.count,
         missing=missing,
     )
+
+
+def scan_steps(
+    series: Series, steps: range, known: ValueRange, *, may_miss: bool, progress: Progress
+) -> dict[int, npt.NDArray[np.uint8]]:
+    """The masks of missing values of some steps, as `Scan.missing` has them, of a scanned series.
+
+    known: range of the whole series. may_miss: whether values of it are missing.
+
+    Raises InputError for values beyond the range, and for missing ones where none may be: the data
+    are not those that were scanned. Progress stage: "scanning".
+    """
+    missing: dict[int, npt.NDArray[np.uint8]] = {}
+    last_bits: npt.NDArray[np.uint8] | None = None
+    for number, step in enumerate(steps):
+        frame, count, mean = series.read(step), 0, Mean()
+        for piece in pieces(frame):
+            piece_count, low, high = _scan_piece(piece, mean)
+            count += piece_count
+            if piece_count and not (known.low <= low and high <= known.high):
+                raise InputError(
+                    f"{series.source}: step {step} has values from {low:.9g} to {high:.9g}, and "
+                    f"the plan is of data from {known.low:.9g} to {known.high:.9g}; make it anew"
+                )
+        if count < frame.size:
+            if not may_miss:
+                raise InputError(
+                    f"{series.source}: step {step} has missing values, and the plan is of data "
+                    "without; make it anew"
+                )
+            missing[step] = last_bits = _missing_bits(frame, last_bits)
+        progress("scanning", number + 1, len(steps), "")
+    return missing
+
+
+def _missing_bits(
+    frame: npt.NDArray[Any], last: npt.NDArray[np.uint8] | None
+) -> npt.NDArray[np.uint8]:
+    """The bits of the values of a frame that are not finite; the last ones where they are equal."""
+    bits = np.packbits(~np.isfinite(frame))
+    # A land mask is the same at every step: keep one copy of it.
+    return last if last is not None and np.array_equal(bits, last) else bits
 
 
 def _scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.scan import scan
+from fhash_codec.coreset.scan import scan, scan_steps
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
@@ -66,3 +67,26 @@ def test_progress_counts_the_steps() -> None:
     calls = []
     scan(ArraySeries(np.zeros((3, 1, 1, 1))), lambda *call: calls.append(call))
     assert calls == [("scanning", 1, 3, ""), ("scanning", 2, 3, ""), ("scanning", 3, 3, "")]
+
+
+def test_masks_of_some_steps_are_those_of_the_whole() -> None:
+    array = np.random.default_rng(1).random((5, 3, 4, 5))
+    array[1:4, 0], array[3, 1, 1] = np.nan, np.inf
+    series = ArraySeries(array)
+    whole = scan(series, silent)
+    some = scan_steps(series, range(1, 4), whole.value_range, may_miss=True, progress=silent)
+    assert list(some) == [1, 2, 3]
+    for step, bits in some.items():
+        np.testing.assert_array_equal(bits, whole.missing[step])
+
+
+def test_steps_of_other_data_are_refused() -> None:
+    array = np.arange(24.0).reshape(2, 2, 2, 3)
+    series = ArraySeries(array)
+    for known in (ValueRange(1, 23), ValueRange(0, 22)):
+        with pytest.raises(InputError, match="the plan is of data from"):
+            scan_steps(series, range(2), known, may_miss=False, progress=silent)
+    array[1, 0, 0, 0] = np.nan
+    assert scan_steps(series, range(1), ValueRange(0, 23), may_miss=False, progress=silent) == {}
+    with pytest.raises(InputError, match="step 1 has missing values, and the plan is of data wit"):
+        scan_steps(series, range(2), ValueRange(0, 23), may_miss=False, progress=silent)
