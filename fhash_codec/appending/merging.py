@@ -200,6 +200,14 @@ class _Streams(Sequence[bytes]):
             (part, index) for part in self.parts for index in product(*map(range, part.table.grid))
         ]
 
+    def sizes(self) -> list[int]:
+        """Bytes of each tile, from the indices of the parts."""
+        sizes = []
+        for part, place in self.places:
+            with damage_named(part.path):
+                sizes.append(part.table.coded_bytes(place))
+        return sizes
+
     def __len__(self) -> int:
         return sum(prod(part.table.grid) for part in self.parts)
 
@@ -264,6 +272,7 @@ class _Whole:
             tile=first.table.chunk_shape,
             settings=first.settings,
             streams=self.streams,
+            sizes=self.streams.sizes(),
         )
         progress("merging", 0, 1, "")
         table.write(writer)

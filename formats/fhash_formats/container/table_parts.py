@@ -40,6 +40,7 @@ class TableParts:
         settings: settings that all tiles share.
         streams: stream of each tile, in C order of their grid, masks included.
         apart: whether head and masks have arrays of their own; by default from APART_BYTES on.
+        sizes: bytes of each stream, where they are known without reading it.
     """
 
     shape: tuple[int, ...]
@@ -48,13 +49,19 @@ class TableParts:
     settings: TileSettings
     streams: Sequence[bytes]
     apart: bool | None = None
+    sizes: Sequence[int] | None = None
+
+    @cached_property
+    def _sizes(self) -> Sequence[int]:
+        """Bytes of each stream."""
+        return [len(stream) for stream in self.streams] if self.sizes is None else self.sizes
 
     @cached_property
     def _apart(self) -> bool:
         """Whether head and masks have arrays of their own."""
         if self.apart is not None:
             return self.apart
-        return sum(len(stream) for stream in self.streams) >= APART_BYTES
+        return sum(self._sizes) >= APART_BYTES
 
     @cached_property
     def _split(self) -> tuple[Sequence[bytes], Sequence[bytes] | None]:
@@ -126,5 +133,6 @@ class TableParts:
             writer.add_array(name, chunks=chunks, **described)
             return
         grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-        shards = shard_shape(self.tile, grid)
+        sizes = self._sizes if chunks is self.streams else [len(chunk) for chunk in chunks]
+        shards = shard_shape(self.tile, grid, sizes)
         writer.add_sharded(name, shard_shape=shards, chunks=iter(chunks), **described)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from table_files import HEAD, SHAPE, table_parts, write_table
 
-from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container import Container, ContainerWriter, sharding
 from fhash_formats.container.table_parts import APART_BYTES
 
 
@@ -99,3 +99,23 @@ def test_a_large_table_has_its_parts_apart() -> None:
     parts = replace(table_parts(mask=False), streams=[bytes(APART_BYTES)])
     assert parts.features == ["transform", "apart"]
     assert replace(parts, streams=[bytes(APART_BYTES - 1)]).features == ["transform"]
+
+
+@pytest.mark.parametrize("most", [1, 200])
+def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypatch, most) -> None:
+    parts, header = table_parts(), samples.compact_header()
+    whole = write_table(tmp_path / "whole.fhz", header, parts, apart=True)
+    monkeypatch.setattr(sharding, "MAX_MEMBER", most)
+    known = replace(parts, sizes=[len(stream) for stream in parts.streams])
+    paths = [
+        write_table(tmp_path / f"{number}.fhz", header, each, apart=True)
+        for number, each in enumerate((parts, known))
+    ]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with Container.open(whole) as container, Container.open(paths[0]) as cut:
+        table, other = container.arrays["tables/level_1"], cut.arrays["tables/level_1"]
+        assert len(other.chunks) > len(table.chunks)
+        np.testing.assert_array_equal(table.read(), other.read())
+        for index in np.ndindex(table.grid):
+            assert table.coded_bytes(index) == other.coded_bytes(index) == len(other.coded(index))
+        assert cut.verify()
