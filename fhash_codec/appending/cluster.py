@@ -1,9 +1,10 @@
 """Encoding on a cluster of dask: the plan is made once and sent, workers code parts, one is made.
 
-Each task is a part of the series (parts.py), coded by one thread of a worker, which returns the
-bytes of its file. The client keeps these in files beside the output and joins them (merging.py). So
-it holds a few parts at a time, and the output is complete or absent. Of the client this needs
-`submit` and, for arrays of dask, `compute`; dask is not imported.
+Each task works in one thread of a worker. The first ones scan a long series, whose figures the
+client joins (coreset/scan.py). Then each codes a part of it (parts.py) and returns the bytes of its
+file. The client keeps these in files beside the output and joins them (merging.py). So it holds the
+results of a few tasks at a time, and the output is complete or absent. The client needs to have the
+methods `submit` and, for arrays of dask, `compute`; dask is not imported.
 """
 
 from __future__ import annotations
@@ -13,10 +14,9 @@ import os
 import time
 from asyncio import CancelledError
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from copy import copy
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,11 +27,14 @@ import numpy.typing as npt
 from fhash_codec.appending.merging import join_parts
 from fhash_codec.appending.parts import Part, encode_part
 from fhash_codec.appending.series_plan import SeriesPlan, bounded
+from fhash_codec.compact.tiles.blocks import fits_memory
 from fhash_codec.config import EncodeConfig
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.features import InTime, parse_feature
 from fhash_codec.coreset.lazy import LazyFrames
+from fhash_codec.coreset.scan import Scan, SpanScan
 from fhash_codec.coreset.selection import Source, mask_files, open_source
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.stage_clock import recording, stage
@@ -43,10 +46,10 @@ from fhash_formats.support.atomic import check_output, explained
 from fhash_formats.support.locations import local_path
 from fhash_formats.support.threads import at_most
 
-__all__ = ["HeldSteps", "code_part", "encode_on_cluster"]
+__all__ = ["HeldSteps", "encode_on_cluster"]
 
 PART_BYTES = 256 << 20
-"""Bytes of the values of a part, unless one layer of tiles has more."""
+"""Bytes of the values of a task, unless one layer of tiles, or one frame, has more."""
 PARTS_PER_THREAD = 4
 """Parts for each thread of the cluster, where there are layers enough: threads are not equally
 fast."""
@@ -67,11 +70,12 @@ def encode_on_cluster(
 ) -> dict[str, Any]:
     """Encode a series on the workers of a dask client; see `fhash_codec.encode`.
 
-    source: a file that all workers see, or a labelled or plain array of dask. The client reads all
-        frames of it once for their range, one after the other, and the sample of the plan.
+    source: a file that all workers see, or a labelled or plain array of dask. The client reads the
+        sample of the plan. It also reads all frames once, one after the other, of a series that is
+        short, has missing values, or of which features are kept.
 
-    Raises ClusterError where a part fails on the cluster; the other parts are then cancelled, as
-    they are by Ctrl-C.
+    Raises ClusterError where a task fails on the cluster; the others are then cancelled, as they
+    are by Ctrl-C.
     """
     path, config = Path(os.path.normpath(path)), bounded(config)
     begun = time.perf_counter()
@@ -79,8 +83,9 @@ def encode_on_cluster(
     check_output(path, force)
     with recording() as clock, open_source(source) as series:
         check_output(path, force, sources=[*series.files, *mask_files(config)])
-        jobs = _jobs_of(source, series)
-        plan = SeriesPlan.make(series, config, progress)
+        jobs = _jobs_of(client, source, series)
+        known = _scanned(client, jobs, series, config, progress)
+        plan = SeriesPlan.make(series, config, progress, known)
         with _folder_beside(path) as folder:
             with stage("coding", "parts of the series, on the cluster"):
                 parts = _code(client, jobs, plan, folder, progress)
@@ -124,119 +129,166 @@ class HeldSteps(Series):
         return np.ascontiguousarray(self.values[step - self.first], dtype=self.dtype)
 
 
-def code_part(
+def run_on_worker(
+    work: Callable[..., Any],
     source: str | HeldSteps,
-    plan: bytes,
-    number: int,
-    of: int,
-    first: int = 0,
-    frames: npt.NDArray[Any] | None = None,
-) -> bytes:
-    """Code a part in one thread, on a worker; the bytes of its file.
+    first: int,
+    frames: npt.NDArray[Any] | None,
+    *arguments: Any,
+) -> Any:
+    """The result of `work(series, *arguments)` in one thread, on a worker.
 
     source: a path, or labels, for which `frames` are those of the steps from `first` on.
-    plan: as `SeriesPlan.to_bytes` returns it.
     """
-    if isinstance(source, HeldSteps):
-        assert frames is not None
-        source = source.with_steps(first, frames)
-    with TemporaryDirectory(prefix="fhash-") as folder, at_most(1):
+    held = source if frames is None or isinstance(source, str) else source.with_steps(first, frames)
+    with at_most(1), open_source(held) as series:
+        return work(series, *arguments)
+
+
+def code_part(series: Series, plan: bytes, number: int, of: int) -> bytes:
+    """Code a part; the bytes of its file. plan: as `SeriesPlan.to_bytes` returns it."""
+    with TemporaryDirectory(prefix="fhash-") as folder:
         file = Path(folder) / "part.fhz"
         known = SeriesPlan.from_bytes(plan)
-        encode_part(source, file, None, Part(number=number, of=of), plan=known)
+        encode_part(series, file, None, Part(number=number, of=of), plan=known)
         return file.read_bytes()
 
 
 class _FileJobs:
     """Tasks that read a file, which has the same path on all workers."""
 
-    def __init__(self, place: str) -> None:
-        self._place = place
+    def __init__(self, client: Any, place: str) -> None:
+        self._client, self._place = client, place
 
-    def submit(self, client: Any, plan: SeriesPlan, packed: bytes, part: Part) -> Any:
-        """Begin to code a part; its future."""
-        return client.submit(code_part, self._place, packed, part.number, part.of)
+    def submit(
+        self, work: Callable[..., Any], steps: range, *arguments: Any, whole: bool = False
+    ) -> Any:
+        """Begin a task, which needs some steps; its future."""
+        return self._client.submit(run_on_worker, work, self._place, 0, None, *arguments)
 
 
 class _ArrayJobs:
     """Tasks that get the frames of a dask array from tasks that compute them on the workers."""
 
-    def __init__(self, series: Series, lazy: LazyFrames) -> None:
-        self._first = HeldSteps(series, whole=True)
-        self._others = HeldSteps(series, whole=False)
-        self._lazy = lazy
+    def __init__(self, client: Any, series: Series, lazy: LazyFrames) -> None:
+        self._client, self._lazy = client, lazy
+        self._labels = {whole: HeldSteps(series, whole=whole) for whole in (False, True)}
 
-    def submit(self, client: Any, plan: SeriesPlan, packed: bytes, part: Part) -> Any:
-        """Begin to code a part; its future."""
-        steps = plan.steps(part.layers(plan.layers))
-        # A feature of what happens in time looks at the steps beside each step.
-        beside = any(isinstance(parse_feature(text), InTime) for text in plan.features)
-        first = max(steps.start - beside, 0)
-        frames = client.compute(self._lazy.array[first : steps.stop + beside])
-        labels = self._first if part.number == 1 else self._others
-        return client.submit(code_part, labels, packed, part.number, part.of, first, frames)
+    def submit(
+        self, work: Callable[..., Any], steps: range, *arguments: Any, whole: bool = False
+    ) -> Any:
+        """Begin a task; its future.
+
+        steps: that it needs. whole: whether it needs all that belongs to the series.
+        """
+        frames = self._client.compute(self._lazy.array[steps.start : steps.stop])
+        labels = self._labels[whole]
+        return self._client.submit(run_on_worker, work, labels, steps.start, frames, *arguments)
 
 
-def _jobs_of(source: Source, series: Series) -> _FileJobs | _ArrayJobs:
+_Jobs = _FileJobs | _ArrayJobs
+
+
+def _jobs_of(client: Any, source: Source, series: Series) -> _Jobs:
     """The tasks for a source; raises InputError for one that other machines cannot read."""
     if isinstance(source, str | Path):
         local = local_path(source)
-        return _FileJobs(str(source) if local is None else os.path.abspath(local))
+        return _FileJobs(client, str(source) if local is None else os.path.abspath(local))
     lazy = getattr(series, "lazy", None)
     if isinstance(lazy, LazyFrames):
-        return _ArrayJobs(series, lazy)
+        return _ArrayJobs(client, series, lazy)
     raise InputError(
         f"{series.source}: client= codes on other machines, which read a file by its path, or an "
         "array of dask (xarray.open_dataset(..., chunks={})); leave client out for other sources"
     )
 
 
+def _scanned(
+    client: Any, jobs: _Jobs, series: Series, config: EncodeConfig, progress: Progress
+) -> tuple[Scan, Ranks] | None:
+    """The scan of a long series of which everything is kept, and the ranks of its values.
+
+    None for another series, and for one with missing values: the client scans it by itself.
+    """
+    if fits_memory(series) or config.features != ("all",):
+        return None
+    total, frame = series.shape[0], series.dtype.itemsize * math.prod(series.shape[1:])
+    length = max(1, PART_BYTES // frame)
+    spans = [range(first, min(first + length, total)) for first in range(0, total, length)]
+    begin = [lambda span=span: jobs.submit(SpanScan, span, span) for span in spans]
+    names = [f"the scan of steps {span.start} to {span.stop - 1}" for span in spans]
+
+    def told(results: Iterator[Any]) -> Iterator[Any]:
+        for span, result in zip(spans, results, strict=True):
+            progress("scanning", span.stop, total, "")
+            yield result
+
+    with (
+        stage("scan", "range of all values, on the cluster"),
+        closing(_results(begin, names, _threads(client))) as results,
+    ):
+        return SpanScan.joined(series, told(results))
+
+
 def _code(
-    client: Any, jobs: _FileJobs | _ArrayJobs, plan: SeriesPlan, folder: Path, progress: Progress
+    client: Any, jobs: _Jobs, plan: SeriesPlan, folder: Path, progress: Progress
 ) -> list[Path]:
-    """Code all parts on the cluster, a few of them at a time; their files, in a folder."""
-    threads = _threads(client)
+    """Code all parts on the cluster; their files, in a folder."""
+    threads, packed, files = _threads(client), plan.to_bytes(), list[Path]()
     parts = _parts(plan, threads)
-    packed, waiting, files = plan.to_bytes(), deque[Any](), list[Path]()
-    begin = partial(jobs.submit, client, plan, packed)
-    try:
-        for part in parts[: AHEAD * threads]:
-            waiting.append(begin(part))
-        for part in parts:
-            data = _result(waiting[0], part)
-            waiting.popleft()
-            file = folder / f"{part.number}.fhz"
-            _write(file, data)
-            files.append(file)
-            if part.number + AHEAD * threads <= part.of:
-                waiting.append(begin(parts[part.number + AHEAD * threads - 1]))
+    # A feature of what happens in time looks at the steps beside each step.
+    beside = any(isinstance(parse_feature(text), InTime) for text in plan.features)
+
+    def begin(part: Part) -> Any:
+        own = plan.steps(part.layers(plan.layers))
+        steps = range(max(own.start - beside, 0), min(own.stop + beside, plan.shape[0]))
+        whole = part.number == 1
+        return jobs.submit(code_part, steps, packed, part.number, part.of, whole=whole)
+
+    begins = [lambda part=part: begin(part) for part in parts]
+    names = [f"part {part.number}/{part.of}" for part in parts]
+    with closing(_results(begins, names, threads)) as results:
+        for part, data in zip(parts, results, strict=True):
+            files.append(folder / f"{part.number}.fhz")
+            _write(files[-1], data)
             progress("coding", part.number, part.of, "parts")
+    return files
+
+
+def _results(
+    begin: Sequence[Callable[[], Any]], names: Sequence[str], threads: int
+) -> Generator[Any]:
+    """Yield the results of tasks in their order, a few of which are under way at a time.
+
+    begin: begins each task, and returns its future. names: of the tasks, for messages. Those under
+    way are cancelled where the iteration ends early. Raises ClusterError where one fails.
+    """
+    waiting = deque[Any]()
+    try:
+        for number, name in enumerate(names):
+            while len(waiting) < AHEAD * threads and number + len(waiting) < len(begin):
+                waiting.append(begin[number + len(waiting)]())
+            yield _result(waiting[0], name)
+            waiting.popleft()
     finally:
         for future in waiting:
             with suppress(Exception):  # of a cluster that is gone
                 future.cancel()
-    return files
 
 
-def _result(future: Any, part: Part) -> bytes:
-    """The file of a part; raises ClusterError where it could not be made."""
+def _result(future: Any, name: str) -> Any:
+    """The result of a task; raises ClusterError where it failed."""
     try:
-        data = future.result()
+        return future.result()
     except (Exception, CancelledError) as error:
         reason = " ".join(str(error).split()) or "no reason is told"
         raise ClusterError(
-            f"part {part.number}/{part.of} failed on the cluster: {type(error).__name__}: "
-            f"{reason[:400]}"
+            f"{name} failed on the cluster: {type(error).__name__}: {reason[:400]}"
         ) from error
-    if not isinstance(data, bytes):
-        raise ClusterError(
-            f"part {part.number}/{part.of}: the cluster returned {type(data).__name__}; results of "
-            "client.submit(...).result() are needed"
-        )
-    return data
 
 
 def _write(file: Path, data: bytes) -> None:
+    """Write a file of the client; raises OutputError."""
     try:
         file.write_bytes(data)
     except OSError as error:

@@ -23,7 +23,9 @@ from fhash_codec.compact.tiles.coding import Outcome
 from fhash_codec.compact.tiles_to_promise import plan_series
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import Source, mask_files, open_source, select_features
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_formats.container import strict_json
@@ -92,12 +94,21 @@ class SeriesPlan:
         return range(layers.start * length, min(layers.stop * length, self.shape[0]))
 
     @classmethod
-    def make(cls, series: Series, config: EncodeConfig, progress: Progress = silent) -> SeriesPlan:
+    def make(
+        cls,
+        series: Series,
+        config: EncodeConfig,
+        progress: Progress = silent,
+        known: tuple[Scan, Ranks] | None = None,
+    ) -> SeriesPlan:
         """Plan a series: one pass over all steps for their range, and trials on a sample of tiles.
 
-        config: as `bounded` returns it. Raises what `encode` raises while it plans.
+        config: as `bounded` returns it. known: as in `select_features`, in place of that pass.
+        Raises what `encode` raises while it plans.
         """
-        selection = select_features(series, config, progress, ranked=not fits_memory(series))
+        selection = select_features(
+            series, config, progress, ranked=not fits_memory(series), known=known
+        )
         with thread_pool() as workers:
             plan, _, bulk = plan_series(series, selection, config, workers, progress)
         table = CodedTable(plan=plan, streams=[], outcome=_NOTHING, bulk=bulk)

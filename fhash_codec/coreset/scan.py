@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.extremes import Extremes
-from fhash_codec.measure.ranks import Ranks
+from fhash_codec.measure.ranks import Ranks, RanksSpan
 from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
@@ -85,9 +85,59 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
             "there is nothing to encode"
         )
     extremes.refuse(series)
-    value_range = ValueRange(low, high)
+    return _scan_of(low, high, mean, missing)
+
+
+class SpanScan:
+    """A scan of neighbouring steps without missing values; spans join to the scan of a series.
+
+    Another machine may make it. Attributes:
+        has_missing: whether a value is missing; nothing else counts then.
+        ranks: of the values.
+    """
+
+    def __init__(self, series: Series, steps: range) -> None:
+        """Scan some steps."""
+        self._low, self._high, self._mean = np.inf, -np.inf, Mean()
+        self._extremes = Extremes(series.dtype, series.unlikely)
+        self.ranks = RanksSpan(steps.start * prod(series.shape[1:]))
+        self.has_missing = False
+        for step in steps:
+            frame = series.read(step)
+            for piece in pieces(frame):
+                count, low, high = _scan_piece(piece, self._mean)
+                self.has_missing |= count < piece.size
+                if self.has_missing:
+                    self.ranks = RanksSpan(0)
+                    return
+                self._extremes.add(piece, count, low, high)
+                self._low, self._high = min(self._low, low), max(self._high, high)
+            self.ranks.add(frame)
+
+    @staticmethod
+    def joined(series: Series, spans: Iterable[SpanScan]) -> tuple[Scan, Ranks] | None:
+        """The scan of a series and its ranks, from spans of all steps in their order.
+
+        None where a value is missing. Raises InputError as `scan` does.
+        """
+        low, high, mean, ranks = np.inf, -np.inf, Mean(), Ranks()
+        extremes = Extremes(series.dtype, series.unlikely)
+        for span in spans:
+            if span.has_missing:
+                return None
+            low, high = min(low, span._low), max(high, span._high)
+            mean.join(span._mean)
+            extremes.join(span._extremes)
+            ranks.extend(span.ranks)
+        extremes.refuse(series)
+        return _scan_of(low, high, mean, {}), ranks
+
+
+def _scan_of(
+    low: float, high: float, mean: Mean, missing: Mapping[int, npt.NDArray[np.uint8]]
+) -> Scan:
     return Scan(
-        value_range=value_range,
+        value_range=ValueRange(low, high),
         mean=min(max(mean.value(), low), high),
         finite_count=mean.count,
         missing=missing,

@@ -65,6 +65,11 @@ class Mean:
         self._total += Fraction(total) / Fraction(scale)
         self.count += count
 
+    def join(self, other: Mean) -> None:
+        """Add the values of another mean."""
+        self._total += other._total
+        self.count += other.count
+
     def value(self) -> float:
         """The mean of all values added; there must be at least one."""
         return float(self._total / self.count)

@@ -12,7 +12,10 @@ import pytest
 import fhash_codec
 from fhash_codec import ClusterError, EncodeConfig, InputError
 from fhash_codec.appending import cluster as rooms
+from fhash_codec.appending import series_plan
 from fhash_codec.appending.cluster import HeldSteps
+from fhash_codec.compact import encode
+from fhash_codec.compact.tiles import blocks
 from fhash_formats.errors import OutputExistsError
 from fhash_formats.series import ArraySeries
 
@@ -145,12 +148,11 @@ def test_a_failure_of_a_worker_is_one_line(tmp_path, client) -> None:
 
 
 def test_a_worker_that_dies_is_one_line(tmp_path, client, monkeypatch) -> None:
-    monkeypatch.setattr(rooms, "code_part", os._exit)
-    dask = pytest.importorskip("dask")
     monkeypatch.setattr(
-        rooms._FileJobs, "submit", lambda self, client, *rest: client.submit(os._exit, 1)
+        rooms._FileJobs, "submit", lambda self, *rest, **options: client.submit(os._exit, 1)
     )
     path = saved(tmp_path, values())
+    dask = pytest.importorskip("dask")
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         pytest.raises(ClusterError, match="part 1/5 failed on the cluster: KilledWorker"),
@@ -172,7 +174,7 @@ def test_an_interruption_cancels_the_rest_and_leaves_no_file(tmp_path, threads, 
     config = settings(tile="1x6x8x5")  # 8 parts
     with pytest.raises(KeyboardInterrupt):
         fhash_codec.encode(path, output, config, client=threads, force=older, progress=stop)
-    assert len(threads.futures) == rooms.AHEAD * 2 + 1  # and none was begun after that
+    assert len(threads.futures) == rooms.AHEAD * 2  # and none was begun after that
     assert all(future.done() or future.running() for future in threads.futures)
     assert sorted(os.listdir(tmp_path)) == (["a.fhz"] if older else []) + ["data.npy"]
     assert not older or output.read_bytes() == b"older"
@@ -221,3 +223,46 @@ def test_held_steps_have_the_labels_of_the_whole() -> None:
     np.testing.assert_array_equal(held.read(4), values()[4])
     with pytest.raises(InputError, match="step 5 was not sent"):
         held.read(5)
+
+
+@pytest.mark.parametrize("kind", ["values", "gaps", "integers", "constant"])
+def test_a_long_series_is_scanned_on_the_cluster(tmp_path, threads, monkeypatch, kind) -> None:
+    dask = pytest.importorskip("dask.array")
+    for module in (rooms, series_plan, encode):
+        monkeypatch.setattr(module, "fits_memory", lambda series: False)
+    monkeypatch.setattr(blocks, "MAX_BYTES_IN_MEMORY", 1)
+    array = values()
+    if kind == "gaps":
+        array[4, 2] = np.nan
+    if kind == "integers":
+        array = (100 * array).astype(np.int16)
+    if kind == "constant":
+        array[:] = 3
+    monkeypatch.setattr(rooms, "PART_BYTES", 2 * array[0].nbytes)
+    counts: list[tuple[int, int]] = []
+
+    def watch(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "scanning":
+            counts.append((done, total))
+
+    require_same(tmp_path, dask.from_array(array, chunks=(4, 6, 8, 10)), threads, settings())
+    source = dask.from_array(array, chunks=(4, 6, 8, 10))
+    fhash_codec.encode(source, tmp_path / "again.fhz", settings(), client=threads, progress=watch)
+    on_cluster = [(2, 9), (4, 9), (6, 9), (8, 9), (9, 9)]
+    alone = [(step, 9) for step in range(1, 10)]
+    assert counts == (on_cluster[:3] + alone if kind == "gaps" else on_cluster)
+
+
+def test_extremes_that_nobody_declared_are_refused_on_the_cluster_too(
+    tmp_path, threads, monkeypatch
+) -> None:
+    dask = pytest.importorskip("dask.array")
+    monkeypatch.setattr(rooms, "fits_memory", lambda series: False)
+    monkeypatch.setattr(rooms, "PART_BYTES", 1)
+    array = values()
+    array[[1, 7], 0] = 1e20
+    with pytest.raises(InputError, match="give --missing 1e\\+20"):
+        fhash_codec.encode(
+            dask.from_array(array, chunks=3), tmp_path / "a.fhz", settings(), client=threads
+        )
+    assert not list(tmp_path.iterdir())
