@@ -18,6 +18,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from fhash_formats.errors import (
+    ClusterError,
     DamagedFileError,
     FhashError,
     FhashWarning,
@@ -75,6 +76,7 @@ _MODULES = {
 """Public names that load on first use, with their modules in this package."""
 
 __all__ = [
+    "ClusterError",
     "DamagedFileError",
     "Dataset",
     "EncodeConfig",

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.container_name import check_name
+from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.dataset import Dataset
 from fhash_codec.encoding import (
     EncodedVariable,
-    check_name,
     encode_variable,
-    mask_files,
     missed_path,
     missed_text,
 )

@@ -19,7 +19,8 @@ from fhash_codec.compact.coded_table import DecodedTiles
 from fhash_codec.compact.encode import encode_compact
 from fhash_codec.comparison import measure, ssim_budget
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.container_name import check_name
+from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import brief_quality
 from fhash_codec.lean_header import lean
 from fhash_codec.paper.encode import encode_paper
@@ -41,14 +42,6 @@ _NONE_DECODED: DecodedTiles = {}
 PREDICTED = ("seconds", "bytes", "psnr")
 """Figures of a prediction that a header keeps."""
 
-DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
-.pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
-DATA_SUFFIXES = frozenset(DATA_SUFFIX_NAMES.split())
-"""Suffixes of data files that are read or written. No container may have one of them.
-
-Those that say nothing of their content (.zip, .bin, .dat) are allowed.
-"""
-
 
 def encode(
     source: Source,
@@ -59,6 +52,7 @@ def encode(
     force: bool = False,
     progress: Progress = silent,
     predicted: Mapping[str, Any] | None = None,
+    client: Any = None,
 ) -> dict[str, Any]:
     """Encode a series into the container `path`, complete or not at all.
 
@@ -69,6 +63,10 @@ def encode(
         settings name none.
     force: replace a file that exists.
     predicted: seconds, bytes and psnr that were predicted, for the header; see `fhash info`.
+    client: of a dask cluster (`dask.distributed.Client`), on whose workers the series is coded.
+        The file is that of this function without `client` and with `timings=False`, byte for byte.
+        The source is a file that all workers see, or an array of dask, labelled or not; the
+        promise is a bound of the error. See docs/scale.md.
 
     Returns the figures of the written file (see `report`), and as "stages" what took the time (see
     `stage_clock.Stage`). In the profile paper Ctrl-C during the
@@ -81,9 +79,12 @@ def encode(
     QualityError, with the figures of the file in the error, if the file
     misses what the settings promise. It is written nevertheless: as `path` where that is free; an
     older file stays as it is, and the new one is written beside it (`missed_path`). Warns
-    (FhashWarning) where the bulk of the values is far worse than an explicit promise sounds.
+    (FhashWarning) where the bulk of the values is far worse than an explicit promise sounds. Raises
+    ClusterError where a worker of `client` fails.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
+    if client is not None:
+        return _on_cluster(source, path, config, client, mask, force, progress)
     begun = time.perf_counter()
     with recording() as clock, _opened(source, path, force, config) as series:
         check_output(path, force, sources=[*series.files, *mask_files(config)])
@@ -106,6 +107,23 @@ def encode(
     for remark in remarks(config, figures):
         warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
+
+
+def _on_cluster(
+    source: Source,
+    path: Path,
+    config: EncodeConfig,
+    client: Any,
+    mask: npt.ArrayLike | None,
+    force: bool,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Encode on a cluster; raises InputError for a mask, which only this process has."""
+    from fhash_codec.appending.cluster import encode_on_cluster
+
+    if mask is not None:
+        raise InputError("mask is an array of this process; with client= give a feature mask:FILE")
+    return encode_on_cluster(source, path, config, client, force=force, progress=progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,17 +293,3 @@ def missed_text(path: Path, written: Path, missed: str, advice: str) -> str:
     """The message of a missed promise: what was missed, where the file is, and what may help."""
     where = "the file is written" if written == path else f"it is kept, the new file is {written}"
     return f"{path}: {missed}; {where}" + (f". {advice}" if advice else "")
-
-
-def check_name(path: Path) -> None:
-    """Raise InputError for a container named like a data file: most often the source itself."""
-    if path.suffix.lower() in DATA_SUFFIXES:
-        raise InputError(
-            f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz"
-        )
-
-
-def mask_files(config: EncodeConfig) -> list[str]:
-    """Paths of the masks among the features."""
-    prefix = "mask:"
-    return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.plain import correction_of, correction_type, predicted
+from fhash_codec.container_name import check_name
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
-from fhash_codec.encoding import check_name
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.paper.storage import BITS, feature_bits

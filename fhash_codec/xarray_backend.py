@@ -250,12 +250,13 @@ def _encode(
     variable: Hashable | None,
     config: EncodeConfig | None,
     force: bool,
+    client: Any,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
     if config is not None and settings:
         raise InputError(f"give either config or single settings, not both: {', '.join(settings)}")
     chosen = config or EncodeConfig.from_dict(dict(settings))
-    return encode(labelled_series(data, variable), path, chosen, force=force)
+    return encode(labelled_series(data, variable), path, chosen, force=force, client=client)
 
 
 @xr.register_dataset_accessor("fhash")  # type: ignore[no-untyped-call]
@@ -272,13 +273,14 @@ class DatasetAccessor:
         variable: Hashable | None = None,
         config: EncodeConfig | None = None,
         force: bool = False,
+        client: Any = None,
         **settings: Any,
     ) -> dict[str, Any]:
         """Encode a variable, the only one that can be by default; as `fhash_codec.encode` does.
 
         settings: fields of `EncodeConfig`, such as psnr=45.
         """
-        return _encode(self._dataset, path, variable, config, force, settings)
+        return _encode(self._dataset, path, variable, config, force, client, settings)
 
 
 @xr.register_dataarray_accessor("fhash")  # type: ignore[no-untyped-call]
@@ -294,7 +296,8 @@ class DataArrayAccessor:
         *,
         config: EncodeConfig | None = None,
         force: bool = False,
+        client: Any = None,
         **settings: Any,
     ) -> dict[str, Any]:
         """Encode the array as `fhash_codec.encode` does; settings: fields of `EncodeConfig`."""
-        return _encode(self._array, path, None, config, force, settings)
+        return _encode(self._array, path, None, config, force, client, settings)

@@ -24,6 +24,7 @@ from fhash_formats.errors import InterruptedEncodingError
 
 COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
+    "plan": "choose tiles and settings once, for `fhash encode --part --plan`",
     "merge": "join the parts that `fhash encode --part` wrote",
     "append": "code further steps behind those of RUN.fhz",
     "pack": "make RUN.fhz of coded Zarr arrays, without coding again",

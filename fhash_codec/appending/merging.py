@@ -9,15 +9,15 @@ from functools import cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.appending.parts import COLUMNS, COUNTS, ERRORS, PART, WHOLE, comparisons_of
 from fhash_codec.compact.tiles_to_promise import all_tiles
+from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
-from fhash_codec.encoding import check_name
 from fhash_codec.header import brief_quality, write_series
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparer
@@ -34,7 +34,7 @@ from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.atomic import check_output
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["merge"]
+__all__ = ["Joined", "join_parts", "merge"]
 
 SIMILARITY = 8
 """Number in a row of errors that is the sum of the SSIM; the next one is its count."""
@@ -65,6 +65,26 @@ def merge(
     InputError for files that are no parts or not of one encoding, for gaps and overlaps;
     DamagedFileError for damaged ones; OutputExistsError and OutputError.
     """
+    joined = join_parts(paths, output, force=force, progress=progress)
+    figures = {name: joined.quality[name] for name in ("psnr", "rmse", "max_abs_error")}
+    counted = {"parts": joined.parts, "steps": joined.steps, "tiles": joined.tiles}
+    return {"path": str(output), "bytes": joined.size, **counted, **figures}
+
+
+class Joined(NamedTuple):
+    """A file that was made of parts: bytes, counts, and its quality as `report` takes it."""
+
+    size: int
+    parts: int
+    steps: int
+    tiles: int
+    quality: dict[str, Any]
+
+
+def join_parts(
+    paths: Sequence[str | Path], output: str | Path, *, force: bool, progress: Progress
+) -> Joined:
+    """Join parts to a container; arguments and errors are those of `merge`."""
     output = Path(output)
     check_name(output)
     check_output(output, force, sources=list(paths))
@@ -74,12 +94,9 @@ def merge(
         _require_whole(parts)
         whole = _Whole(parts)
         with ContainerWriter(output, force=force) as writer:
-            header = whole.write(writer, progress)
+            header, quality = whole.write(writer, progress)
             size = writer.commit(header)
-    told = header["quality"]
-    counted = {"parts": len(parts), "steps": whole.shape[0], "tiles": len(whole.streams)}
-    figures = {name: told.get(name) for name in ("psnr", "rmse", "max_abs_error")}
-    return {"path": str(output), "bytes": size, **counted, **figures}
+    return Joined(size, len(parts), whole.shape[0], len(whole.streams), quality)
 
 
 class _Piece:
@@ -201,6 +218,14 @@ class _Streams(Sequence[bytes]):
             (part, index) for part in self.parts for index in product(*map(range, part.table.grid))
         ]
 
+    def sizes(self) -> list[int]:
+        """Bytes of each tile, from the indices of the parts."""
+        sizes = []
+        for part, place in self.places:
+            with damage_named(part.path):
+                sizes.append(part.table.coded_bytes(place))
+        return sizes
+
     def __len__(self) -> int:
         return sum(prod(part.table.grid) for part in self.parts)
 
@@ -242,8 +267,10 @@ class _Whole:
         self.shape: tuple[int, int, int, int] = (parts[0].steps, *frame)
         self.streams = _Streams(parts)
 
-    def write(self, writer: ContainerWriter, progress: Progress) -> dict[str, Any]:
-        """Write the arrays of the whole; its header."""
+    def write(
+        self, writer: ContainerWriter, progress: Progress
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Write the arrays of the whole; its header, and its quality with all digits."""
         first = self._parts[0]
         header = dict(first.container.header)
         for name in (PART, "format", "format_version"):
@@ -270,6 +297,7 @@ class _Whole:
             tile=first.table.chunk_shape,
             settings=first.settings,
             streams=self.streams,
+            sizes=self.streams.sizes(),
         )
         progress("merging", 0, 1, "")
         table.write(writer)
@@ -286,7 +314,7 @@ class _Whole:
         header = lean({**header, "model": {**header["model"], "gains": []}})
         # They are in the lean form already.
         header["model"]["gains"] = gains
-        return header
+        return header, quality
 
     def _coords(self) -> dict[str, Coordinate]:
         """The positions of the whole."""

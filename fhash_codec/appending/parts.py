@@ -1,7 +1,7 @@
 """`encode_part`: some steps of a series on one machine of several; `merge` joins the parts.
 
-Every part makes the same plan from the whole series, and codes whole layers of its tiles. So parts
-have the bytes that one encoding of everything has. A part is a container of its steps; the key
+All parts have one plan of the whole series, and each codes whole layers of its tiles. So parts have
+the bytes that one encoding of everything has. A part is a container of its steps; the key
 `part` of its header and the array `steps/errors` say what `merge` needs beside that.
 """
 
@@ -10,23 +10,26 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.coded_table import CodedTable
-from fhash_codec.compact.encode import table_header
-from fhash_codec.compact.tiles.blocks import fits_memory
-from fhash_codec.compact.tiles_to_promise import all_tiles, code_layers, plan_series
+from fhash_codec.appending.series_plan import SeriesPlan, bounded
+from fhash_codec.compact.recipe import CodedLayers, code_layers
+from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.comparison import measure, ssim_budget
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.features import Everything
-from fhash_codec.coreset.scan import Scan
-from fhash_codec.coreset.selection import FeatureSelection, Source, open_source, select_features
-from fhash_codec.encoding import check_name, mask_files
+from fhash_codec.container_name import check_name
+from fhash_codec.coreset.extent import Extent, packed_masks
+from fhash_codec.coreset.features import Everything, resolve_features
+from fhash_codec.coreset.scan import Scan, scan_steps
+from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import OUTSIDE, brief_quality, describe_source, write_series
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparison
@@ -95,9 +98,10 @@ class Part:
 def encode_part(
     source: Source,
     path: str | Path,
-    config: EncodeConfig,
+    config: EncodeConfig | None,
     part: Part,
     *,
+    plan: SeriesPlan | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -106,33 +110,36 @@ def encode_part(
     The arguments are those of `encode`; the promise is a bound of the error, and times are not
     kept, so that the parts make the file of `encode` with `timings=False`, byte for byte.
 
+    plan: of the whole series, as `plan_parts` makes it once for all parts; then only the steps of
+        the part are read. It has the settings; those of `config` must be the same, if given. The
+        part plans the whole series by itself if None.
+
     Returns the figures of the written file (`report`). Raises what `encode` raises, and InputError
-    for a promise that no part alone can keep.
+    for a promise that no part alone can keep and for a plan of other data or settings.
     """
-    path, config = Path(path), replace(config, timings=False)
-    if config.profile != "compact" or (config.max_error is None and config.max_error_rel is None):
-        raise InputError(
-            "a part keeps a promise by itself, which is a bound of the error in the profile "
-            "compact: give max_error or max_error_rel"
-        )
+    path = Path(path)
+    config = _settings(config, plan)
     check_name(path)
     check_output(path, force)
     begun = time.perf_counter()
     with open_source(source) as series:
         check_output(path, force, sources=[*series.files, *mask_files(config)])
-        selection = select_features(series, config, progress, ranked=not fits_memory(series))
-        with thread_pool() as workers:
-            plan, _, bulk = plan_series(series, selection, config, workers, progress)
-            layers = part.layers(plan.blocks.grid[0])
-            table = replace(code_layers(plan, layers, workers, progress), bulk=bulk)
-        length = plan.blocks.tile[0]
-        steps = range(layers.start * length, min(layers.stop * length, series.shape[0]))
-        with ContainerWriter(path, force=force) as writer:
-            job = _Job(series, selection, config, part, steps, table)
-            quality = job.write(writer, progress)
+        if plan is None:
+            plan = SeriesPlan.make(series, config, progress)
+        plan.require(series)
+        quality = _Job(series, plan, part).write(path, force, progress)
         series.check()
         with open_volume(path) as volume:
             return report(volume, quality, seconds=time.perf_counter() - begun, files=series.files)
+
+
+def _settings(config: EncodeConfig | None, plan: SeriesPlan | None) -> EncodeConfig:
+    """The settings of a part; raises InputError where they are not those of its plan."""
+    if plan is None:
+        return bounded(config or EncodeConfig())
+    if config is not None:
+        plan.require_settings(vars(config))
+    return plan.config
 
 
 def comparisons_of(errors: npt.NDArray[np.float64], first: int) -> list[Comparison]:
@@ -169,98 +176,130 @@ def _row(comparison: Comparison) -> list[float]:
     return [float(number) for number in numbers]
 
 
-@dataclass(frozen=True)
 class _Job:
-    """A part that is coded and has to be written."""
+    """A part that is to be coded, measured and written."""
 
-    series: Series
-    selection: FeatureSelection
-    config: EncodeConfig
-    part: Part
-    steps: range
-    table: CodedTable
+    def __init__(self, series: Series, plan: SeriesPlan, part: Part) -> None:
+        self.series, self.plan, self.part = series, plan, part
+        self.layers = part.layers(plan.layers)
+        self.steps = plan.steps(self.layers)
 
-    def write(self, writer: ContainerWriter, progress: Progress) -> dict[str, Any]:
+    def write(self, path: Path, force: bool, progress: Progress) -> dict[str, Any]:
         """Write the part and measure it; its quality."""
-        steps = StepsSeries(self.series, self.steps)
-        everything = any(isinstance(one, Everything) for one in self.selection.features)
-        source = self._write_source(writer)
-        described = write_series(
-            writer, steps, self._scan(), range(len(self.steps)), brief=True, everything=everything
+        plan = self.plan
+        missing = scan_steps(
+            self.series,
+            self.steps,
+            plan.value_range,
+            may_miss=plan.has_missing,
+            progress=progress,
         )
-        if everything and self.selection.scanned.missing:
+        blocks = self._blocks(missing, progress)
+        with thread_pool() as workers:
+            coded = code_layers(blocks, plan.recipe, self.layers, workers, progress)
+        with ContainerWriter(path, force=force) as writer:
+            header = self._write_arrays(writer, blocks, coded, missing)
+            quality, errors, whole = self._measured(writer, header, progress)
+            writer.add_whole(ERRORS, errors)
+            low, high = header["value_range"]
+            header["quality"] = brief_quality(quality, high - low, len(self.steps))
+            header = lean(header)
+            header[PART] |= {
+                "number": self.part.number,
+                "of": self.part.of,
+                "first": self.steps.start,
+                "steps": self.series.shape[0],
+                "size": coded.outcome.size,
+                "nonzero": coded.outcome.nonzero,
+                "ssim_steps": whole,
+            }
+            writer.commit(header)
+        return quality
+
+    def _blocks(self, missing: Mapping[int, npt.NDArray[np.uint8]], progress: Progress) -> Blocks:
+        """The series in tiles, of which those of the part can be read."""
+        plan, shape = self.plan, self.series.shape
+        packed = [np.empty(0, np.uint8)] * shape[0]  # those of other steps are not looked at
+        if plan.samples < shape[0] * prod(plan.box.shape):
+            features = resolve_features(
+                plan.features, self.series, range(shape[0]), plan.value_range, progress
+            )
+            dilation = plan.config.dilation
+            masks = packed_masks(self.series, missing, self.steps, features, dilation)
+            for step, mask in masks.items():
+                packed[step] = mask
+        extent = Extent(
+            box=plan.box,
+            key_frames=tuple(range(shape[0])),
+            packed=packed,
+            domain=shape[1:],
+            samples=plan.samples,
+            background=plan.header["background"],
+        )
+        return Blocks(self.series, extent, plan.recipe.tile).by_layers()
+
+    def _write_arrays(
+        self,
+        writer: ContainerWriter,
+        blocks: Blocks,
+        coded: CodedLayers,
+        missing: Mapping[int, npt.NDArray[np.uint8]],
+    ) -> dict[str, Any]:
+        """Write coordinates, masks and tiles; the header without its quality."""
+        plan, steps = self.plan, StepsSeries(self.series, self.steps)
+        everything = str(Everything()) in plan.features
+        source = self._write_source(writer)
+        value_range = plan.value_range
+        scanned = Scan(
+            value_range=value_range,
+            mean=value_range.low,
+            finite_count=0,
+            missing={step - self.steps.start: bits for step, bits in missing.items()},
+        )
+        described = write_series(
+            writer, steps, scanned, range(len(self.steps)), brief=True, everything=everything
+        )
+        if everything and plan.has_missing:
             described["missing"] = OUTSIDE
-        blocks = self.table.plan.blocks
         parts = TableParts(
             shape=(len(self.steps), *blocks.shape[1:]),
             dtype=blocks.dtype,
             tile=blocks.tile,
-            settings=self.table.plan.settings,
-            streams=self.table.streams,
+            settings=plan.recipe.settings,
+            streams=coded.streams,
         )
         parts.write(writer)
-        header = self._header(steps, described, parts)
+        own = deepcopy(dict(plan.header))
+        own["required_features"] = parts.features + coordinate_features(described["coordinates"])
+        own["model"]["levels"] = [list(parts.shape)]
+        own["model"]["parameters"] += coded.outcome.nonzero
+        own["model"]["gains"].append(all_tiles(coded.outcome.size))
+        told = describe_source(steps, value_range, plan.config)
+        return {**told, **described, **own, PART: source}
+
+    def _measured(
+        self, writer: ContainerWriter, header: Mapping[str, Any], progress: Progress
+    ) -> tuple[dict[str, Any], npt.NDArray[np.float64], list[int]]:
+        """The quality of what is written, the errors of each step, and the steps of the SSIM."""
         rows: list[list[float]] = []
-        budget = ssim_budget(self.config)
-        whole = ssim_steps(self.series.shape[0], _vertices(self.series), budget) if budget else []
+        z, y, x = self.series.shape[1:]
+        budget = ssim_budget(self.plan.config)
+        whole = ssim_steps(self.series.shape[0], z * y * x, budget) if budget else []
         with Volume(writer.preview(header)) as volume:
             quality = measure(
-                steps,
+                StepsSeries(self.series, self.steps),
                 volume,
                 progress,
                 ssim_measured=[step - self.steps.start for step in whole if step in self.steps],
                 observe=lambda comparison: rows.append(_row(comparison)),
             )
-        writer.add_whole(ERRORS, np.array(rows, dtype=np.float64))
-        low, high = header["value_range"]
-        header["quality"] = brief_quality(quality, high - low, len(self.steps))
-        header = lean(header)
-        header[PART] = {
-            "number": self.part.number,
-            "of": self.part.of,
-            "first": self.steps.start,
-            "steps": self.series.shape[0],
-            "size": self.table.outcome.size,
-            "nonzero": self.table.outcome.nonzero,
-            "ssim_steps": whole,
-            **source,
-        }
-        writer.commit(header)
-        return quality
+        return quality, np.array(rows, dtype=np.float64), whole
 
     def _write_source(self, writer: ContainerWriter) -> dict[str, Any]:
         """Write what belongs to the whole series in its source, in the first part alone."""
         if self.part.number != 1:
             return {}
-        whole = describe_source(self.series, self.selection.scanned.value_range, self.config)
+        whole = describe_source(self.series, self.plan.value_range, self.plan.config)
         for name, array in source_parts(self.series, self.series.coords, {})[1].items():
             writer.add_whole(f"{WHOLE}{name}", array)
         return {SOURCE: whole[SOURCE]} if SOURCE in whole else {}
-
-    def _scan(self) -> Scan:
-        """The scan of the whole series, with the missing values of the part's steps."""
-        scanned = self.selection.scanned
-        missing: Mapping[int, npt.NDArray[np.uint8]] = {
-            step - self.steps.start: bits
-            for step, bits in scanned.missing.items()
-            if step in self.steps
-        }
-        return replace(scanned, missing=missing)
-
-    def _header(
-        self, steps: Series, described: Mapping[str, Any], parts: TableParts
-    ) -> dict[str, Any]:
-        """The header of the part, without its quality."""
-        gains = [*self.table.plan.gains, all_tiles(self.table.outcome.size)]
-        table = replace(self.table, plan=replace(self.table.plan, gains=gains))
-        own = table_header(self.selection, table, self.config, None)
-        own["required_features"] = parts.features + coordinate_features(described["coordinates"])
-        own["model"]["levels"] = [list(parts.shape)]
-        source = describe_source(steps, self.selection.scanned.value_range, self.config)
-        return {**source, **described, **own}
-
-
-def _vertices(series: Series) -> int:
-    """Vertices of a step."""
-    z, y, x = series.shape[1:]
-    return z * y * x

@@ -20,7 +20,7 @@ from fhash_codec.appending.planning import bound_of, plan_layers
 from fhash_codec.appending.resuming import continued
 from fhash_codec.compact.tiles.tiling import parse_tile
 from fhash_codec.config import EncodeConfig
-from fhash_codec.encoding import check_name
+from fhash_codec.container_name import check_name
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, check_values, index_coordinate

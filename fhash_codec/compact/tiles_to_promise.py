@@ -41,7 +41,7 @@ from fhash_codec.stage_clock import stage
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
-__all__ = ["all_tiles", "code_layers", "code_series", "plan_series", "resized"]
+__all__ = ["all_tiles", "code_series", "plan_series", "resized"]
 
 OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles, for the sizes after each stage."""
@@ -136,16 +136,6 @@ def plan_series(
 def all_tiles(size: int) -> dict[str, Any]:
     """Return the last entry of a header's gains: tiles of so many bytes."""
     return {"what": "all tiles", "bytes": size + OVERHEAD_BYTES}
-
-
-def code_layers(
-    coding_plan: CodingPlan, layers: range, workers: ThreadPoolExecutor, progress: Progress
-) -> CodedTable:
-    """Code some layers of tiles along time, and no others, with the same bytes as in a whole table.
-
-    They keep a bound; other promises ask for all tiles.
-    """
-    return _code_all(coding_plan, workers, progress, layers=layers)
 
 
 def resized(table: CodedTable, overhead: int, progress: Progress) -> CodedTable:
@@ -320,11 +310,10 @@ def _code_all(
     workers: ThreadPoolExecutor,
     progress: Progress,
     note: str = "",
-    layers: range | None = None,
 ) -> CodedTable:
     """Code every tile; few tiles are worked on at a time, so that memory stays bounded.
 
-    note: for the progress. layers: of tiles along time that are coded; all if None.
+    note: for the progress.
     """
     blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
@@ -338,7 +327,7 @@ def _code_all(
     streams: list[bytes] = []
     decoded_tiles: list[Values | None] = []
     outcomes: list[Outcome] = []
-    indices = [index for index in blocks.indices() if layers is None or index[0] in layers]
+    indices = list(blocks.indices())
     sources = _sources(coding_plan, indices)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"

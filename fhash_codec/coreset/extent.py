@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, fuse
 from fhash_codec.coreset.features import Everything, Feature, dilate
-from fhash_codec.coreset.scan import Scan
+from fhash_codec.coreset.scan import Scan, finite_mask
 from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.value_range import Mean
 from fhash_codec.progress import Progress
@@ -123,10 +123,11 @@ def find_extent(
         without_vertices -= {
             feature for feature, mask in zip(features, masks, strict=True) if mask.any()
         }
-        mask, finite = _dilated(np.logical_or.reduce(masks), step, scan, dilation)
+        finite = scan.finite(step, (z, y, x))
+        mask = _dilated(np.logical_or.reduce(masks), finite, dilation)
         packed.append(np.packbits(mask))
         for one, packed_one in zip(masks, packed_apart, strict=False):
-            packed_one.append(np.packbits(_dilated(one, step, scan, dilation)[0]))
+            packed_one.append(np.packbits(_dilated(one, finite, dilation)))
         boxes.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
         _add_outside(outside, frame, mask, finite)
@@ -155,6 +156,26 @@ def find_extent(
     )
 
 
+def packed_masks(
+    series: Series,
+    missing: Mapping[int, npt.NDArray[np.uint8]],
+    steps: range,
+    features: Sequence[Feature],
+    dilation: int,
+) -> dict[int, npt.NDArray[np.uint8]]:
+    """The packed masks of some steps, as `Extent.packed` has those of all.
+
+    missing: masks of the missing values of these steps, see `Scan`.
+    """
+    result = {}
+    for step in steps:
+        frame = series.read(step)
+        mask = np.logical_or.reduce([feature.select(frame, step) for feature in features])
+        finite = finite_mask(missing, step, series.shape[1:])
+        result[step] = np.packbits(_dilated(mask, finite, dilation))
+    return result
+
+
 def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: Progress) -> Extent:
     """The extent of a coreset that holds every vertex; no frame is read for it."""
     all_ones = np.packbits(np.ones(domain, dtype=bool))
@@ -171,18 +192,16 @@ def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: 
 
 
 def _dilated(
-    mask: npt.NDArray[np.bool_], step: int, scan: Scan, dilation: int
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_] | None]:
-    """Masks (z, y, x) of the finite vertices of the dilated mask, and of all finite vertices.
+    mask: npt.NDArray[np.bool_], finite: npt.NDArray[np.bool_] | None, dilation: int
+) -> npt.NDArray[np.bool_]:
+    """Mask (z, y, x) of the finite vertices of the dilated mask.
 
-    The second mask is None if every vertex is finite.
+    finite: mask of all finite vertices; None if every vertex is finite.
     """
     mask = dilate(mask, dilation)
-    z, y, x = mask.shape
-    finite = scan.finite(step, (z, y, x))
     if finite is not None:
         mask &= finite
-    return mask, finite
+    return mask
 
 
 def _add_outside(

@@ -92,6 +92,19 @@ class _End:
         else:
             self._candidate(extreme)
 
+    def join(self, other: _End) -> None:
+        """Add the values of another end of the same side."""
+        if other.value is None:
+            return
+        if self.value is None or self._beyond(other.value, self.value):
+            self._candidate(self.value)
+            self.value, self.count = other.value, 0
+        if other.value == self.value:
+            self.count += other.count
+        else:
+            self._candidate(other.value)
+        self._candidate(other.next)
+
     def _beyond(self, one: float, other: float) -> bool:
         return one < other if self.low else one > other
 
@@ -135,6 +148,12 @@ class Extremes:
             self._count += count
             self._low.add(piece, low)
             self._high.add(piece, high)
+
+    def join(self, other: Extremes) -> None:
+        """Add the values of other extremes of the same type."""
+        self._count += other._count
+        self._low.join(other._low)
+        self._high.join(other._high)
 
     def suspects(self) -> list[float]:
         """The ends that look like fill values; none, one or both."""

@@ -1,7 +1,8 @@
 """Labelled arrays as series: `DataArray` and `Dataset` of xarray, whatever they were opened from.
 
 This is the way in for everything that xarray opens: GRIB, OPeNDAP, Icechunk, files in a cloud.
-Frames are computed one by one, so that a lazy array is never held as a whole. What belongs to the
+Frames are computed one by one, or chunk by chunk of a dask array (lazy.py), so that a lazy array is
+never held as a whole. What belongs to the
 variable is taken as xarray would write it to a file.
 """
 
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.layout import Dimension, must_select
 from fhash_formats.readers.common.netcdf_surroundings import stored_variable
@@ -51,7 +53,7 @@ def array_series(source: Any) -> Series:
         return labelled_series(source)
     dims, labels = getattr(source, "dims", None), getattr(source, "coords", None)
     if dims is None or labels is None or len(dims) < MIN_DIMENSIONS:
-        return ArraySeries(source)
+        return DaskSeries(source) if is_lazy(source) else ArraySeries(source)
     return labelled_series(source)
 
 
@@ -105,6 +107,9 @@ class LabelledSeries(Series):
     """A labelled array, read frame by frame.
 
     array: the DataArray. beside: a Dataset with all that its attributes may name.
+
+    Attributes:
+        lazy: frames of an array of dask; None for others.
     """
 
     def __init__(self, array: Any, beside: Any) -> None:
@@ -127,9 +132,18 @@ class LabelledSeries(Series):
         self.attributes = json_attributes(array.attrs, without=PLUMBING | PACKING)
         self.units = str(self.attributes.get("units", ""))
         self.metadata = lambda: self._metadata_of(beside)
+        self.lazy = LazyFrames(self._in_order(array)) if is_lazy(array) else None
+
+    def _in_order(self, array: Any) -> Any:
+        """The dask array of a labelled one, as (t, z, y, x)."""
+        known = dict(zip(self._axes, array.dims, strict=True))
+        ordered = array.transpose(*(known[axis] for axis in AXES if axis in known)).data
+        return ordered[tuple(slice(None) if axis in known else None for axis in AXES)]
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
+        if self.lazy is not None:
+            return np.ascontiguousarray(self.lazy.read(step), dtype=self.dtype)
         at = {
             dim: step for dim, axis in zip(self._array.dims, self._axes, strict=True) if axis == "t"
         }

@@ -43,6 +43,12 @@ def open_source(source: Source) -> Iterator[Series]:
         yield source if isinstance(source, Series) else array_series(source)
 
 
+def mask_files(config: EncodeConfig) -> list[str]:
+    """Paths of the masks among the features."""
+    prefix = "mask:"
+    return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]
+
+
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
     """The feature of a mask in memory; raises InputError for a shape other than the series'."""
     values = np.asarray(mask, dtype=bool)
@@ -77,20 +83,28 @@ def select_features(
     mask: npt.ArrayLike | None = None,
     *,
     ranked: bool = False,
+    known: tuple[Scan, Ranks] | None = None,
 ) -> FeatureSelection:
     """Scan a series, choose its key frames and find its features, one frame at a time.
 
     ranked: whether the ranks of the values are taken in the same passes.
+    known: the scan of the series and the ranks of all its values, where they were taken elsewhere;
+        for the feature 'all' alone.
     mask: booleans (t, z, y, x) or (z, y, x), one more feature. It replaces the feature 'all' if the
         settings name no other.
 
     Raises InputError for settings that do not fit the series, or that select nothing. Warns of
     times that cannot serve as an axis.
     """
-    ranks = Ranks() if ranked else None
+    ranks = known[1] if known is not None else Ranks() if ranked else None
     everything = "all" in config.features and (mask is None or config.features != ("all",))
     scanned, key_frames, features = resolve_selection(
-        series, config, progress, mask, ranks if everything else None
+        series,
+        config,
+        progress,
+        mask,
+        ranks if everything else None,
+        scanned=None if known is None else known[0],
     )
     selected = None if everything else ranks
     with stage("features", f"vertices of {', '.join(map(str, features))}"):
@@ -106,10 +120,12 @@ def resolve_selection(
     progress: Progress,
     mask: npt.ArrayLike | None,
     ranks: Ranks | None = None,
+    *,
+    scanned: Scan | None = None,
 ) -> tuple[Scan, tuple[int, ...], tuple[Feature, ...]]:
     """The scan, the key frames and the resolved features of a series; see `select_features`.
 
-    ranks: gets all finite values.
+    ranks: gets all finite values, unless the series was scanned before.
     """
     times = time_axis(series.coords["t"].values)
     if times is not series.coords["t"].values:
@@ -120,7 +136,7 @@ def resolve_selection(
             stacklevel=3,
         )
     with stage("scan", "range and missing values, by one pass over all steps"):
-        scanned = scan(series, progress, ranks)
+        scanned = scan(series, progress, ranks) if scanned is None else scanned
     with stage("key frames", f"steps to encode: {config.key_frames}"):
         key_frames = select_key_frames(config.key_frames, series, times, progress)
     with stage("features", f"thresholds of {', '.join(config.features)}"):

@@ -53,18 +53,42 @@ class Ranks:
                     block, self._block = np.sort(self._block), None
                     self._carry(block)
 
-    def _carry(self, block: npt.NDArray[Any]) -> None:
-        """Put a sorted block at the lowest free level, joined with those of the levels below."""
-        level = 0
+    def extend(self, span: RanksSpan) -> None:
+        """Add the values of a span, which follow those added so far; nothing depends on the cut.
+
+        Raises ValueError for a span of other places.
+        """
+        if span.first != self.count or span.size != self._size:
+            raise ValueError(f"values from {span.first} on do not follow {self.count}")
+        self.add(span.head)
+        for level, block in span.blocks:
+            self.count += self._size << level
+            self._joined_below(level)
+            self._carry(block, level)
+        self.add(span.tail)
+
+    def _joined_below(self, level: int) -> None:
+        """Count the joins of which a block of a level was made."""
+        while len(self._levels) < level:
+            self._levels.append(None)
+            self._upper.append(False)
+        for below in range(level):
+            joins = 1 << (level - below - 1)
+            self._upper[below] ^= bool(joins % 2)
+            self.error += joins << below
+
+    def _carry(self, block: npt.NDArray[Any], level: int = 0) -> None:
+        """Put a sorted block at the lowest free level, joined with those of the levels below.
+
+        level: of the block, the lowest at which it may be put.
+        """
         while level < len(self._levels):
             other = self._levels[level]
             if other is None:
                 self._levels[level] = block
                 return
-            both = np.concatenate((block, other))
-            both.sort(kind="stable")
             # Taking the upper and the lower of each pair in turn makes the shifts cancel, mostly.
-            block = both[int(self._upper[level]) :: 2].copy()
+            block = _join(block, other, upper=self._upper[level])
             self._upper[level] = not self._upper[level]
             self._levels[level] = None
             self.error += 1 << level
@@ -103,3 +127,53 @@ class Ranks:
             return int(np.searchsorted(so_far, beyond, side="right"))
         place = int(np.searchsorted(so_far, beyond - self.error, side="right")) - 1
         return None if place < 0 else place
+
+
+class RanksSpan:
+    """A sketch of neighbouring values of many, for `Ranks.extend`; another machine may make it.
+
+    Its blocks are those that the sketch of all values would make of them, by their places.
+
+    Attributes:
+        first: number of values before these.
+        size: values of a block.
+        head, tail: values before the first and after the last whole block.
+        blocks: level and values of each sorted block between them, in their order.
+    """
+
+    def __init__(self, first: int, size: int = SIZE) -> None:
+        """Begin without values."""
+        self.first, self.size = first, size
+        self.head = self.tail = np.empty(0)
+        self.blocks: list[tuple[int, npt.NDArray[Any]]] = []
+        self._missing = -first % size  # values of the head that are yet to come
+        self._place = (first + self._missing) // size  # number of the next block among all
+
+    def add(self, values: npt.NDArray[Any]) -> None:
+        """Add finite values of an array of any shape; all arrays are of one real type."""
+        flat = values.reshape(-1)
+        head, rest = flat[: self._missing], flat[self._missing :]
+        self.head = np.concatenate((self.head.astype(flat.dtype, copy=False), head))
+        self._missing -= head.size
+        rest = np.concatenate((self.tail.astype(flat.dtype, copy=False), rest))
+        whole = rest.size // self.size * self.size
+        for start in range(0, whole, self.size):
+            self._push(np.sort(rest[start : start + self.size]))
+        self.tail = rest[whole:].copy()
+
+    def _push(self, block: npt.NDArray[Any]) -> None:
+        """Add a sorted block, joined with those before it that make a pair with it."""
+        level, place = 0, self._place
+        while place % 2 and self.blocks and self.blocks[-1][0] == level:
+            _, other = self.blocks.pop()
+            block = _join(block, other, upper=bool(place // 2 % 2))
+            level, place = level + 1, place // 2
+        self.blocks.append((level, block))
+        self._place += 1
+
+
+def _join(block: npt.NDArray[Any], other: npt.NDArray[Any], *, upper: bool) -> npt.NDArray[Any]:
+    """Every second value of two sorted blocks, the upper or the lower one of each pair."""
+    both = np.concatenate((block, other))
+    both.sort(kind="stable")
+    return both[int(upper) :: 2].copy()

@@ -65,8 +65,8 @@ class Mean:
         self._total += Fraction(total) / Fraction(scale)
         self.count += count
 
-    def include(self, other: Mean) -> None:
-        """Add all values that were added to another mean."""
+    def join(self, other: Mean) -> None:
+        """Add the values of another mean."""
         self._total += other._total
         self.count += other.count
 

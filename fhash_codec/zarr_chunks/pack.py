@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.dataset_encoding import encodable
-from fhash_codec.encoding import check_name
 from fhash_codec.header import OUTSIDE, describe_source, write_missing, write_series
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange

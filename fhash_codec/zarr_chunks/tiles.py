@@ -86,7 +86,7 @@ class Facts:
 
     def add(self, look: _Look, region: tuple[slice, ...]) -> None:
         """Add a tile in its place; tiles come in the order of their first step."""
-        self.mean.include(look.mean)
+        self.mean.join(look.mean)
         self.low, self.high = min(self.low, look.low), max(self.high, look.high)
         self.occupied += look.occupied
         self.features |= look.features

@@ -64,6 +64,10 @@ class TrainingError(FhashError, ArithmeticError):
     """Training that diverged or cannot go on."""
 
 
+class ClusterError(FhashError, RuntimeError):
+    """Work that failed on a machine of a cluster, or a cluster that was lost."""
+
+
 class MissingDependencyError(FhashError, ImportError):
     """A missing optional library of a format or command; the message names the extra to install."""
 

@@ -200,6 +200,11 @@ def test_append(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     check("append", parsed(fhash("append", run, data, "--t", "2:3", "--json", "-q")))
 
 
+def test_plan(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ("--max-error", "0.1", "--effort", "1", "-q", "--json")
+    check("plan", parsed(fhash("plan", data, "-o", tmp_path / "a.plan", *words)))
+
+
 def test_merge(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ("--max-error", "0.1", "--tile", "2x6x7x8", "--effort", "1", "-q", "--json")
     parts = [tmp_path / f"{number}.fhz" for number in (1, 2)]

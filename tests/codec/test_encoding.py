@@ -10,7 +10,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, OutputError, OutputExistsError, QualityError
 from fhash_codec.compact.tiles.coding import code
-from fhash_codec.encoding import DATA_SUFFIXES
+from fhash_codec.container_name import DATA_SUFFIXES
 from fhash_formats.readers import REGISTRY
 from fhash_formats.writers.mesh import MESH_SUFFIXES
 from fhash_formats.writers.registry import WRITERS

@@ -15,7 +15,7 @@ from click.core import ParameterSource
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.commands.cost import check_report_folder
-from fhash_cli.commands.merge import encode_all_or_part
+from fhash_cli.commands.merge import WishedPart, encode_all_or_part
 from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
@@ -84,6 +84,13 @@ MAX_LABELS = 64
     "as 3/16. `fhash merge` joins the parts to what one command would write with --no-timings. "
     "Needs --max-error or --max-error-rel.",
 )
+@click.option(
+    "--plan",
+    metavar="RUN.plan",
+    type=click.Path(),
+    help="With --part: the plan that `fhash plan` made, settings included. Only the steps of the "
+    "part are then read.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -104,6 +111,7 @@ def command(
     explain: bool,
     time_budget: float | None,
     part: str | None,
+    plan: str | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -119,8 +127,8 @@ def command(
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
     """
-    if part is not None and (explain or time_budget is not None or report_folder is not None):
-        raise click.UsageError("--part goes without --explain, --time-budget and --report")
+    others = explain or time_budget is not None or report_folder is not None
+    wish = WishedPart.of(part, plan, with_others=others)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, components, quiet=quiet)
@@ -142,7 +150,7 @@ def command(
             config = choice.config
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = encode_all_or_part(series, output, config, part, force, progress, predicted)
+            report = encode_all_or_part(series, output, config, wish, force, progress, predicted)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures

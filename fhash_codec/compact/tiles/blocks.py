@@ -85,6 +85,7 @@ class Blocks:
         self.complete = extent.samples == prod(self.shape)
         self.weights: tuple[int, ...] = (1,)
         self._box = _BoxInMemory()
+        self._only_layers = False
         self._cut(tile)
 
     def _cut(self, tile: Shape) -> None:
@@ -97,6 +98,15 @@ class Blocks:
         """Return the same series in other tiles; the box in memory is shared."""
         other = copy(self)
         other._cut(tile)
+        return other
+
+    def by_layers(self) -> Blocks:
+        """Return the same tiles, of which layer after layer is read and none is kept.
+
+        So nothing is read of the other layers, of a short series either.
+        """
+        other = copy(self)
+        other._only_layers, other._last_layer = True, None
         return other
 
     def window(self, shape: Shape) -> Blocks:
@@ -155,7 +165,7 @@ class Blocks:
     @property
     def in_memory(self) -> bool:
         """Whether the box over all steps stays in memory."""
-        return (
+        return not self._only_layers and (
             self._box.content is not None
             or prod(self.shape) * self.dtype.itemsize <= MAX_BYTES_IN_MEMORY
         )

@@ -140,6 +140,11 @@ class Sample:
         return self.blocks.in_memory
 
     @property
+    def filling(self) -> tuple[TileSettings, int] | None:
+        """Settings and density by which the tiles were filled; None for tiles of the source."""
+        return self._filling
+
+    @property
     def is_single(self) -> bool:
         """Whether this is one tile of several, which may be unlike the others."""
         return len(self.tiles) == 1 and not self.complete

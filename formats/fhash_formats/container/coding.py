@@ -39,6 +39,8 @@ A block of at most 128 KiB takes at least a header of three bytes and one more (
 CRC32C: Codec = {"name": "crc32c"}
 
 _CRC = struct.Struct("<I")
+CRC_BYTES = _CRC.size
+"""Bytes of the CRC-32C behind a chunk."""
 _ZSTD_MARK = 0xFD2FB528
 _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 

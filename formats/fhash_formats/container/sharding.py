@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.coding import CRC32C, Codec, crc32c, with_crc32c
+from fhash_formats.container.zip_checked import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 SHARDING = "sharding_indexed"
@@ -135,14 +136,34 @@ def shard_order(
         yield from sharding.chunks_of(shard, shape)
 
 
-def shard_shape(chunk_shape: Sequence[int], grid: Sequence[int]) -> Index:
+def shard_shape(
+    chunk_shape: Sequence[int], grid: Sequence[int], sizes: Sequence[int] | None = None
+) -> Index:
     """The shape of the shards that a writer chooses for an array of `grid` inner chunks.
 
     One shard holds the whole array up to SINGLE_SHARD_CHUNKS inner chunks. A larger array gets a
-    shard for each layer of inner chunks along the first axis.
+    shard for each layer of inner chunks along the first axis. Shards beyond the limits of the
+    format are halved, along the first axis first, so that C order stays the order of the file.
+
+    sizes: coded bytes of each inner chunk in C order; None for an array that is not that large.
     """
-    layers = grid[0] if prod(grid) <= SINGLE_SHARD_CHUNKS else 1
-    return tuple(n * count for n, count in zip(chunk_shape, (layers, *grid[1:]), strict=True))
+    counts = [grid[0] if prod(grid) <= SINGLE_SHARD_CHUNKS else 1, *grid[1:]]
+    for axis in range(len(counts)):
+        while counts[axis] > 1 and _beyond_limits(counts, grid, sizes):
+            counts[axis] = -(-counts[axis] // 2)
+    return tuple(n * count for n, count in zip(chunk_shape, counts, strict=True))
+
+
+def _beyond_limits(counts: Sequence[int], grid: Sequence[int], sizes: Sequence[int] | None) -> bool:
+    """Whether shards of so many inner chunks along each axis have too many, or too many bytes."""
+    if prod(counts) > MAX_SHARD_CHUNKS:
+        return True
+    if sizes is None:
+        return False
+    total = np.reshape(np.asarray(sizes, dtype=np.int64) + _CRC.size, grid)
+    for axis, count in enumerate(counts):
+        total = np.add.reduceat(total, range(0, grid[axis], count), axis=axis)
+    return int(total.max()) + prod(counts) * ENTRY_BYTES + _CRC.size > MAX_MEMBER
 
 
 def sharding_codecs(chunk_shape: Sequence[int], codecs: Sequence[Codec]) -> list[Codec]:

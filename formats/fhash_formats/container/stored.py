@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fhash_formats.container.ahead import Ahead, chunks_after
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.container.coding import without_crc32c
+from fhash_formats.container.coding import CRC_BYTES, without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.shard_places import ShardPlaces
 from fhash_formats.container.source import Source, damage_named
@@ -357,6 +357,11 @@ class StoredArray:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""
         with self._stored_chunk(index) as data:
             return without_crc32c(data)
+
+    def coded_bytes(self, index: ChunkIndex) -> int:
+        """The number of bytes that `coded` returns, without reading them."""
+        size = self.chunks[index].size if self._shards is None else self._place(index)[1]
+        return size - CRC_BYTES
 
     @contextmanager
     def _stored_chunk(self, index: ChunkIndex) -> Iterator[memoryview]:

@@ -30,6 +30,7 @@ class TableParts:
         tile: shape of a tile.
         settings: settings that all tiles share.
         streams: stream of each tile, in C order of their grid, masks included.
+        sizes: bytes of each stream, where they are known without reading it.
     """
 
     shape: tuple[int, ...]
@@ -37,6 +38,7 @@ class TableParts:
     tile: tuple[int, ...]
     settings: TileSettings
     streams: Sequence[bytes]
+    sizes: Sequence[int] | None = None
 
     @property
     def features(self) -> list[str]:
@@ -59,5 +61,6 @@ class TableParts:
             writer.add_array(TABLE, chunks=self.streams, **described)
             return
         grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-        shards = shard_shape(self.tile, grid)
+        sizes = self.sizes or [len(stream) for stream in self.streams]
+        shards = shard_shape(self.tile, grid, sizes)
         writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(self.streams), **described)

@@ -6,7 +6,8 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from itertools import count
 from threading import Lock
 from typing import TypeVar
@@ -25,23 +26,45 @@ SHARES_PER_THREAD = 4
 PART = 1 << 19
 """Values of a part of `row_parts`, at least; with fewer a further thread does not pay."""
 
+_most: ContextVar[int | None] = ContextVar("most threads", default=None)
+
 
 def usable_threads(threads: int | None = None) -> int:
     """The number of threads to use: `threads`, else FHASH_THREADS, else the usable processors.
 
-    The environment variable FHASH_THREADS is read at each call. Raises InputError for a number of
-    threads that is not allowed.
+    The environment variable FHASH_THREADS is read at each call. Within `at_most` there are no more
+    than it allows. Raises InputError for a number of threads that is not allowed.
     """
     if threads is not None:
         if threads < 1:
             raise InputError(f"threads is {threads}; at least 1 is needed")
         return threads
-    setting = os.environ.get("FHASH_THREADS")
-    if setting is not None:
-        if not (setting.isascii() and setting.isdigit() and 1 <= int(setting) <= MAX_THREADS):
-            raise InputError(f"FHASH_THREADS is '{setting:.40}'; allowed: 1 to {MAX_THREADS}")
-        return int(setting)
+    most, setting = _most.get(), os.environ.get("FHASH_THREADS")
+    if setting is None:
+        number = _processors()
+    elif setting.isascii() and setting.isdigit() and 1 <= int(setting) <= MAX_THREADS:
+        number = int(setting)
+    else:
+        raise InputError(f"FHASH_THREADS is '{setting:.40}'; allowed: 1 to {MAX_THREADS}")
+    return number if most is None else min(number, most)
+
+
+def _processors() -> int:
+    """The number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def at_most(threads: int) -> Iterator[None]:
+    """Limit `usable_threads` in the context, for a job that shares its process with others.
+
+    The limit is that of the caller's thread, which makes the pools and shares out the work.
+    """
+    token = _most.set(threads)
+    try:
+        yield
+    finally:
+        _most.reset(token)
 
 
 def in_threads(

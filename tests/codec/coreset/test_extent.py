@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.extent import Extent, find_extent
+from fhash_codec.coreset.extent import Extent, find_extent, packed_masks
 from fhash_codec.coreset.features import Everything, Feature, Interval, Mask
 from fhash_codec.coreset.scan import scan
 from fhash_codec.progress import silent
@@ -72,3 +72,16 @@ def test_features_are_kept_apart_where_asked_and_make_up_the_whole() -> None:
         np.testing.assert_array_equal(np.logical_or.reduce(masks), extent.mask(key))
         assert masks[0].sum() < masks[1].sum()
     assert extent_of(values, features).apart == ()
+
+
+@pytest.mark.parametrize("features", [(Interval(0.6, 1.0),), (Everything(),)])
+def test_masks_of_some_steps_are_those_of_the_whole(features) -> None:
+    values = VALUES.copy()
+    values[1, 2, 3, 4] = np.nan
+    series = ArraySeries(values)
+    seen = scan(series, silent)
+    whole = find_extent(series, seen, range(4), features, 1, silent)
+    some = packed_masks(series, seen.missing, range(1, 3), features, 1)
+    assert list(some) == [1, 2]
+    for step, packed in some.items():
+        np.testing.assert_array_equal(packed, whole.packed[step])

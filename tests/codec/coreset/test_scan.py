@@ -1,9 +1,13 @@
 """The first pass: range, mean and missing values."""
 
+import pickle
+
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.scan import scan
+from fhash_codec.coreset.scan import SpanScan, scan, scan_steps
+from fhash_codec.measure.ranks import Ranks
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
@@ -66,3 +70,66 @@ def test_progress_counts_the_steps() -> None:
     calls = []
     scan(ArraySeries(np.zeros((3, 1, 1, 1))), lambda *call: calls.append(call))
     assert calls == [("scanning", 1, 3, ""), ("scanning", 2, 3, ""), ("scanning", 3, 3, "")]
+
+
+def test_masks_of_some_steps_are_those_of_the_whole() -> None:
+    array = np.random.default_rng(1).random((5, 3, 4, 5))
+    array[1:4, 0], array[3, 1, 1] = np.nan, np.inf
+    series = ArraySeries(array)
+    whole = scan(series, silent)
+    some = scan_steps(series, range(1, 4), whole.value_range, may_miss=True, progress=silent)
+    assert list(some) == [1, 2, 3]
+    for step, bits in some.items():
+        np.testing.assert_array_equal(bits, whole.missing[step])
+
+
+def test_steps_of_other_data_are_refused() -> None:
+    array = np.arange(24.0).reshape(2, 2, 2, 3)
+    series = ArraySeries(array)
+    for known in (ValueRange(1, 23), ValueRange(0, 22)):
+        with pytest.raises(InputError, match="the plan is of data from"):
+            scan_steps(series, range(2), known, may_miss=False, progress=silent)
+    array[1, 0, 0, 0] = np.nan
+    assert scan_steps(series, range(1), ValueRange(0, 23), may_miss=False, progress=silent) == {}
+    with pytest.raises(InputError, match="step 1 has missing values, and the plan is of data wit"):
+        scan_steps(series, range(2), ValueRange(0, 23), may_miss=False, progress=silent)
+
+
+@pytest.mark.parametrize("length", [1, 2, 5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16])
+def test_spans_join_to_the_scan_of_all_steps(dtype, length) -> None:
+    array = (100 * np.random.default_rng(0).standard_normal((5, 4, 5, 6))).astype(dtype)
+    series, ranks = ArraySeries(array), Ranks()
+    whole = scan(series, silent, ranks)
+    spans = [SpanScan(series, range(a, min(a + length, 5))) for a in range(0, 5, length)]
+    joined = SpanScan.joined(series, pickle.loads(pickle.dumps(spans)))
+    assert joined is not None
+    assert joined[0] == whole
+    assert joined[1].middle(6) == ranks.middle(6)
+
+
+def test_extremes_of_spans_are_those_of_all_steps() -> None:
+    for extremes in ([7e7, 1e20], [-9999, 1e20], [-9999, 3], [5, 5], [1, 1e20]):
+        array = np.random.default_rng(0).random((6, 2, 3, 4))
+        array[1, 0, 0, 0], array[4, 1, 1, 1] = extremes
+        array[5, 0, :2, 0] = extremes
+        series = ArraySeries(array)
+        spans = [SpanScan(series, range(a, a + 2)) for a in (0, 2, 4)]
+
+        def outcome(work) -> str:
+            try:
+                return repr(work())
+            except InputError as error:
+                return str(error)
+
+        alone = outcome(lambda series=series: scan(series, silent))
+        assert outcome(lambda s=series, p=spans: SpanScan.joined(s, p)[0]) == alone
+
+
+def test_missing_values_in_a_span_leave_the_scan_to_another_way() -> None:
+    array = np.zeros((4, 2, 2, 2))
+    array[2, 0, 0, 0] = np.inf
+    series = ArraySeries(array)
+    spans = [SpanScan(series, range(a, a + 2)) for a in (0, 2)]
+    assert [span.has_missing for span in spans] == [False, True]
+    assert SpanScan.joined(series, spans) is None

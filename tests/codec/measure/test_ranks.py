@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from fhash_codec.measure.ranks import Ranks
+from fhash_codec.measure.ranks import Ranks, RanksSpan
 
 RNG = np.random.default_rng(0)
 KINDS = {
@@ -82,3 +83,33 @@ def test_the_error_is_small_where_memory_is() -> None:
     shift = abs(low - 0.01), abs(high - 0.99)
     assert max(shift) < 3 * ranks.error / count
     assert ranks.count == count
+
+
+@pytest.mark.parametrize("dtype", ["f4", "i2", "f8"])
+@pytest.mark.parametrize("seed", range(20))
+def test_spans_make_the_sketch_of_one_pass(dtype, seed) -> None:
+    generator, size = np.random.default_rng(seed), 8
+    values = (100 * generator.standard_normal(generator.integers(1, 2000))).astype(dtype)
+    whole, parts = Ranks(size), Ranks(size)
+    whole.add(values)
+    cuts = np.sort(generator.integers(0, values.size + 1, generator.integers(0, 9)))
+    for first, end in pairwise([0, *cuts.tolist(), values.size]):
+        span = RanksSpan(first, size)
+        middle = (first + end) // 2
+        span.add(values[first:middle])
+        span.add(values[middle:end].reshape(1, -1))
+        assert len(span.blocks) <= 2 * max(1, values.size // size).bit_length()
+        parts.extend(span)
+    assert (parts.count, parts.error) == (whole.count, whole.error)
+    for beyond in {0, values.size // 100, (values.size - 1) // 2}:
+        assert parts.middle(beyond) == whole.middle(beyond)
+    more = values[:500]
+    whole.add(more)
+    parts.add(more)
+    assert (parts.error, parts.middle(2)) == (whole.error, whole.middle(2))
+
+
+def test_a_span_of_another_place_is_refused() -> None:
+    span = RanksSpan(3, 8)
+    with pytest.raises(ValueError, match="values from 3 on do not follow 0"):
+        Ranks(8).extend(span)

@@ -126,5 +126,5 @@ def test_means_of_parts_make_that_of_the_whole() -> None:
         whole.add(part)
         one = Mean()
         one.add(part)
-        parts.include(one)
+        parts.join(one)
     assert (parts.count, parts.value()) == (whole.count, whole.value())

@@ -21,6 +21,7 @@ from fhash_formats.container.sharding import (
     parse_index,
     sharding_codecs,
 )
+from fhash_formats.container.zip_checked import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 
 
@@ -258,3 +259,32 @@ def test_the_parts_of_shards_hold_each_chunk_once() -> None:
             assert sharding.place(index)[0] == shard
             chunks.append(index)
     assert sorted(chunks) == list(product(*spans))
+
+
+@pytest.mark.parametrize(
+    ("grid", "largest", "counts"),
+    [
+        ((4, 3, 5, 2), 1 << 20, (4, 3, 5, 2)),  # 120 MiB fit
+        ((4, 3, 5, 2), 1 << 25, (2, 3, 5, 2)),  # 3.8 GiB: half of the steps
+        ((4, 3, 5, 2), 1 << 27, (1, 1, 5, 2)),  # 15 GiB: a third of a layer, 1.3 GiB
+        ((4, 3, 5, 2), 1 << 29, (1, 1, 2, 2)),
+        ((4, 3, 5, 2), MAX_MEMBER // 2, (1, 1, 1, 2)),
+        ((4, 3, 5, 2), MAX_MEMBER, (1, 1, 1, 1)),  # no shard can hold such a tile
+        ((2, 1 << 7, 1 << 7, 1 << 7), 1, (1, 1 << 6, 1 << 7, 1 << 7)),  # 2^20 tiles
+    ],
+)
+def test_shards_stay_within_the_limits(grid, largest, counts) -> None:
+    sizes = np.ones(np.prod(grid), np.int64)
+    sizes[:] = largest - 64 if grid[0] == 4 else largest
+    assert shard_shape((1, 2, 3, 4), grid, sizes) == tuple(np.multiply((1, 2, 3, 4), counts))
+    order = shard_order(grid, (1, 1, 1, 1), counts)
+    if grid[0] == 4:
+        assert list(order) == list(product(*map(range, grid)))
+
+
+def test_the_largest_shard_decides() -> None:
+    sizes = np.ones((4, 2, 1, 1), np.int64)
+    sizes[2] = MAX_MEMBER // 2 - 100
+    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (4, 2, 1, 1)
+    sizes[3, 0] = 1000
+    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (1, 2, 1, 1)

@@ -15,6 +15,7 @@ from fhash_formats.support.threads import (
     ITEMS_PER_THREAD,
     PART,
     SHARES_PER_THREAD,
+    at_most,
     in_threads,
     map_ahead,
     row_parts,
@@ -184,3 +185,18 @@ def test_parts_hold_each_row_once_and_pay(rows: int, row: int, threads: int) -> 
     parts = row_parts(rows, row, threads)
     assert [number for first, end in parts for number in range(first, end)] == list(range(rows))
     assert len(parts) == max(1, min(threads, rows, rows * row // PART))
+
+
+def test_a_job_may_be_limited_to_some_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_THREADS", "6")
+    seen = []
+    with at_most(2):
+        assert usable_threads() == 2
+        other = threading.Thread(target=lambda: seen.append(usable_threads()))
+        other.start()
+        other.join()
+        with at_most(9):
+            assert usable_threads() == 6
+        assert usable_threads(5) == 5
+    assert seen == [6]  # another job of the process is not concerned
+    assert usable_threads() == 6

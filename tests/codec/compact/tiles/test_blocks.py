@@ -107,3 +107,22 @@ def test_a_window_is_the_part_where_values_vary_most(
         np.testing.assert_array_equal(part.counted, whole[1:4, :, :, 4:])
     half = window.retile((3, 6, 7, 2))
     np.testing.assert_array_equal(half.read((0, 0, 0, 1)).values, VALUES[1:4, :, :, 6:])
+
+
+def test_by_layers_only_the_layer_that_is_asked_for_is_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    blocks = blocks_of((2, 4, 7, 5))
+    read: list[int] = []
+    usual = ArraySeries.read
+    monkeypatch.setattr(
+        ArraySeries, "read", lambda self, step: read.append(step) or usual(self, step)
+    )
+    layers = blocks.by_layers()
+    assert not layers.in_memory
+    for index in [(1, 0, 0, 0), (1, 1, 0, 1)]:
+        tile = layers.read(index)
+        assert read == [2, 3]
+        assert blocks.in_memory
+        first = VALUES[2:4, 4 * index[1], 0, 5 * index[3]]
+        np.testing.assert_array_equal(tile.values[:, 0, 0, 0], first)
