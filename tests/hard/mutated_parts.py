@@ -76,7 +76,7 @@ def _part(chance: random.Random, parts: Parts) -> Parts:
 
 def _whole(chance: random.Random, parts: Parts) -> Parts:
     """Give a part arrays that the whole is said to have, small and large."""
-    length = chance.choice((1, 3, 1 << 20, 1 << 24))
+    length = chance.choice((1, 3, 1 << 20, 1 << 22))
     name = f"whole/{chance.choice(WHOLE)}"
     added = array_of_zeros(name, [length], chance.choice(("float64", "uint8", "int64")))
     groups = ["/".join(name.split("/")[:n]) for n in range(1, name.count("/") + 1)]
@@ -165,7 +165,7 @@ def _beside(chance: random.Random, parts: Parts) -> Parts:
     """Add an array that a growing file would have to carry on."""
     name = chance.choice(("extra", "steps/errors", "auxiliary/a", "occupancy/bits", "coords/x"))
     table = _root(parts)[1].get("array", TABLE)
-    length = chance.choice((1, 7, prod(tile_of(documents_of(parts)[table])), 1 << 24))
+    length = chance.choice((1, 7, prod(tile_of(documents_of(parts)[table])), 1 << 22))
     added = array_of_zeros(name, [length], chance.choice(("float64", "uint8")))
     if "/" in name:
         group = b'{"zarr_format":3,"node_type":"group"}'

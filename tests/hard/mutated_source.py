@@ -135,9 +135,9 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _zeros(chance: random.Random, parts: Parts) -> Parts:
-    """Declare arrays beside the values of up to 2^27 bytes of zeros, alone or many times."""
+    """Declare arrays beside the values of up to 2^25 bytes of zeros, alone or many times."""
     root, headers = _headers(parts)
-    length = 1 << chance.choice((18, 20, 22, 24))
+    length = 1 << chance.choice((16, 18, 20, 22))
     times = chance.choice((1, 7, 500))
     for header in headers:
         header["source"]["lengths"] = {"long": length}
