@@ -220,14 +220,19 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
             for array in container.arrays.values():
                 if array.coding != TRANSFORM:
                     continue
-                t, z, y, x = (1,) * (4 - len(array.chunk_shape)) + array.chunk_shape
+                t, z, y, x = (
+                    (1,) * (4 - len(array.chunk_shape)) + array.chunk_shape
+                    if array.axes is None
+                    else array.axes.tile_shape(array.chunk_shape)
+                )
                 for index in np.ndindex(*array.grid):
                     stream = bytes(array.coded(index))
                     if array.masks is not None:
                         stream = join_mask(stream, array.masks.coded(index))
                     own = parse_stream(stream).settings
                     settings = array.settings if own is None else unpack_settings(own)
-                    yield stream, settings, (t, z, y, x)
+                    if settings is not None:  # else the stream has no coded integers
+                        yield stream, settings, (t, z, y, x)
 
 
 def coded_sections(
