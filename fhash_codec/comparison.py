@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,12 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Place
+from fhash_formats.container.reader import CACHE_BYTES
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
 
+LAYER_BYTES = 1 << 30
+"""Bytes of decoded frames that are held at a time, at most; a single larger one is allowed."""
 QUICK_SSIM_BUDGET = 1 << 20
 """Vertices whose SSIM is measured after an encoding at effort 1."""
 
@@ -113,7 +117,7 @@ def measure(
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
     quality = measure_quality(
         series.read,
-        volume.values if exact else volume.read,
+        DecodedFrames(volume, exact=exact).read,
         series.shape[0],
         data_range,
         volume.background,
@@ -125,6 +129,40 @@ def measure(
     )
     series.check()
     return quality.to_dict()
+
+
+class DecodedFrames:
+    """The decoded frames of a volume, read in their order.
+
+    A reader of single frames decodes a layer of tiles for each of its steps where the layer is
+    larger than the cache. Then the steps of a layer are decoded together.
+    """
+
+    def __init__(self, volume: Volume, *, exact: bool) -> None:
+        """Read nothing yet. exact: whether integers come as such, and not as floats."""
+        self._volume, self._exact = volume, exact
+        self._steps, self._frames = range(0), np.empty(0)
+        layer = min(volume.chunks[0], volume.shape[0])
+        room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
+        parts = -(-room // LAYER_BYTES)
+        self._layer, self._together = layer, 1 if 2 * room <= CACHE_BYTES else -(-layer // parts)
+
+    def read(self, step: int) -> npt.NDArray[Any]:
+        """The frame (z, y, x) of a step."""
+        volume = self._volume
+        if self._together == 1:
+            return volume.values(step) if self._exact else volume.read(step)
+        if step not in self._steps:
+            self._frames = np.empty(0)  # its memory is free before more is decoded
+            start = step // self._layer * self._layer
+            first = start + (step - start) // self._together * self._together
+            end = min(first + self._together, start + self._layer, volume.shape[0])
+            self._steps = range(first, end)
+            read = volume.values_of_steps if self._exact else volume.read_steps
+            self._frames = read(self._steps)
+        # A copy, so that a frame that is still compared does not hold the others.
+        frame: npt.NDArray[Any] = self._frames[step - self._steps.start].copy()
+        return frame
 
 
 def _neighbours(series: Series, volume: Volume) -> NeighboursOf | None:

@@ -197,6 +197,7 @@ class _Job:
         blocks = self._blocks(missing, progress)
         with thread_pool() as workers:
             coded = code_layers(blocks, plan.recipe, self.layers, workers, progress)
+        blocks.forget()  # measuring needs the memory
         with ContainerWriter(path, force=force) as writer:
             header = self._write_arrays(writer, blocks, coded, missing)
             quality, errors, whole = self._measured(writer, header, progress)

@@ -90,6 +90,8 @@ def encode_compact(
     mark = writer.mark()
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
+    if config.ratio is None:
+        table.plan.blocks.forget()  # all is coded, and measuring needs the memory
     for _ in range(WRITINGS):
         parts = table.parts
         with stage("writing", "tiles"):

@@ -109,6 +109,12 @@ class Blocks:
         other._only_layers, other._last_layer = True, None
         return other
 
+    def forget(self) -> None:
+        """Free the memory of the values, which are read again when they are asked for."""
+        with self._box.lock:
+            self._box.content = None
+        self._last_layer = None
+
     def window(self, shape: Shape) -> Blocks:
         """Return a part of the box over some steps, as one tile in memory: where values vary most.
 

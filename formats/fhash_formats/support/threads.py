@@ -102,17 +102,24 @@ def in_threads(
         more = min(usable_threads() if threads is None else threads, len(arguments)) - 1
         for _ in range(more):
             helpers.append(_threads.pool(more).submit(compute_all))
+    taken: Future[Result] = Future()
     try:
-        for future in results:
+        for place, future in enumerate(results):
             while not future.done() and compute_next():
                 pass
-            yield future.result()
+            result, results[place] = future.result(), taken
+            future = taken  # so that nothing here holds what was yielded
+            yield result
+            del result
     finally:
         stopped = True
         for helper in helpers:
             # A helper that never began, because the pool is busy, has nothing left to do.
             if not helper.cancel():
                 helper.result()
+        # The pool holds such a helper until it is free, and would hold all of this with it.
+        arguments.clear()
+        results.clear()
 
 
 def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], threads: int) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
+import weakref
 from collections.abc import Iterator, Sequence
 
 import pytest
@@ -200,3 +202,30 @@ def test_a_job_may_be_limited_to_some_threads(monkeypatch: pytest.MonkeyPatch) -
         assert usable_threads(5) == 5
     assert seen == [6]  # another job of the process is not concerned
     assert usable_threads() == 6
+
+
+def test_a_busy_pool_holds_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_threads", lambda: 2)
+    begun, done = threading.Event(), threading.Event()
+
+    class Large:
+        """A result that can be watched."""
+
+    def wait(item: int) -> None:
+        begun.set()
+        done.wait(60)
+
+    occupied = threading.Thread(target=lambda: list(in_threads(wait, range(2))))
+    occupied.start()
+    assert begun.wait(60)
+    held: list[weakref.ref[Large]] = []
+    try:
+        for result in in_threads(lambda item: Large(), range(4)):
+            assert all(one() is None for one in held)
+            held.append(weakref.ref(result))
+        del result
+        gc.collect()
+        assert [one() for one in held] == [None] * 4
+    finally:
+        done.set()
+        occupied.join()
