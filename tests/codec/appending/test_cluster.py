@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
+import zarr
 
 import fhash_codec
 from fhash_codec import ClusterError, EncodeConfig, InputError
@@ -131,6 +133,21 @@ def test_an_array_without_labels_and_with_gaps(tmp_path, client) -> None:
     gaps = values()
     gaps[3:5, 1:3] = np.nan
     require_same(tmp_path, dask.from_array(gaps, chunks=(3, 6, 4, 10)), client, settings())
+
+
+def test_workers_read_what_this_process_reads(tmp_path, client) -> None:
+    """dask takes the client by default: for the engine, the file as Zarr, and its view."""
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(values(), path, settings())
+    with fhash_codec.open(path) as volume:
+        expected = volume[...]
+    store = zarr.storage.ZipStore(path, mode="r")
+    for dataset in (
+        xarray.open_dataset(path, chunks={}),
+        xarray.open_zarr(store, consolidated=False),
+        xarray.open_zarr(fhash_codec.zarr_store(path)),
+    ):
+        np.testing.assert_array_equal(dataset["values"], expected)
 
 
 def test_a_failure_of_a_worker_is_one_line(tmp_path, client) -> None:
