@@ -66,5 +66,5 @@ def test_a_file_has_the_plateau_as_its_centre(tmp_path, effort: int) -> None:
     path = tmp_path / "a.fhz"
     fhash_codec.encode(values, path, EncodeConfig(psnr=45.0, effort=effort, timings=False))
     with zipfile.ZipFile(path) as file:
-        array = file.read("tables/level_1/zarr.json").decode()
+        array = file.read("values/zarr.json").decode()
     assert f'"center":{float(np.float32(0.777))}' in array
