@@ -49,19 +49,19 @@ class TableParts:
     settings: TileSettings
     streams: Sequence[bytes]
     apart: bool | None = None
-    sizes: Sequence[int] | None = None
+    sizes: npt.NDArray[np.int64] | None = None
 
     @cached_property
-    def _sizes(self) -> Sequence[int]:
+    def _sizes(self) -> npt.NDArray[np.int64]:
         """Bytes of each stream."""
-        return [len(stream) for stream in self.streams] if self.sizes is None else self.sizes
+        return _lengths(self.streams) if self.sizes is None else self.sizes
 
     @cached_property
     def _apart(self) -> bool:
         """Whether head and masks have arrays of their own."""
         if self.apart is not None:
             return self.apart
-        return sum(self._sizes) >= APART_BYTES
+        return int(self._sizes.sum()) >= APART_BYTES
 
     @cached_property
     def _split(self) -> tuple[Sequence[bytes], Sequence[bytes] | None]:
@@ -133,6 +133,11 @@ class TableParts:
             writer.add_array(name, chunks=chunks, **described)
             return
         grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-        sizes = self._sizes if chunks is self.streams else [len(chunk) for chunk in chunks]
+        sizes = self._sizes if chunks is self.streams else _lengths(chunks)
         shards = shard_shape(self.tile, grid, sizes)
         writer.add_sharded(name, shard_shape=shards, chunks=iter(chunks), **described)
+
+
+def _lengths(chunks: Sequence[bytes]) -> npt.NDArray[np.int64]:
+    """Bytes of each chunk."""
+    return np.fromiter(map(len, chunks), np.int64, len(chunks))

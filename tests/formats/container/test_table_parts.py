@@ -106,7 +106,7 @@ def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypat
     parts, header = table_parts(), samples.compact_header()
     whole = write_table(tmp_path / "whole.fhz", header, parts, apart=True)
     monkeypatch.setattr(sharding, "MAX_MEMBER", most)
-    known = replace(parts, sizes=[len(stream) for stream in parts.streams])
+    known = replace(parts, sizes=np.array([len(stream) for stream in parts.streams]))
     paths = [
         write_table(tmp_path / f"{number}.fhz", header, each, apart=True)
         for number, each in enumerate((parts, known))
