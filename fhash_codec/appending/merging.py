@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import islice, product
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple, overload
@@ -32,6 +32,7 @@ from fhash_formats.container.variables import is_several
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.atomic import check_output
+from fhash_formats.support.open_files import many_files
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["Joined", "join_parts", "merge"]
@@ -88,7 +89,7 @@ def join_parts(
     output = Path(output)
     check_name(output)
     check_output(output, force, sources=list(paths))
-    with ExitStack() as stack:
+    with many_files(len(paths)), ExitStack() as stack:
         parts = [_Piece(stack.enter_context(Container.open(path))) for path in paths]
         parts.sort(key=lambda part: part.first)
         _require_whole(parts)
@@ -211,20 +212,20 @@ class _Streams(Sequence[bytes]):
 
     parts: Sequence[_Piece]
 
-    @cached_property
-    def places(self) -> list[tuple[_Piece, tuple[int, ...]]]:
+    def places(self) -> Iterator[tuple[_Piece, tuple[int, ...]]]:
         """Part and index of each tile, in C order of the whole."""
-        return [
-            (part, index) for part in self.parts for index in product(*map(range, part.table.grid))
-        ]
+        for part in self.parts:
+            for index in product(*map(range, part.table.grid)):
+                yield part, index
 
-    def sizes(self) -> list[int]:
+    def sizes(self) -> npt.NDArray[np.int64]:
         """Bytes of each tile, from the indices of the parts."""
-        sizes = []
-        for part, place in self.places:
+
+        def size(part: _Piece, place: tuple[int, ...]) -> int:
             with damage_named(part.path):
-                sizes.append(part.table.coded_bytes(place))
-        return sizes
+                return part.table.coded_bytes(place)
+
+        return np.fromiter((size(*place) for place in self.places()), np.int64, len(self))
 
     def __len__(self) -> int:
         return sum(prod(part.table.grid) for part in self.parts)
@@ -236,10 +237,10 @@ class _Streams(Sequence[bytes]):
     def __getitem__(self, index: int | slice) -> bytes | Sequence[bytes]:
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
-        return _read(*self.places[index])
+        return _read(*next(islice(self.places(), index, None)))
 
     def __iter__(self) -> Iterator[bytes]:
-        return (_read(part, place) for part, place in self.places)
+        return (_read(part, place) for part, place in self.places())
 
 
 def _read(part: _Piece, place: tuple[int, ...]) -> bytes:

@@ -137,7 +137,7 @@ def shard_order(
 
 
 def shard_shape(
-    chunk_shape: Sequence[int], grid: Sequence[int], sizes: Sequence[int] | None = None
+    chunk_shape: Sequence[int], grid: Sequence[int], sizes: npt.NDArray[np.int64] | None = None
 ) -> Index:
     """The shape of the shards that a writer chooses for an array of `grid` inner chunks.
 
@@ -154,13 +154,15 @@ def shard_shape(
     return tuple(n * count for n, count in zip(chunk_shape, counts, strict=True))
 
 
-def _beyond_limits(counts: Sequence[int], grid: Sequence[int], sizes: Sequence[int] | None) -> bool:
+def _beyond_limits(
+    counts: Sequence[int], grid: Sequence[int], sizes: npt.NDArray[np.int64] | None
+) -> bool:
     """Whether shards of so many inner chunks along each axis have too many, or too many bytes."""
     if prod(counts) > MAX_SHARD_CHUNKS:
         return True
     if sizes is None:
         return False
-    total = np.reshape(np.asarray(sizes, dtype=np.int64) + _CRC.size, grid)
+    total = np.reshape(sizes + _CRC.size, grid)
     for axis, count in enumerate(counts):
         total = np.add.reduceat(total, range(0, grid[axis], count), axis=axis)
     return int(total.max()) + prod(counts) * ENTRY_BYTES + _CRC.size > MAX_MEMBER

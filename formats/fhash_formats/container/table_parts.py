@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_formats.container.apart import TABLE
 from fhash_formats.container.coding import transform_codecs
@@ -38,7 +39,7 @@ class TableParts:
     tile: tuple[int, ...]
     settings: TileSettings
     streams: Sequence[bytes]
-    sizes: Sequence[int] | None = None
+    sizes: npt.NDArray[np.int64] | None = None
 
     @property
     def features(self) -> list[str]:
@@ -61,6 +62,8 @@ class TableParts:
             writer.add_array(TABLE, chunks=self.streams, **described)
             return
         grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-        sizes = self.sizes or [len(stream) for stream in self.streams]
+        sizes = self.sizes
+        if sizes is None:
+            sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
         shards = shard_shape(self.tile, grid, sizes)
         writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(self.streams), **described)

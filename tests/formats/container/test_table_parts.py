@@ -108,7 +108,7 @@ def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypat
 
     whole = written("whole.fhz", parts)
     monkeypatch.setattr(sharding, "MAX_MEMBER", most)
-    known = replace(parts, sizes=[len(stream) for stream in parts.streams])
+    known = replace(parts, sizes=np.array([len(stream) for stream in parts.streams]))
     paths = [written(f"{number}.fhz", each) for number, each in enumerate((parts, known))]
     assert paths[0].read_bytes() == paths[1].read_bytes()
     with Container.open(whole) as container, Container.open(paths[0]) as cut:
