@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fhash_cli.output import apart, extent, listed
@@ -39,6 +41,9 @@ def listing(
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
+    if len(good) > 1 and all(len(variable["commands"]) == 1 for variable in good):
+        words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
+        lines.append(f"\nall in one file:\n  {shlex.join(words)}")
     rest = [variable for variable in variables if variable["problem"]]
     others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
     small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fhash_cli.source_listing import MAX_TEXT, details, details_rows, positions
+from fhash_cli.source_listing import MAX_TEXT, details, details_rows, listing, positions
 from fhash_formats.series import ArraySeries, Coordinate
 
 
@@ -30,3 +30,26 @@ def test_positions_of_times_are_dates_where_they_are() -> None:
     time = Coordinate(name="t", values=np.array([0.5, 2.0]), attributes={"units": "s"})
     assert positions(time, "t") == "t 0.5 to 2 s"
     assert positions(time, "x") == "t 0.5 to 2 s"
+
+
+def test_several_variables_go_into_one_file_unless_one_can_be_read_in_two_ways() -> None:
+    dimensions = [{"name": name, "length": 2, "axis": name} for name in "tzyx"]
+    variables = [
+        {
+            "name": name,
+            "dtype": "float32",
+            "stored": "",
+            "units": "",
+            "shape": [2, 2, 2, 2],
+            "missing": [],
+            "problem": "",
+            "dimensions": dimensions,
+            "commands": [f"fhash encode 'a b.nc' --var {name}"],
+        }
+        for name in "uv"
+    ]
+    line = "\nall in one file:\n  fhash encode 'a b.nc' -o 'a b.fhz' --var all"
+    assert listing("a b.nc", 1, variables).endswith(line)
+    assert "all in one file" not in listing("a b.nc", 1, variables[:1])
+    variables[0]["commands"] *= 2
+    assert "all in one file" not in listing("a b.nc", 1, variables)
