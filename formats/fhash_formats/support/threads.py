@@ -58,7 +58,7 @@ def _processors() -> int:
 def at_most(threads: int) -> Iterator[None]:
     """Limit `usable_threads` in the context, for a job that shares its process with others.
 
-    The limit is that of the caller's thread, which makes the pools and shares out the work.
+    The limit is that of the caller's thread and of the pools that it makes (`thread_pool`).
     """
     token = _most.set(threads)
     try:
@@ -144,8 +144,16 @@ def row_parts(rows: int, row: int, threads: int) -> list[tuple[int, int]]:
 
 
 def thread_pool() -> ThreadPoolExecutor:
-    """Create a pool of one thread per usable processor, for work that releases the GIL."""
-    return ThreadPoolExecutor(usable_threads(), thread_name_prefix="fhash-tile")
+    """Create a pool of one thread per usable processor, for work that releases the GIL.
+
+    The limit of `at_most` holds in its threads, too.
+    """
+    return ThreadPoolExecutor(
+        usable_threads(),
+        thread_name_prefix="fhash-tile",
+        initializer=_most.set,
+        initargs=(_most.get(),),
+    )
 
 
 def map_ahead(

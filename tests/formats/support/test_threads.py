@@ -200,6 +200,8 @@ def test_a_job_may_be_limited_to_some_threads(monkeypatch: pytest.MonkeyPatch) -
         with at_most(9):
             assert usable_threads() == 6
         assert usable_threads(5) == 5
+        with thread_pool() as pool:
+            assert pool.submit(usable_threads).result() == 2
     assert seen == [6]  # another job of the process is not concerned
     assert usable_threads() == 6
 
