@@ -143,7 +143,7 @@ import os, signal, sys, time
 from fhash_cli import main
 if sys.argv[1] == "decode":
     from fhash_codec.volume import Volume as Slow
-    name = "read"
+    name = "read_steps"
 else:
     from fhash_formats.container import ContainerWriter as Slow
     name = "add_array"  # of a paper file, and of a compact one of a single tile
