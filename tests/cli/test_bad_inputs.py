@@ -379,7 +379,7 @@ LINES = [
     ("completion", "Missing argument 'SHELL'. Choose from: bash, zsh, fish"),
     ("completion csh", "Invalid value for 'SHELL': 'csh' is not one of"),
     ("encode DATA -o x.fhz --psnr forty", "'forty' is not a valid number"),
-    ("encode DATA -o x.fhz --pnsr 40", "Did you mean one of: '--part', '--psnr'?"),
+    ("encode DATA -o x.fhz --pnsr 40", "Did you mean one of: '--part', '--plan', '--psnr'?"),
     ("encode DATA -o x.fhz --ratio 0.5", "0.5 is not in the range 1<=x<=1e+09"),
     ("encode DATA -o x.fhz --var a --var b", "--var is given more than once"),
     ("diff RUN DATA", "the data come first: fhash diff DATA RUN"),
