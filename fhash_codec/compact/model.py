@@ -117,6 +117,13 @@ class CompactModel:
             return self._read_plain_lod(step, lod, region)
         array = self._table
         values = read_coarse(array, step, lod, region, array.decode_chunk, array.dtype)
+        lost = np.isnan(values) if lod and values.dtype.kind == "f" else np.zeros(0, np.bool_)
+        if lost.any():
+            # A tile of labels that begins between coarse vertices gives a vertex beside each of
+            # them, which may be outside of the coreset where the vertex itself is not.
+            spans = [slice(low << lod, ((high - 1) << lod) + 1) for low, high in region]
+            own = array.read((slice(step, step + 1), *spans))[0][(slice(None, None, 1 << lod),) * 3]
+            np.copyto(values, own, where=lost)
         return self._without_infinities(values)
 
     def _read_plain_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:

@@ -14,12 +14,13 @@ using std::int64_t;
 
 // Add `weight` times the pair of values on both sides of each value of a row. Where one of the two
 // is missing, twice the value itself stands for the pair, so that linear values stay as they are.
+// Their mean counts twice: the sum of two values near the largest one is infinite.
 FHASH_CLONES void add_pairs(const float* row, const float* before, const float* behind,
                             int64_t count, float weight, float* FHASH_RESTRICT sum) {
     FHASH_INDEPENDENT
     for (int64_t i = 0; i < count; i++) {
-        const float pair = before[i] + behind[i];
-        sum[i] += weight * (pair == pair ? pair : 2 * row[i]);
+        const float mean = 0.5f * before[i] + 0.5f * behind[i];
+        sum[i] += 2 * weight * (mean == mean ? mean : row[i]);
     }
 }
 

@@ -93,10 +93,12 @@ def _along(values: Single, weights: Single, axis: int) -> Single:
     count = len(values)
     out = weights[0] * values
     for away, weight in enumerate(weights[1:], start=1):
-        pairs = 2 * values
+        # The sum of two values near the largest one is infinite; their mean counts twice.
+        means = values.copy()
         if count > 2 * away:
-            both = values[: count - 2 * away] + values[2 * away :]
-            inner = pairs[away : count - away]
+            half = np.float32(0.5)
+            both = half * values[: count - 2 * away] + half * values[2 * away :]
+            inner = means[away : count - away]
             inner[...] = np.where(np.isnan(both), inner, both)
-        out += weight * pairs
+        out += 2 * weight * means
     return np.ascontiguousarray(np.moveaxis(out, 0, axis))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -267,3 +268,20 @@ def test_masks_of_other_numbers_are_masks(monkeypatch: pytest.MonkeyPatch) -> No
         )
         np.testing.assert_array_equal(volume[...], expected)
         np.testing.assert_array_equal(volume.read(0.5), between)
+
+
+def test_coarse_levels_of_labels_have_every_vertex_of_the_coreset(tmp_path: Path) -> None:
+    """Tiles of odd lengths begin between the coarse vertices; their labels lie beside these."""
+    t, z, y, x = np.indices((4, 9, 10, 11))
+    values = np.rint(5 * np.sin(x / 2 + t) * np.cos(y / 2) + z / 3).astype(np.float32)
+    config = EncodeConfig(effort=1, tile="2x3x4x5", features=("isosurface:2.5",), dilation=0)
+    fhash_codec.encode(values, tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert "labels" in volume.info["required_features"]
+        box = volume.box.slices()
+        for step, lod in product(range(4), (1, 2)):
+            coarse = volume.read_lod(step, lod)
+            every = (slice(None, None, 1 << lod),) * 3
+            occupied = volume.occupancy(step)[box][every]
+            assert 0 < occupied.sum() < occupied.size
+            np.testing.assert_array_equal(np.isfinite(coarse), occupied)

@@ -65,3 +65,12 @@ def test_errors_cancel_and_what_is_larger_than_they_are_stays(way: str) -> None:
     heights = found[4:-4, 4:-4, 8] - found[4:-4, 4:-4, 7]
     assert heights.min() > 0.95
     assert (free[..., 8] - free[..., 7]).max() < 0.5
+
+
+def test_values_near_the_largest_float_stay_finite(way: str) -> None:
+    given = np.float32(3.2e38) * values((9, 10, 24), 3)
+    found = smoothed(given, 1.3)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(
+        found / np.float32(1e38), smoothed(given / np.float32(1e38), 1.3), rtol=1e-5
+    )
