@@ -24,6 +24,7 @@ from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.sharding import Sharding, pack_index, parse_index
 from fhash_formats.errors import FhashError
 from fhash_formats.transform.apart import without_names
+from fhash_formats.transform.array_axes import take_axes
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.entropy.coder import decode_integers
 from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels
@@ -39,6 +40,7 @@ from fhash_formats.transform.tile.sections import (
     little_endian,
     parse_stream,
     section,
+    unpack_settings,
 )
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -250,9 +252,17 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
     whole, apart = without_names(configuration_of(document))
-    settings, shape = TileSettings.from_dict(whole), sharding.chunk_shape
+    whole, axes = take_axes(whole)
+    shape = sharding.chunk_shape if axes is None else axes.tile_shape(sharding.chunk_shape)
     dtype = np.dtype(document["data_type"])
     stream = chunks[at][:-4]
+    if "transform" in whole:
+        settings = TileSettings.from_dict(whole)
+    else:  # tiles have settings of their own, or need none
+        own = parse_stream(stream).settings
+        if own is None:
+            raise NothingFitsError
+        settings = unpack_settings(own)
     if MASK_ARRAY in apart:
         stream = split_mask(_restreamed(chance, join_mask(stream, b""), settings, shape, dtype))[0]
     else:
