@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import mutations
 import pytest
 from fuzz import run
 from test_faults_together import PLACES
@@ -73,3 +74,14 @@ def test_sources_of_the_fuzzer_exist() -> None:
     sources += [run.CODEC / f"{name}.cpp" for name in (*run.CODEC_SOURCES, *run.MARCH)]
     for path in (*sources, *run.TARGETS):
         assert path.is_file(), path
+
+
+def test_seeds_of_the_fuzzer_are_written_of_every_golden(tmp_path: Path) -> None:
+    run.prepare(tmp_path, every=40)
+    assert any((tmp_path / "corpus").iterdir())
+
+
+def test_mutations_of_goldens_are_made() -> None:
+    """A golden that a mutation cannot take would stop the long set after a quarter of an hour."""
+    for number in range(0, 12_000, 10):
+        assert mutations.mutation(number).data
