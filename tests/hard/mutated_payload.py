@@ -223,7 +223,9 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
                     )
                 )
     if chance.random() < 0.2:
-        values[:] = chance.choice(SPECIAL) if dtype.kind == "f" else chance.choice((0, 255))
+        # The largest float64 is infinite in float32.
+        with np.errstate(over="ignore"):
+            values[:] = chance.choice(SPECIAL) if dtype.kind == "f" else chance.choice((0, 255))
     return replaced(parts, {member: with_crc(compress(values.tobytes(), 1))})
 
 
