@@ -53,10 +53,8 @@ STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
 
 
-def describe_source(
-    series: Series, value_range: ValueRange, config: EncodeConfig
-) -> dict[str, Any]:
-    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
+def describe_variable(series: Series) -> dict[str, Any]:
+    """The header entry of the variable of a series."""
     variable: dict[str, Any] = {
         "name": str(series.name),
         "units": str(series.units),
@@ -65,6 +63,14 @@ def describe_source(
     }
     if series.fill is not None and math.isfinite(series.fill):
         variable["fill"] = series.fill
+    return variable
+
+
+def describe_source(
+    series: Series, value_range: ValueRange, config: EncodeConfig
+) -> dict[str, Any]:
+    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
+    variable = describe_variable(series)
     source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),

@@ -18,7 +18,13 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.dataset_encoding import encodable
-from fhash_codec.header import OUTSIDE, describe_source, write_missing, write_series
+from fhash_codec.header import (
+    OUTSIDE,
+    describe_source,
+    describe_variable,
+    write_missing,
+    write_series,
+)
 from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -149,9 +155,13 @@ class _Job:
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Write the arrays of a variable; its header and its figures."""
         nothing = Scan(value_range=ValueRange(0.0, 0.0), mean=0.0, finite_count=0, missing={})
-        variable = describe_source(series, nothing.value_range, EncodeConfig())["variable"]
         described = write_series(
-            writer, series, nothing, range(series.shape[0]), variable=variable, brief=True
+            writer,
+            series,
+            nothing,
+            range(series.shape[0]),
+            variable=describe_variable(series),
+            brief=True,
         )
         tiles = Tiles(array, series.source, fill_absent=self.absent == "fill")
         total = len(tiles)
