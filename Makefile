@@ -5,7 +5,7 @@ BIN := .venv/bin
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units hard wheels clean
+.PHONY: demo test types units hard every wheels clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
 demo: .venv/.stamp
@@ -23,15 +23,19 @@ types: .venv/.stamp
 units: .venv/.stamp
 	$(BIN)/python -m pytest $(SPREAD)
 
-# The long set: every case of every test, of which `make test` runs up to two; hard cases, hostile files, faults and fuzzing. It takes
-# an hour on 4 processors and needs g++. docs/stability.md gets the figures.
+# Hard cases, hostile files, faults, fuzzing and `fhash selftest --all`: an hour on 2 processors; needs g++. docs/stability.md
+# gets the figures.
 hard: .venv/.stamp
 	mkdir -p build/hard
 	rm -f build/hard/figures.jsonl
-	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD)
+	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) tests/fresh tests/golden tests/hard
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
+
+# Every case of every other test, of which `make test` runs up to two of each.
+every: .venv/.stamp
+	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
 
 # A source archive and a stripped wheel for CPython 3.11 and newer (abi3, manylinux) in dist/; needs g++.
 wheels: .venv/.stamp

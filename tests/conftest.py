@@ -56,7 +56,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselects the long set, and most cases of a test with many: the quick set has the first
-    and the last. `make hard` runs all."""
+    and the last. `make hard` and `make every` run the others."""
     items_before = list(items)
     items[:] = [item for item in items if not _is_long(item)]
     cases: dict[str, list[pytest.Item]] = {}
