@@ -127,7 +127,10 @@ def _text(result: AblateBench) -> str:
             f"{axis}: {why[axis]}",
             table(
                 [
-                    ("", "PSNR", "dB", "all values", "bytes", "x", "seconds", "x", "training"),
+                    (
+                        *("", "PSNR", "dB", "all values", "bytes", "x", "numbers"),
+                        *("points M/s", "seconds", "x", "training"),
+                    ),
                     *(_cells(row, (axis, str(row.settings)) in references) for row in rows),
                 ]
             ),
@@ -136,6 +139,7 @@ def _text(result: AblateBench) -> str:
     lines += [
         "PSNR: in the feature, over all steps, those that are not trained included;"
         " dB, x: beside the row marked *",
+        "numbers: of the model; points: queries between vertices, per second of processors",
         f"{result.series}, {extent(result.shape)}, {', '.join(result.features)}",
         *(f"{profile}: {settings}" for profile, settings in result.common.items()),
         *(f"not measured: {reason}" for reason in result.left_out),
@@ -155,6 +159,8 @@ def _cells(row: Row, reference: bool) -> tuple[str, ...]:
         number(row.psnr_domain),
         size(row.bytes),
         "" if row.bytes_ratio is None else number(row.bytes_ratio, digits=3),
+        f"{row.parameters:,}",
+        number(row.points_per_second / 1e6, digits=3),
         number(row.seconds, digits=3),
         "" if row.seconds_ratio is None else number(row.seconds_ratio, digits=3),
         "" if row.training_seconds is None else number(row.training_seconds, digits=3),

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.bench.ablate.axes import Axis, axes_named
+from fhash_codec.bench.ablate.points import points_per_second
 from fhash_codec.bench.ablate.results import AblateBench, Run
 from fhash_codec.bench.machine import machine
 from fhash_codec.config import EncodeConfig
@@ -38,6 +39,8 @@ EPOCHS = 10
 """Epochs of every training, unless others are asked for."""
 MADE = "bubble"
 """Scene of the made series: the paper's ablations are of its Argon Bubble."""
+TAKEN = ("bytes", "parameters", "points_per_second", "psnr", "psnr_domain", "max_abs_error")
+"""Figures of an encoding that a run has under the same name."""
 
 
 def bench_ablate(
@@ -176,12 +179,13 @@ def _encoded(series: Series, path: Path, config: EncodeConfig) -> dict[str, Any]
         # What a variation does badly is what the table is to show.
         warnings.simplefilter("ignore", FhashWarning)
         try:
-            return encode(series, path, config, force=True)
+            figures = encode(series, path, config, force=True)
         except QualityError as error:
-            return error.figures
+            figures = error.figures
         finally:
             for left in path.parent.glob("*.checkpoint"):
                 left.unlink()
+    return {**figures, "points_per_second": points_per_second(path)}
 
 
 def _read(path: Path) -> Run:
@@ -207,6 +211,6 @@ def _run(axis: Axis, varied: dict[str, Any], seed: int, figures: dict[str, Any])
         **{
             field.name: figures[field.name]
             for field in dataclasses.fields(Run)
-            if field.name in ("bytes", "parameters", "psnr", "psnr_domain", "max_abs_error")
+            if field.name in TAKEN
         },
     )

@@ -23,6 +23,7 @@ class Run:
         epochs: epochs of the training, 0 without one.
         bytes: size of the file.
         parameters: numbers of the model.
+        points_per_second: points that are evaluated in a second of processors.
         psnr: dB in the coreset; None where the error is 0.
         psnr_domain: dB over all finite vertices.
         max_abs_error: largest error in the coreset, in data units.
@@ -38,6 +39,7 @@ class Run:
     epochs: int
     bytes: int
     parameters: int
+    points_per_second: float
     psnr: float | None
     psnr_domain: float | None
     max_abs_error: float | None
@@ -62,7 +64,8 @@ class Row:
 
     Attributes:
         axis, settings: as in `Run`.
-        seconds, training_seconds, bytes, parameters, psnr, psnr_domain, max_abs_error: medians.
+        seconds, training_seconds, bytes, parameters, points_per_second, psnr, psnr_domain,
+            max_abs_error: medians.
         psnr_spread: largest less smallest PSNR of the seeds; None for one seed.
         seconds_ratio, bytes_ratio: over those of the axis's reference.
         psnr_gain: dB over the axis's reference.
@@ -74,6 +77,7 @@ class Row:
     training_seconds: float | None
     bytes: int
     parameters: int
+    points_per_second: float
     psnr: float | None
     psnr_domain: float | None
     max_abs_error: float | None
@@ -145,6 +149,7 @@ def _row(runs: list[Run], reference: list[Run] | None) -> Row:
         training_seconds=_median([run.training_seconds for run in runs]),
         bytes=round(size),
         parameters=round(median(run.parameters for run in runs)),
+        points_per_second=median(run.points_per_second for run in runs),
         psnr=psnr,
         psnr_domain=_median([run.psnr_domain for run in runs]),
         max_abs_error=_median([run.max_abs_error for run in runs]),

@@ -21,6 +21,7 @@ RUN: dict[str, Any] = {
     "epochs": 0,
     "bytes": 100,
     "parameters": 7,
+    "points_per_second": 3e6,
     "psnr": 40.0,
     "psnr_domain": 41.0,
     "max_abs_error": 0.5,
