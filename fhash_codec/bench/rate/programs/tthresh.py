@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from struct import Struct
+
+import numpy as np
 
 from fhash_codec.bench.rate.layouts import Values
 from fhash_codec.bench.rate.programs.program import ProgramVariant, called
@@ -19,6 +22,8 @@ UNIFORM = 20 * math.log10(math.sqrt(3))
 """dB by which the RMSE of a uniformly distributed error lies below the tolerance of a level."""
 HALF_RANGE = 20 * math.log10(2)
 """dB by which the program's PSNR lies below ours: it is relative to half of the range."""
+CONSTANT = Struct("<d")
+"""A part of one value alone, which the program would take minutes and megabytes for."""
 LEAST_AXES = 3
 """Axes that an array must have."""
 
@@ -31,7 +36,11 @@ class Tthresh:
 
     def encode(self, part: Values, file: Path, scale: tuple[float, float], level: float) -> None:
         """Write an array coded; see `Program`. Its axes go from the fastest to the slowest."""
-        own = float(part.max()) - float(part.min())
+        low, high = float(part.min()), float(part.max())
+        if low == high:
+            file.write_bytes(CONSTANT.pack(low))
+            return
+        own = high - low
         # The program's PSNR is relative to the range of what it is given.
         psnr = level + UNIFORM - HALF_RANGE + 20 * math.log10(max(own, 1e-9 * scale[1]) / scale[1])
         lengths = [n for n in part.shape if n > 1]
@@ -46,6 +55,8 @@ class Tthresh:
 
     def decode(self, file: Path, shape: tuple[int, ...], scale: tuple[float, float]) -> Values:
         """An array from its file; see `Program`. The program keeps the number type."""
+        if file.stat().st_size == CONSTANT.size:
+            return np.full(shape, CONSTANT.unpack(file.read_bytes())[0])
         raw = file.with_suffix(".out")
         called([self.path, "-c", file, "-o", raw])
         count = math.prod(shape)

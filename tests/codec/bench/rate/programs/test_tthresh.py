@@ -30,3 +30,14 @@ def test_the_psnr_is_that_of_the_level(
         assert 43 < reached < 48
         assert 0 < coded.bytes < 8 * values.size + 600
     assert {variant.goals for variant in variants(tthresh)} == {("psnr", "bound")}
+
+
+def test_a_constant_part_is_kept_without_the_program(tmp_path: Path) -> None:
+    """On it, the program takes minutes, and megabytes."""
+    values = np.linspace(0, 1, 2 * 3 * 4 * 5).reshape(2, 3, 4, 5)
+    values[0] = 0.3
+    frames = next(variant for variant in variants("/nowhere") if variant.layout == "frame")
+    file = tmp_path / "part"
+    frames.program.encode(values[0], file, (0.0, 1.0), 45.0)
+    assert file.stat().st_size == 8
+    np.testing.assert_array_equal(frames.program.decode(file, (3, 4, 5), (0.0, 1.0)), values[0])
