@@ -48,8 +48,8 @@ OWN_WARNING = "fhash: warning: "
 class Trial:
     """One mutated file and the commands on it."""
 
-    def __init__(self, number: int, folder: Path) -> None:
-        self.mutation = mutations.mutation(number)
+    def __init__(self, mutation: mutations.Mutation, folder: Path) -> None:
+        self.mutation = mutation
         self.path, self.folder = folder / "run.fhz", folder
         self.path.write_bytes(self.mutation.data)
         self.ends: list[dict[str, Any]] = []
@@ -321,25 +321,28 @@ def _bound_time() -> None:
     )
 
 
+def _bound_memory(limit: int) -> None:
+    """Let allocations fail that would take the process beyond so many bytes."""
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
+
+
 def worker(folder: Path) -> None:
     """Warm up, bound the memory, then answer each number on stdin with a line of JSON."""
     fhash_cli.main.warn = _warned  # type: ignore[assignment]
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    for golden in mutations.goldens():
-        warm = Trial(0, folder)
-        warm.mutation = mutations.Mutation(
-            number=0, golden=golden, kind="none", sealed=True, data=mutations.goldens()[golden][0]
-        )
-        warm.path.write_bytes(warm.mutation.data)
-        warm.shape = warm._declared()
-        wrong = [end for end in warm.run()["ends"] if end["wrong"]]
+    for golden, (data, _) in mutations.goldens().items():
+        same = mutations.Mutation(number=0, golden=golden, kind="none", sealed=True, data=data)
+        wrong = [end for end in Trial(same, folder).run()["ends"] if end["wrong"]]
         assert not wrong, wrong
     limit = _resident("VmData") + MEMORY
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     for line in sys.stdin:
         if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # for a test of the crash
             os.kill(os.getpid(), signal.SIGSEGV)
-        answers.write(json.dumps(Trial(int(line), folder).run()) + "\n")
+        # Making a file of giant arrays may take more than reading it may.
+        _bound_memory(resource.RLIM_INFINITY)
+        mutation = mutations.mutation(int(line))
+        _bound_memory(limit)
+        answers.write(json.dumps(Trial(mutation, folder).run()) + "\n")
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ PLACES = [
     ("encode paper", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read_steps"),
     ("decode h5", "fhash_formats.writers.hdf5", "_create"),
-    ("decode zarr", "fhash_formats.writers.zarr_store", "_flush"),
+    ("decode zarr", "fhash_formats.writers.zarr_store", "flush"),
     ("decode nc", "fhash_formats.container.reader", "Container.open"),
     ("decode vtp", "fhash_codec.isosurface", "isosurface"),
     ("render png", "fhash_codec.rendering.renderer", "Renderer.render"),
