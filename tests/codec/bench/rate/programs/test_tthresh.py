@@ -33,7 +33,7 @@ def test_the_psnr_is_that_of_the_level(
 
 
 def test_a_constant_part_is_kept_without_the_program(tmp_path: Path) -> None:
-    """On it, the program takes minutes, and megabytes."""
+    """The program takes minutes on it, and megabytes."""
     values = np.linspace(0, 1, 2 * 3 * 4 * 5).reshape(2, 3, 4, 5)
     values[0] = 0.3
     frames = next(variant for variant in variants("/nowhere") if variant.layout == "frame")
