@@ -169,18 +169,30 @@ class Volume(Card, ArrayLike):
 
         steps: whole steps; together, small frames are read faster. Errors as in `read`.
         """
+        return self._read_steps(steps, region, outside)[0]
+
+    def _read_steps(
+        self, steps: range, region: Spans | None, outside: str
+    ) -> tuple[npt.NDArray[Any], tuple[npt.NDArray[Any], npt.NDArray[np.bool_]] | None]:
+        """What `read_steps` gives, and the decoded values of the part in the box with their mask.
+
+        These are of the source's own type: float64 has not every integer of 64 bits. None where
+        steps are read one by one, or the region is outside the box.
+        """
         model = self._model_of_steps
         if model is None or steps.step != 1:
-            return np.stack([self.read(step, region, outside=outside) for step in steps])
+            return np.stack([self.read(step, region, outside=outside) for step in steps]), None
         first, last = (int(self._key_index(step)) for step in (steps[0], steps[-1]))
+        decoded = None
 
         def decode(in_box: Box) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-            values, occupied = model.read_steps(first, last + 1, in_box)
+            nonlocal decoded
+            values, occupied = decoded = model.read_steps(first, last + 1, in_box)
             return values.astype(self.float_dtype, copy=False), occupied
 
         region = self._checked(region)
         missing = read_missing(self.container, range(first, last + 1), region)
-        return self._completed(decode, region, missing, outside, (len(steps),))
+        return self._completed(decode, region, missing, outside, (len(steps),)), decoded
 
     def values(
         self, t: float, region: Spans | None = None, *, outside: str = "nan"
@@ -200,18 +212,15 @@ class Volume(Card, ArrayLike):
         self, steps: range, region: Spans | None = None, *, outside: str = "nan"
     ) -> npt.NDArray[Any]:
         """Values (t, z, y, x) of a region at neighbouring steps, each as `values` gives it."""
-        read = self.read_steps(steps, region, outside=outside)
+        read, decoded = self._read_steps(steps, region, outside)
         if self.dtype.kind == "f":
             return filled(read, self.fill)
         gaps = np.isnan(read)
         result: npt.NDArray[Any] = rounded(read, self.dtype)
         common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
-            # float64 has not every integer of 64 bits.
-            in_region, in_box = common
-            model = self._model_of_steps
-            assert model is not None, "only such files hold integers"
-            exact, occupied = model.read_steps(steps[0], steps[-1] + 1, in_box)
+            assert decoded is not None, "only such files hold integers"
+            in_region, (exact, occupied) = common[0], decoded
             np.copyto(result[(slice(None), *in_region.slices())], exact, where=occupied)
         result[gaps] = self.fill
         return result

@@ -9,6 +9,7 @@ lie in FOLDER. With --write NUMBER FILE.fhz it writes the file of a number.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import io
 import json
 import os
@@ -335,6 +336,8 @@ def worker(folder: Path) -> None:
         wrong = [end for end in Trial(same, folder).run()["ends"] if end["wrong"]]
         assert not wrong, wrong
     limit = _resident("VmData") + MEMORY
+    # Where a command does not end, the log tells where it was.
+    faulthandler.register(signal.SIGXCPU, all_threads=True, chain=True)
     for line in sys.stdin:
         if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # for a test of the crash
             os.kill(os.getpid(), signal.SIGSEGV)

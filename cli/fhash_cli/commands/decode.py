@@ -274,7 +274,8 @@ class Selection:
         for steps, frames in self._decoded(volume):
             inside = count_inside(volume, steps, self.region, frames, self.outside)
             statistics.add(frames, inside)
-            if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
+            exact = self.kind == volume.dtype and self.kind.kind in "iu" and self.kind.itemsize == 8
+            if exact and self.lod is None:
                 # float64 has not every integer of 64 bits.
                 whole = range(int(steps[0]), int(steps[-1]) + 1)
                 frames = volume.values_of_steps(whole, self.region, outside=self.outside)

@@ -124,11 +124,12 @@ def measured(tile: Tile, coded: CodedTile, settings: TileSettings, coding: Codin
         squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
     return Outcome(
         size=len(coded.data),
-        squares=squares / scale**2,
+        # Divided twice: the square of the largest scale is no float.
+        squares=squares / scale / scale,
         count=count,
         max_error=sums.largest / scale,
         nonzero=coded.nonzero,
-        bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale**2,
+        bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale / scale,
         bulk_count=bulk_count,
     )
 

@@ -15,6 +15,7 @@ import fhash_codec
 import fhash_formats
 from fhash_cli.commands.decode import TYPES
 from fhash_cli.conversion import convert
+from fhash_codec.compact.model import CompactModel
 from fhash_formats.errors import InputError
 
 Fhash = Callable[..., Result]
@@ -357,3 +358,28 @@ def test_a_part_comes_back_as_that_part_of_the_source(
         assert found["time"].attrs["units"] == "hours since 2001-01-01"
         assert "month" not in found.variables
         assert "height" in found.coords
+
+
+@pytest.mark.parametrize(("dtype", "reads"), [("f8", 1), ("i8", 2)])
+def test_only_integers_of_64_bits_are_decoded_twice(
+    fhash: Fhash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    dtype: str,
+    reads: int,
+) -> None:
+    """Statistics are of floats, which have not every such integer."""
+    path = tmp_path / "run.fhz"
+    values = (np.arange(2 * 4 * 5 * 6).reshape(2, 4, 5, 6) ** 2 + 2**60).astype(dtype)
+    fhash_codec.encode(values, path)
+    decoded = []
+    read = CompactModel.read_steps
+
+    def counted(model: CompactModel, *arguments: object) -> object:
+        decoded.append(model)
+        return read(model, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(CompactModel, "read_steps", counted)
+    got = saved(fhash, path, tmp_path / "out.npy")
+    assert got.dtype == values.dtype
+    assert len(decoded) == reads

@@ -44,6 +44,16 @@ def test_the_outcome_is_that_of_the_decoded_values() -> None:
     assert outcome.psnr(3.0) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("high", [1e-200, 1e-310])
+def test_a_range_whose_scale_has_no_square_is_measured(high: float) -> None:
+    """Settings of a file that grows may be of any range."""
+    settings = replace(SETTINGS, low=0.0, high=high)
+    coded, outcome = code(Tile(VALUES, None), settings, Coding())
+    assert coded.decoded.max() == pytest.approx(high, abs=1e-38)
+    assert outcome.max_error == pytest.approx(np.abs(VALUES).max())
+    assert outcome.squares > 1
+
+
 def test_an_exact_tile_has_no_error() -> None:
     coded, outcome = code(Tile(VALUES, None), replace(SETTINGS, double=True), Coding(exact=True))
     np.testing.assert_array_equal(coded.decoded, VALUES)
