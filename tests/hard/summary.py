@@ -38,6 +38,9 @@ half-written, and the older output stays.""",
     "a signal at an operation": "The same signals at file operations.",
     "a source that changes": """\
 The source grows, shrinks, is rewritten or vanishes while it is read: the command is refused.""",
+    "a file that grows": """\
+A running simulation appends; it is stopped before each file operation, in a new file and in one
+that goes on. The file under the name stays complete, with every layer that was reported.""",
     "two at once": "Two processes write one output. The result is complete and of one of them.",
     "little memory": "Commands under ever smaller limits of memory finish, or end with one line.",
     "a large series": "",
