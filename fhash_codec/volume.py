@@ -22,7 +22,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import sampled
 from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
-from fhash_codec.volume_model import open_model
+from fhash_codec.volume_model import Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
@@ -122,9 +122,7 @@ class Volume(Card, ArrayLike):
     def key_times(self) -> KeyTimes:
         """The map from steps and times to the model's time axis."""
         stored = self.container.arrays.get("key_frames")
-        key_frames = tuple(
-            range(self.shape[0]) if stored is None else (int(step) for step in stored.read())
-        )
+        key_frames = tuple(range(self.shape[0]) if stored is None else map(int, stored.read()))
         return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
 
     @property
@@ -155,7 +153,7 @@ class Volume(Card, ArrayLike):
         """
         key, region = self._key_index(t), self._checked(region)
 
-        def decode(in_box: Box) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        def decode(in_box: Box) -> Decoded:
             requested = self._occupied(key, in_box)
             values = self._model.read(key, in_box, requested).astype(self.float_dtype, copy=False)
             return (values if key.is_integer() else self._in_range(values)), requested
@@ -173,19 +171,14 @@ class Volume(Card, ArrayLike):
 
     def _read_steps(
         self, steps: range, region: Spans | None, outside: str
-    ) -> tuple[npt.NDArray[Any], tuple[npt.NDArray[Any], npt.NDArray[np.bool_]] | None]:
-        """What `read_steps` gives, and the decoded values of the part in the box with their mask.
-
-        These are of the source's own type: float64 has not every integer of 64 bits. None where
-        steps are read one by one, or the region is outside the box.
-        """
+    ) -> tuple[npt.NDArray[Any], Decoded | None]:
+        """Values as `read_steps` gives them, and the part in the box as decoded, if it was."""
         model = self._model_of_steps
         if model is None or steps.step != 1:
             return np.stack([self.read(step, region, outside=outside) for step in steps]), None
-        first, last = (int(self._key_index(step)) for step in (steps[0], steps[-1]))
-        decoded = None
+        (first, last), decoded = (int(self._key_index(steps[n])) for n in (0, -1)), None
 
-        def decode(in_box: Box) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        def decode(in_box: Box) -> Decoded:
             nonlocal decoded
             values, occupied = decoded = model.read_steps(first, last + 1, in_box)
             return values.astype(self.float_dtype, copy=False), occupied
@@ -220,8 +213,8 @@ class Volume(Card, ArrayLike):
         common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             assert decoded is not None, "only such files hold integers"
-            in_region, (exact, occupied) = common[0], decoded
-            np.copyto(result[(slice(None), *in_region.slices())], exact, where=occupied)
+            # float64 has not every integer of 64 bits.
+            np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
         result[gaps] = self.fill
         return result
 
@@ -302,8 +295,7 @@ class Volume(Card, ArrayLike):
         must be in the coreset at either of the two; in the profile compact, at both. Raises
         RegionError for a step or region outside the domain.
         """
-        key = self._key_index(t)
-        region = self._checked(region)
+        key, region = self._key_index(t), self._checked(region)
         result = np.zeros(region.shape, dtype=bool)
         common = shared_part(self.box, region)
         if common is not None:
@@ -357,7 +349,7 @@ class Volume(Card, ArrayLike):
 
     def _completed(
         self,
-        decode: Callable[[Box], tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]],
+        decode: Callable[[Box], Decoded],
         region: Box,
         missing: npt.NDArray[np.bool_] | None,
         outside: str,

@@ -15,6 +15,8 @@ from fhash_formats.container import Container
 
 Positions = npt.NDArray[np.float64]
 """Positions (n,) of points along one axis."""
+Decoded = tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]
+"""Values of a part of the box, and the mask of those in the coreset."""
 
 
 class VolumeModel(Protocol):
