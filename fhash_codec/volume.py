@@ -176,7 +176,8 @@ class Volume(Card, ArrayLike):
         model = self._model_of_steps
         if model is None or steps.step != 1:
             return np.stack([self.read(step, region, outside=outside) for step in steps]), None
-        (first, last), decoded = (int(self._key_index(steps[n])) for n in (0, -1)), None
+        first, last = (int(self._key_index(step)) for step in (steps[0], steps[-1]))
+        decoded = None
 
         def decode(in_box: Box) -> Decoded:
             nonlocal decoded
@@ -208,14 +209,13 @@ class Volume(Card, ArrayLike):
         read, decoded = self._read_steps(steps, region, outside)
         if self.dtype.kind == "f":
             return filled(read, self.fill)
-        gaps = np.isnan(read)
         result: npt.NDArray[Any] = rounded(read, self.dtype)
         common = shared_part(self.box, self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             assert decoded is not None, "only such files hold integers"
             # float64 has not every integer of 64 bits.
             np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
-        result[gaps] = self.fill
+        result[np.isnan(read)] = self.fill
         return result
 
     def read_lod(self, t: float, lod: int, region: Spans | None = None) -> npt.NDArray[Any]:
