@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.measure.value_range import pieces
+from fhash_formats.support.number_types import is_wide_integer
 
 __all__ = ["ErrorSums", "Values", "error_sums", "histogram", "range_and_sum", "squared_errors"]
 
@@ -107,7 +108,7 @@ def error_sums(
         and original.dtype in (np.float32, np.float64)
     ):
         return _native_sums(library, original, decoded, mask, scale, bulk)
-    exact = original.dtype.kind in "iu" and original.dtype.itemsize == 8
+    exact = is_wide_integer(original.dtype)
     total = ErrorSums(0, 0.0, 0.0)
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
     for source, result, counted in zip(pieces(original), pieces(decoded), masks, strict=True):
@@ -255,7 +256,7 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
     """(original - decoded) * scale; exact for 64-bit integers."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)
-    if original.dtype.kind in "iu" and original.dtype.itemsize == 8:
+    if is_wide_integer(original.dtype):
         limits = np.iinfo(original.dtype)
         nearest = np.clip(
             np.rint(decoded.astype(np.float64)),

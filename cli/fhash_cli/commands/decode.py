@@ -270,12 +270,14 @@ class Selection:
         self, volume: Volume, statistics: Statistics, progress: Callback
     ) -> Iterator[npt.NDArray[Any]]:
         """Decode the frames (z, y, x), small ones together; all are added to the statistics."""
+        from fhash_formats.support.number_types import is_wide_integer
+
         background, done = self.outside == "background", 0
+        exact = self.kind == volume.dtype and is_wide_integer(self.kind) and self.lod is None
         for steps, frames in self._decoded(volume):
             inside = count_inside(volume, steps, self.region, frames, self.outside)
             statistics.add(frames, inside)
-            exact = self.kind == volume.dtype and self.kind.kind in "iu" and self.kind.itemsize == 8
-            if exact and self.lod is None:
+            if exact:
                 # float64 has not every integer of 64 bits.
                 whole = range(int(steps[0]), int(steps[-1]) + 1)
                 frames = volume.values_of_steps(whole, self.region, outside=self.outside)

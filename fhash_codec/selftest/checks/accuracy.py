@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.compact.goal import promise
 from fhash_codec.selftest.case import Finding, Run
+from fhash_formats.support.number_types import is_wide_integer
 
 __all__ = ["CHECKS", "expected_coreset", "largest_difference"]
 
@@ -97,7 +98,7 @@ def within_range(run: Run) -> Iterator[Finding]:
     finite = run.values[np.isfinite(run.values)]
     low, high = Fraction(finite.min().item()), Fraction(finite.max().item())
     decoded = run.decoded[np.isfinite(run.decoded)]
-    if run.values.dtype.kind in "iu" and run.values.dtype.itemsize == 8:
+    if is_wide_integer(run.values.dtype):
         low, high = Fraction(float(low)), Fraction(float(high))
     excess = max(
         low - Fraction(decoded.min().item()), Fraction(decoded.max().item()) - high, Fraction(0)
@@ -158,7 +159,7 @@ def largest_difference(values: Values, decoded: Values, where: Mask) -> Fraction
     given_values, decoded_values = values[where], decoded[where]
     if not given_values.size:
         return Fraction(0)
-    if given_values.dtype.kind in "iu" and given_values.dtype.itemsize == 8:
+    if is_wide_integer(given_values.dtype):
         return max(
             abs(Fraction(a) - Fraction(b))
             for a, b in zip(given_values.tolist(), decoded_values.tolist(), strict=True)
@@ -178,7 +179,7 @@ def _psnr(run: Run, where: Mask) -> float:
     if span == 0:
         return 0.0
     given_values, decoded_values = run.values[where], run.decoded[where]
-    if given_values.dtype.kind in "iu" and given_values.dtype.itemsize == 8:
+    if is_wide_integer(given_values.dtype):
         shares = np.array(
             [
                 float((a - Fraction(b)) / span)

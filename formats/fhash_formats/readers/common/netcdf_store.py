@@ -19,6 +19,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.hdf5_tree import require_filters
+from fhash_formats.support.number_types import is_wide_integer
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -115,7 +116,7 @@ def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, An
     import h5py
 
     stored = np.dtype(encoding.get("dtype", np.float32))
-    if stored.kind not in "iu" or stored.itemsize < 8:
+    if not is_wide_integer(stored):
         return None
     plain = {
         key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value

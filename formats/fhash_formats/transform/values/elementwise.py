@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
+from fhash_formats.support.number_types import is_wide_integer
 
 __all__ = [
     "all_finite",
@@ -68,8 +69,7 @@ def within(values: Values, decoded: Values, error: float, counted: Mask | None =
             )
         )
     flat_values, flat_decoded, flat_counted = _flat(values, decoded, counted)
-    wide_integers = values.dtype.kind in "iu" and values.dtype.itemsize == 8
-    is_near = _near_integers if wide_integers else _near
+    is_near = _near_integers if is_wide_integer(values.dtype) else _near
     for piece in pieces(values.size):
         near = is_near(flat_values[piece], flat_decoded[piece], error)
         if flat_counted is not None:
