@@ -7,7 +7,6 @@ only if it is the same file.
 from __future__ import annotations
 
 import os
-import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from fhash_codec.dataset import Dataset
 from fhash_codec.dataset import open as open_file
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.fork_lock import ForkLock
 
 __all__ = ["Handle", "acquire", "place_of", "release", "volumes_of"]
 
@@ -60,7 +60,7 @@ class Handle:
         return bool(self.key[-1] == os.getpid())
 
 
-_lock = threading.Lock()
+_lock = ForkLock()
 _open: weakref.WeakValueDictionary[Key, Handle] = weakref.WeakValueDictionary()
 _kept: OrderedDict[Key, Handle] = OrderedDict()
 

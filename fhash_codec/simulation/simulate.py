@@ -13,7 +13,6 @@ one vertex had to that of the next: sheets thinner than the lattice fade into th
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,7 @@ from fhash_codec.simulation.scene import SimulatedScene, scene_of
 from fhash_codec.simulation.terms import Terms, terms_of
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
+from fhash_formats.support.fork_lock import ForkLock
 from fhash_formats.support.threads import in_threads
 
 __all__ = ["BLOCK_VERTICES", "MAX_FRAME_VERTICES", "Counters", "Simulation", "simulate"]
@@ -105,7 +105,7 @@ class Simulation(Series):
         self.attributes: Mapping[str, Any] = {}
         self.coords = _coordinates(scene)
         self._centres = [self.coords[axis].values.astype(np.float32) for axis in ("z", "y", "x")]
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
 
     @property
     def bounds(self) -> tuple[float, float]:

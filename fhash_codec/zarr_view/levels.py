@@ -7,7 +7,6 @@ always vertex 0.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.value_type import filled, rounded
 from fhash_codec.volume import Volume
 from fhash_codec.zarr_view.arrays import Region
+from fhash_formats.support.fork_lock import ForkLock
 
 __all__ = ["Level", "level_count"]
 
@@ -63,7 +63,7 @@ class Level:
             ((low - o) // self.stride, (low - o) // self.stride - (low - high) // self.stride)
             for (low, high), o in zip(volume.box, self.first, strict=True)
         )
-        self._locks = [threading.Lock() for _ in range(LOCKS)]
+        self._locks = [ForkLock() for _ in range(LOCKS)]
 
     def vertices(self, axis: int) -> slice:
         """The vertices of the domain along an axis of (z, y, x) that the level has."""
@@ -108,7 +108,7 @@ class Level:
         """The vertices of the level that a region shares with the feature bounding box."""
         return self._box.intersect(Box.of((along.start, along.stop) for along in region[1:]))
 
-    def _lock(self, region: Sequence[slice]) -> threading.Lock:
+    def _lock(self, region: Sequence[slice]) -> ForkLock:
         """The lock of the tile that a region begins in.
 
         Several chunks of one tile are asked for at once, one step each. The first request decodes

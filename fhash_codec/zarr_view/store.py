@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Iterable, Mapping
@@ -22,6 +21,7 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 
 from fhash_codec.zarr_view.view import ZarrView, opened_view
 from fhash_formats.errors import InputError
+from fhash_formats.support.fork_lock import ForkLock
 
 __all__ = ["DecodedStore", "zarr_store"]
 
@@ -57,7 +57,7 @@ class _File:
 
 
 _shared: OrderedDict[tuple[str, str], _File] = OrderedDict()
-_shared_lock = threading.Lock()
+_shared_lock = ForkLock()
 
 
 def _shared_file(path: str, options: Mapping[str, Any], tag: str) -> _File:

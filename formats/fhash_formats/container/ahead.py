@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from itertools import islice, product
 
+from fhash_formats.support.fork_lock import ForkLock
 from fhash_formats.support.threads import usable_threads
 
 __all__ = ["Ahead", "chunks_after"]
@@ -17,7 +17,7 @@ class Ahead:
     """The reads of an array so far, as far as they tell the next one. Safe for several threads."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
         self._last: Sequence[range] | None = None
         self._moves = 0
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 from collections import OrderedDict
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from fhash_formats.support.fork_lock import ForkLock
 
 Key = tuple[str, tuple[int, ...], int]
 """Name of the array, index of the chunk and level of detail."""
@@ -26,7 +27,7 @@ class ChunkCache:
         self.limit = limit
         self._bytes = 0
         self._chunks: OrderedDict[Key, npt.NDArray[Any]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
 
     def get(self, key: Key) -> npt.NDArray[Any] | None:
         """The chunk, or None if it is not kept."""

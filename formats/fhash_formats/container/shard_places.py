@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
@@ -22,6 +21,7 @@ from fhash_formats.container.sharding import (
 )
 from fhash_formats.container.source import Source
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.fork_lock import ForkLock
 
 __all__ = ["SPARSE_SHARE", "ShardPlaces"]
 
@@ -46,7 +46,7 @@ class ShardPlaces:
         self._sharding, self._shape, self._members, self._source = sharding, shape, members, source
         self._indices: dict[Index, npt.NDArray[np.int64]] = {}
         self._entries: dict[tuple[Index, int], tuple[int, int]] = {}
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
 
     def read(self, spans: Sequence[range]) -> None:
         """Read what the inner chunks of `spans` need of each shard's index: all of it, or entries.

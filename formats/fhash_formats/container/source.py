@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
+import os
 import stat
 import struct
-import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from fhash_formats.container.ranges import Range
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
+from fhash_formats.support.fork_lock import ForkLock
 
 CHANGED = "the file changed since it was opened; open it again"
 """Told of a file that another took the place of."""
@@ -95,17 +97,17 @@ class FileSource(Source):
             raise MissingInputError(f"{path}: no such file") from error
         except OSError as error:
             raise InputError(f"{path}: cannot be opened: {error.strerror}") from error
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
         self.size = self._file.seek(0, 2)
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
         check_range(self, offset, size)
-        # Windows lacks os.pread, so a lock is needed. Decoding takes longer, and is outside it.
+        # The lock keeps the file open. Decoding takes longer, and is outside it.
         with self._lock:
             if self._file.closed:
                 raise InputError("the container is closed")
-            return _read_fully(self._file, offset, size)
+            return b"".join(_pieces(partial(_read_at, self._file), offset, size))
 
     def close(self) -> None:
         """Release the file, once no other thread reads it."""
@@ -116,12 +118,14 @@ class FileSource(Source):
 class OpenFileSource(Source):
     """A binary file that the caller opened, and closes after the container: `open(...)`, BytesIO.
 
-    Raises InputError for a file of text, one that is closed, not for reading or cannot seek.
+    Raises InputError for a file of text, one that is closed, not for reading or cannot seek. A
+    forked process cannot read it: it shares the place in the file with its parent.
     """
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._lock = threading.Lock()
+        self._process = os.getpid()
+        self._lock = ForkLock()
         self._closed = False
         try:
             self.size = file.seek(0, 2)
@@ -137,10 +141,16 @@ class OpenFileSource(Source):
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
         check_range(self, offset, size)
+        if os.getpid() != self._process and not isinstance(self._file, io.BytesIO):
+            raise InputError(
+                "the container was opened in the process that this one was forked from, from an"
+                " open file; open it by its path, or open it in this process"
+            )
         with self._lock:
             if self._closed or getattr(self._file, "closed", False):
                 raise InputError("the container is closed, or the file that it was opened from")
-            return _read_fully(self._file, offset, size)
+            self._file.seek(offset)
+            return b"".join(_pieces(lambda _, rest: self._file.read(rest), offset, size))
 
     def close(self) -> None:
         """Read no more; the file stays open."""
@@ -148,21 +158,33 @@ class OpenFileSource(Source):
             self._closed = True
 
 
-def _read_fully(file: BinaryIO | io.RawIOBase, offset: int, size: int) -> bytes:
-    """Exactly `size` bytes of a file; raises DamagedFileError where it ends before."""
-    pieces = []
+def _read_at(file: io.FileIO, offset: int, size: int) -> bytes:
+    """Bytes of a file from an offset, up to `size`.
+
+    Forked processes read the same open file, and share its position; only Windows, which has no
+    os.pread, does not fork.
+    """
+    if hasattr(os, "pread"):
+        return os.pread(file.fileno(), size, offset)
     file.seek(offset)
+    return file.read(size)
+
+
+def _pieces(read: Callable[[int, int], bytes], offset: int, size: int) -> Iterator[bytes]:
+    """Exactly `size` bytes from `offset`, as they come; raises DamagedFileError at the file's end.
+
+    read: the bytes from an offset, up to a number, and none at the end.
+    """
     while size > 0:
-        piece = file.read(size)
+        piece = read(offset, size)
         if not piece:
             raise DamagedFileError(
                 "the file was cut short while it was read, "
                 f"{size} bytes from offset {offset} are missing"
             )
-        pieces.append(piece)
+        yield piece
         size -= len(piece)
         offset += len(piece)
-    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 class CountedSource(Source):
@@ -170,7 +192,7 @@ class CountedSource(Source):
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._lock = threading.Lock()
+        self._lock = ForkLock()
         self.size, self.gap = source.size, source.gap
         self.bytes_read = 0
 

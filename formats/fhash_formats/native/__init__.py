@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import ctypes
 import os
-import threading
 from collections.abc import Mapping
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
 from fhash_formats.errors import MissingDependencyError
+from fhash_formats.support.fork_lock import ForkLock
 
 __all__ = [
     "ABI_VERSION",
@@ -115,7 +115,7 @@ PROTOTYPES: Prototypes = {
 """Functions of this package's library that Python calls."""
 
 _FOLDER = Path(__file__).parent
-_LOCK = threading.Lock()
+_LOCK = ForkLock()
 _LOADED: dict[tuple[Path, str, int], ctypes.CDLL | None] = {}
 
 

@@ -11,7 +11,6 @@ array of a NamedTuple one by one, so the functions called for each vertex take f
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -20,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.support.fork_lock import ForkLock
 from fhash_formats.transform.entropy.prior import State
 
 __all__ = [
@@ -143,7 +143,7 @@ ARRAYS = Tables(**_tables())
 LISTS = Tables(*(values.tolist() for values in ARRAYS))
 """Tables of runs in plain Python."""
 
-_LOCK = threading.Lock()
+_LOCK = ForkLock()
 _JITABLE: set[Callable[..., Any]] = set()
 _COMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
 
