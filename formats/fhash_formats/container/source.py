@@ -99,6 +99,7 @@ class FileSource(Source):
             raise InputError(f"{path}: cannot be opened: {error.strerror}") from error
         self._lock = ForkLock()
         self.size = self._file.seek(0, 2)
+        self._state = self._current_state()
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
@@ -108,6 +109,19 @@ class FileSource(Source):
             if self._file.closed:
                 raise InputError("the container is closed")
             return b"".join(_pieces(partial(_read_at, self._file), offset, size))
+
+    def changed(self) -> bool:
+        """Whether the file was written to since it was opened, as a growing file's are in turns."""
+        with self._lock:
+            try:
+                return not self._file.closed and self._current_state() != self._state
+            except OSError:  # of a server that knows the file no more
+                return True
+
+    def _current_state(self) -> tuple[int, int]:
+        """What writing to the file changes."""
+        found = os.fstat(self._file.fileno())
+        return found.st_mtime_ns, found.st_size
 
     def close(self) -> None:
         """Release the file, once no other thread reads it."""

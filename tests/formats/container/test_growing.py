@@ -10,7 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from growing_file import FRAME, add_layer, check_layers, growing_array, growing_header, streams_of
+from growing_file import (
+    FRAME,
+    add_layer,
+    check_layers,
+    growing_array,
+    growing_header,
+    layer_values,
+    streams_of,
+)
 
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.growing import GrowingContainer
@@ -70,6 +78,30 @@ def test_a_reader_goes_on_with_the_state_that_it_opened(tmp_path) -> None:
             first = early.arrays["tables/level_1"].read()
         with Container.open(path) as late:
             np.testing.assert_array_equal(late.arrays["tables/level_1"].read()[:2], first)
+
+
+def test_an_end_that_later_ones_took_the_place_of_is_changed_rather_than_damaged(tmp_path) -> None:
+    """Positions that do not fit the header lie in the end, which every layer moves."""
+    path = tmp_path / "a.fhz"
+    with GrowingContainer(path) as growing:
+        array = growing_array()
+        for number in range(3):
+            growing.add_layer(array, number, streams_of(layer_values(number)))
+            mark = growing.mark()
+            growing.describe(array, 2 * number + 2)
+            times = np.arange(2.0 * number + 2) ** 2
+            growing.add_whole("coords/time", times, attributes={"name": "t"})
+            header = growing_header(2 * number + 2)
+            del header["coordinates"]["time"]
+            growing.publish(header, mark)
+            if number == 0:
+                early = Container.open(path)
+    with pytest.raises(InputError, match="the file changed since it was opened; open it again"):
+        early.coordinate("time")
+    assert early.arrays["tables/level_1"].read().shape == (2, *FRAME)
+    early.close()
+    with Container.open(path) as late:
+        np.testing.assert_array_equal(late.coordinate("time").values, np.arange(6.0) ** 2)
 
 
 def test_zarr_reads_every_state(tmp_path) -> None:

@@ -34,8 +34,27 @@ def test_no_file_folder_and_pipe(tmp_path) -> None:
 def test_file_cut_while_open(sample) -> None:
     with Container.open(sample) as container:
         sample.write_bytes(sample.read_bytes()[:100])
-        with pytest.raises(DamagedFileError, match="cut short"):
+        with pytest.raises(InputError, match="the file changed since it was opened; open it again"):
             container.arrays["mlp/weight_1"].read()
+    source = FileSource(sample)
+    sample.write_bytes(b"")
+    with pytest.raises(DamagedFileError, match="cut short"):
+        source.read(90, 10)
+    assert source.changed()
+    source.close()
+
+
+def test_a_file_is_damaged_rather_than_changed_if_nobody_wrote_to_it_since(tmp_path) -> None:
+    (tmp_path / "a").write_bytes(b"abcdefgh")
+    source = FileSource(tmp_path / "a")
+    assert source.read(0, 8) == b"abcdefgh"
+    assert not source.changed()
+    (tmp_path / "b").write_bytes(b"another file")
+    (tmp_path / "b").replace(tmp_path / "a")
+    assert source.read(0, 8) == b"abcdefgh"
+    assert not source.changed()
+    source.close()
+    assert not source.changed()
 
 
 def test_closed_container(sample) -> None:
