@@ -17,6 +17,19 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 VERTICES_A_THREAD = 12_000
 """Vertices of a training step per thread; with fewer, a further thread costs more than it saves."""
+_PROCESS = os.getpid()
+"""The process that imported this module."""
+
+
+def leave_threads_of_parent() -> None:
+    """Let torch compute in one thread in a process forked since the import of this module.
+
+    OpenMP believes there that it still has the threads of the parent, and waits for them for ever.
+    """
+    if os.getpid() != _PROCESS:
+        import torch
+
+        torch.set_num_threads(1)
 
 
 @contextmanager

@@ -142,6 +142,9 @@ class _Fitting:
 
     def run(self) -> TrainedModel:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
+        from fhash_codec.training.threads import leave_threads_of_parent
+
+        leave_threads_of_parent()
         # With --no-timings the same input gives the same file, on CUDA, too.
         wanted = self._config.deterministic or not self._config.timings
         with enough_memory(self._device), same_bits(self._device, wanted):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from contextlib import suppress
 
 import pytest
 import torch
 
-from fhash_codec.training.threads import VERTICES_A_THREAD, threads_for
+from fhash_codec.training.threads import VERTICES_A_THREAD, leave_threads_of_parent, threads_for
 
 
 @pytest.mark.parametrize(("vertices", "threads"), [(0, 1), (VERTICES_A_THREAD * 2, 2), (10**9, 3)])
@@ -19,5 +21,24 @@ def test_threads_are_those_that_pay_and_come_back_after_an_error(vertices, threa
             assert used == torch.get_num_threads() == threads
             raise ZeroDivisionError
         assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(usual)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_process_does_not_wait_for_the_threads_of_its_parent() -> None:
+    usual = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        leave_threads_of_parent()
+        assert torch.get_num_threads() == 3
+        total = (torch.arange(3_000_000.0) % 7).sum()  # begins the threads
+        child = os.fork()
+        if child == 0:
+            signal.alarm(60)  # kills the child where it hangs
+            leave_threads_of_parent()
+            os._exit(0 if (torch.arange(3_000_000.0) % 7).sum() == total else 1)
+        assert os.waitpid(child, 0)[1] == 0
     finally:
         torch.set_num_threads(usual)
