@@ -14,7 +14,7 @@ import pytest
 if TYPE_CHECKING:
     from range_server import RangeServer
 
-sys.path.insert(0, str(Path(__file__).parent / "serving"))
+sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 
 # The tests' models are tiny: a second thread costs more than it brings, above all where several
 # test runs share a machine.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -93,6 +94,7 @@ class Renderer:
         self._last_plan: tuple[Scene, Plan] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
+        self._process = os.getpid()
 
     def plan(self, scene: Scene) -> Plan:
         """Plan a picture without rendering it; raises InputError or RegionError as `render` does.
@@ -278,6 +280,8 @@ class Renderer:
 
         The wait is needed in any case: only one thread at a time may read a volume.
         """
+        if self._process != os.getpid():  # a forked process has none of its parent's threads
+            self._process, self._background, self._prefetch = os.getpid(), None, None
         if self._prefetch is None:
             return None
         (prefetched, future), self._prefetch = self._prefetch, None

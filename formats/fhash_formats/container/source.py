@@ -119,7 +119,7 @@ class FileSource(Source):
                 return True
 
     def _current_state(self) -> tuple[int, int]:
-        """What writing to the file changes."""
+        """Time of the last change, in ns, and bytes."""
         found = os.fstat(self._file.fileno())
         return found.st_mtime_ns, found.st_size
 

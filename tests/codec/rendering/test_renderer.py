@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from forked import ended_well, forked, needs_fork
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume, native
@@ -81,6 +82,21 @@ def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.M
     renderer.render(shown[0], upcoming=scene(step=1.25, march={"mode": "arm"}))
     with pytest.raises(InputError, match="step 99 is outside"):
         renderer.render(scene(step=99))
+
+
+@needs_fork
+def test_a_forked_process_does_not_wait_for_what_its_parent_decodes(volume: Volume) -> None:
+    renderer = Renderer(volume)
+    expected = renderer.render(scene(step=1)).rgba
+    renderer = Renderer(volume)
+    renderer.render(scene(step=0), upcoming=scene(step=1))
+
+    def draws() -> bool:
+        shown = renderer.render(scene(step=1), upcoming=scene(step=2)).rgba
+        return np.array_equal(shown, expected) and renderer.render(scene(step=2)).rgba.any()
+
+    assert ended_well(forked(draws))
+    np.testing.assert_array_equal(renderer.render(scene(step=1)).rgba, expected)
 
 
 def test_a_failure_beside_is_that_of_its_own_picture(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import sys
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from forked import ended_well, forked, needs_fork
 
 from fhash_formats.container import fsspec_file
 from fhash_formats.container.fsspec_file import PAUSES, FsspecFile
@@ -296,17 +295,8 @@ def test_a_package_that_is_missing(monkeypatch, missing: str, url: str, told: st
         FsspecFile.open(url, {})
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no fork")
+@needs_fork
 def test_a_forked_process_asks_by_itself(range_server) -> None:
     file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
     assert file.fetch(5, 9) == DATA[5:9]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
-    if child == 0:
-        done = 1
-        try:
-            done = 0 if file.fetch(300, 700) == DATA[300:700] else 1
-        finally:
-            os._exit(done)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert ended_well(forked(lambda: file.fetch(300, 700) == DATA[300:700]))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import random
 import threading
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from forked import ended_well, forked, needs_fork
 
 from fhash_formats.container import remote
 from fhash_formats.container.remote import GAP, MAX_TAIL_BYTES, TAIL_BYTES, RemoteSource
@@ -195,19 +194,14 @@ def test_ranges_outside_and_a_closed_source(source) -> None:
         source.read(0, 1)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no fork")
+@needs_fork
 def test_a_forked_process_reads_by_itself(file, source) -> None:
     source.prefetch([(0, 10), (5 * GAP, 10)])
     assert source.read(0, 10) == DATA[:10]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
-    if child == 0:
-        done = 1
-        try:
-            source.prefetch([(7 * GAP, 10), (9 * GAP, 10)])
-            sound = source.read(9 * GAP, 10) == DATA[9 * GAP : 9 * GAP + 10]
-            done = 0 if sound and source.read(0, 10) == DATA[:10] else 1
-        finally:
-            os._exit(done)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+    def reads_right() -> bool:
+        source.prefetch([(7 * GAP, 10), (9 * GAP, 10)])
+        sound = source.read(9 * GAP, 10) == DATA[9 * GAP : 9 * GAP + 10]
+        return sound and source.read(0, 10) == DATA[:10]
+
+    assert ended_well(forked(reads_right))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import io
 import os
-import signal
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 
 import numpy as np
 import pytest
+from forked import ended_well, forked, needs_fork
 
 from fhash_formats.container import Container
 from fhash_formats.container.source import (
@@ -89,27 +88,7 @@ def test_bytes_that_were_read_are_counted(tmp_path) -> None:
     source.close()
 
 
-def child(work: Callable[[], bool]) -> int:
-    """A forked process that ends with 0 where `work` says yes; its number."""
-    process = os.fork()
-    if process == 0:
-        code = 1
-        try:
-            signal.alarm(60)  # kills the child where it hangs
-            code = 0 if work() else 1
-        finally:
-            os._exit(code)
-    return process
-
-
-forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-many_threads = pytest.mark.filterwarnings(
-    "ignore:This process .* is multi-threaded:DeprecationWarning"
-)
-
-
-@forks
-@many_threads
+@needs_fork
 def test_forked_processes_read_one_open_file_at_once(tmp_path) -> None:
     numbers = np.arange(50_000, dtype="<u4")
     (tmp_path / "a").write_bytes(numbers.tobytes())
@@ -119,14 +98,13 @@ def test_forked_processes_read_one_open_file_at_once(tmp_path) -> None:
         places = np.random.default_rng(seed).integers(0, numbers.size, 20_000).tolist()
         return all(source.read(4 * n, 4) == n.to_bytes(4, "little") for n in places)
 
-    children = [child(partial(reads_right, seed)) for seed in range(2)]
+    children = [forked(partial(reads_right, seed)) for seed in range(2)]
     assert reads_right(2)
-    assert [os.waitpid(process, 0)[1] for process in children] == [0, 0]
+    assert [ended_well(process) for process in children] == [True, True]
     source.close()
 
 
-@forks
-@many_threads
+@needs_fork
 def test_a_forked_process_reads_bytes_but_not_a_file_that_its_parent_opened(tmp_path) -> None:
     (tmp_path / "a").write_bytes(b"abcdefgh")
 
@@ -137,7 +115,7 @@ def test_a_forked_process_reads_bytes_but_not_a_file_that_its_parent_opened(tmp_
 
     with (tmp_path / "a").open("rb") as file:
         source = OpenFileSource(file)
-        assert os.waitpid(child(refused), 0)[1] == 0
+        assert ended_well(forked(refused))
         assert source.read(2, 3) == b"cde"
     held = OpenFileSource(io.BytesIO(b"abcdefgh"))
-    assert os.waitpid(child(lambda: held.read(2, 3) == b"cde"), 0)[1] == 0
+    assert ended_well(forked(lambda: held.read(2, 3) == b"cde"))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 
-import pytest
+from forked import ended_well, forked, needs_fork
 
 from fhash_formats.support.fork_lock import ForkLock
 
@@ -29,8 +27,7 @@ def test_one_thread_at_a_time_holds_it() -> None:
     assert released == [0]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@needs_fork
 def test_a_forked_process_finds_it_free_although_a_thread_of_its_parent_holds_it() -> None:
     lock, held, over = ForkLock(), threading.Event(), threading.Event()
 
@@ -39,15 +36,14 @@ def test_a_forked_process_finds_it_free_although_a_thread_of_its_parent_holds_it
             held.set()
             over.wait()
 
+    def take() -> bool:
+        with lock:
+            return True
+
     thread = threading.Thread(target=hold)
     thread.start()
     held.wait()
-    child = os.fork()
-    if child == 0:
-        signal.alarm(30)  # kills the child where it hangs
-        with lock:
-            os._exit(0)
-    status = os.waitpid(child, 0)[1]
+    taken = ended_well(forked(take))
     over.set()
     thread.join()
-    assert status == 0
+    assert taken

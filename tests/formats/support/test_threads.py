@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import gc
-import os
-import signal
 import threading
 import weakref
 from collections.abc import Iterator, Sequence
 
 import pytest
+from forked import ended_well, forked, needs_fork
 
 from fhash_formats.errors import InputError
 from fhash_formats.support import threads as parallel
@@ -118,15 +117,10 @@ def test_a_failure_in_a_share_is_raised() -> None:
         share_out(work, range(100), 3)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@needs_fork
 def test_a_forked_process_has_threads_of_its_own() -> None:
     assert next(iter(in_threads(abs, range(-8, 0)))) == 8
-    child = os.fork()
-    if child == 0:
-        signal.alarm(30)  # kills the child where it hangs
-        os._exit(0 if list(in_threads(abs, range(-8, 0)))[-1] == 1 else 1)
-    assert os.waitpid(child, 0)[1] == 0
+    assert ended_well(forked(lambda: list(in_threads(abs, range(-8, 0)))[-1] == 1))
 
 
 def test_the_environment_says_how_many_threads(monkeypatch: pytest.MonkeyPatch) -> None:
