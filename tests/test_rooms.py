@@ -84,7 +84,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("durations", "frame_statistics", "intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
         ("animation_options", "card_rows", "gallery", "peer_options"),
-        ("scene_options", "simulating"),
+        ("decoding", "scene_options", "simulating"),
         ("source_listing", "variables"),
         ("commands",),
         ("main",),

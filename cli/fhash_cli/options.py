@@ -31,6 +31,12 @@ feature_option = click.option(
 variable_option = click.option(
     "--var", "variable", metavar="NAME", help="Which variable of a file of several."
 )
+variables_option = click.option(
+    "--var",
+    "variable",
+    metavar="NAME,...",
+    help="Which variables of a file of several. Default: all.",
+)
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 
 

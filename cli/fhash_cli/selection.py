@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from fhash_cli.intervals import written
@@ -193,3 +194,35 @@ def opened(
     except fhash_codec.InputError:
         volume.close()
         raise
+
+
+@contextmanager
+def opened_variables(
+    run: str,
+    fill: float | None,
+    features: Sequence[str],
+    variables: str | None,
+    *,
+    several: bool = True,
+) -> Iterator[list[Volume]]:
+    """The variables of a container with names as `--var` takes them, open; all for None.
+
+    several: whether more than one can be taken. The rest is as for `opened`.
+    """
+    import fhash_codec
+    from fhash_codec.feature_volume import only_features
+
+    with fhash_codec.open(run, fill=fill) as whole:
+        every = list(whole) if isinstance(whole, fhash_codec.Dataset) else [whole.name]
+        if variables is None:
+            names = every if several else [whole.container.select(None).variable or every[0]]
+        elif variables in every or not several:
+            names = [variables]
+        else:
+            names = list(dict.fromkeys(part.strip() for part in variables.split(",")))
+        volumes = []
+        for name in names:
+            whole.container.select(name)
+            volume = whole[name] if isinstance(whole, fhash_codec.Dataset) else whole
+            volumes.append(only_features(volume, features) if features else volume)
+        yield volumes

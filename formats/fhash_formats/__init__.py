@@ -11,7 +11,7 @@ from fhash_formats.readers import (
     open_series,
     parse_shape,
 )
-from fhash_formats.writers import Region, save_check, save_region
+from fhash_formats.writers import Region, save_check, save_region, save_regions
 
 __all__ = [
     "Listed",
@@ -23,4 +23,5 @@ __all__ = [
     "parse_shape",
     "save_check",
     "save_region",
+    "save_regions",
 ]

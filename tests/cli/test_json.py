@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 from click.testing import Result
 
@@ -185,9 +186,15 @@ def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     check("demo -o FILE", parsed(fhash(*words, tmp_path / "run.npy")))
 
 
-def test_verify_and_decode(fhash: Fhash, run: Path) -> None:
+def test_verify_and_decode(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     check("verify", parsed(fhash("verify", run, "--json", "-q")))
-    check("decode", parsed(fhash("decode", run, "--json", "-q")))
+    several = tmp_path / "several.fhz"
+    config = fhash_codec.EncodeConfig(max_error=0.1, effort=1)
+    arrays = {"u": np.zeros((2, 3, 4, 5)), "v": np.ones((2, 3, 4, 5))}
+    fhash_codec.encode_dataset(arrays, several, config)
+    one, both = (parsed(fhash("decode", path, "--json", "-q")) for path in (run, several))
+    check("decode", one, both)
+    assert both["variables"]["u"].keys() == one.keys() - {"paths"}
     plain = run.parent / "plain.fhz"
     words = ["export", run, "-o", plain, "--plain", "--force", "--json", "-q"]
     check("export", parsed(fhash(*words)))

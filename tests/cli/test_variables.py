@@ -9,8 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import xarray
 from click.testing import Result
 
+import fhash_codec
 from fhash_cli.variables import config_of, configs_of, info_table, report_table
 from fhash_formats.errors import InputError
 
@@ -38,8 +40,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(data: Path) -> Path:
-    import fhash_codec
-
     path = data.with_name("run.fhz")
     config = fhash_codec.EncodeConfig(effort=1, max_error=0.01)
     fhash_codec.encode_dataset(data, path, config, variables=["u", "v"])
@@ -132,7 +132,52 @@ def test_verify_checks_all_or_one(fhash: Fhash, run: Path, tmp_path: Path) -> No
     assert fhash("verify", path).exit_code == 4
 
 
-@pytest.mark.parametrize("command", ["decode", "render", "diff", "export"])
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+@pytest.mark.parametrize("names", [None, "v, u", "v"])
+def test_decode_writes_all_or_those_that_are_named_into_one_output(
+    fhash: Fhash, run: Path, tmp_path: Path, suffix: str, names: str | None
+) -> None:
+    path = tmp_path / f"out{suffix}"
+    words = ["decode", run, "-o", path, "--t", "1:", "--json"]
+    result = fhash(*words, *([] if names is None else ["--var", names]))
+    assert result.exit_code == 0
+    told, chosen = json.loads(result.stdout), ["u", "v"] if names != "v" else ["v"]
+    parts = told["variables"] if len(chosen) > 1 else {"v": told}
+    assert told["paths"] == [str(path)]
+    assert sorted(parts) == chosen
+    with fhash_codec.open(run) as dataset:
+        for name in chosen:
+            expected = dataset[name][1:]
+            assert parts[name]["shape"] == list(expected.shape)
+            assert parts[name]["max"] == expected.max()
+            if suffix == ".h5":
+                with h5py.File(path) as file:
+                    found = np.asarray(file[name])
+            else:
+                engine = "zarr" if suffix == ".zarr" else "h5netcdf"
+                with xarray.open_dataset(path, engine=engine, decode_times=False) as data:
+                    found = np.asarray(data[name])
+            np.testing.assert_array_equal(found.reshape(expected.shape), expected)
+
+
+def test_decode_tells_of_every_variable(fhash: Fhash, run: Path) -> None:
+    rows = [line.split() for line in fhash("decode", run).stdout.splitlines() if line]
+    assert [row[1] for row in rows if row[0] == "variable"] == ["u", "v"]
+
+
+def test_decode_refuses_what_one_output_cannot_hold(
+    refused: Callable[..., str], run: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "out.npy"
+    assert "holds one variable, and there are 2" in refused(2, "decode", run, "-o", path)
+    surface = ["--isosurface", 1, "-o", tmp_path / "out.ply"]
+    assert "several variables, u, v; choose one" in refused(2, "decode", run, *surface)
+    message = refused(2, "decode", run, "--var", "u,w", "-o", tmp_path / "out.nc")
+    assert "has no variable 'w'; it holds u, v" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["render", "diff", "export"])
 def test_a_variable_must_be_named(
     refused: Callable[..., str], run: Path, data: Path, tmp_path: Path, command: str
 ) -> None:

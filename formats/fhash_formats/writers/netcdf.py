@@ -1,4 +1,4 @@
-"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: a variable and all beside it.
+"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: variables and all beside them.
 
 NaN, or the region's fill value, is declared as `_FillValue`. NetCDF has no float16; it is stored as
 float32, exactly.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from fhash_formats.source_metadata import SourceVariable
 from fhash_formats.support.attributes import PLUMBING
 from fhash_formats.writers.common.held_file import held_hdf5
 from fhash_formats.writers.common.labels import hdf5_value
-from fhash_formats.writers.common.outline import Outline
+from fhash_formats.writers.common.outline import Beside, Outline
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import (
     Frame,
@@ -34,29 +35,32 @@ FILL = "_FillValue"
 
 
 @contextmanager
-def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+def _open(
+    regions: Sequence[Region], outputs: Sequence[Path], temporaries: Sequence[Path]
+) -> Iterator[Sequence[Put]]:
     import h5netcdf
 
-    dtype = little_endian(region.dtype)
+    outlines = [Outline.of(region) for region in regions]
+    beside = Beside.of(outlines)
     with held_hdf5(temporaries[0], lambda file: h5netcdf.File(file, "w")) as (file, root):
         with file.calling():
-            outline = Outline.of(region)
-            values = _create(root, region, outline, dtype)
+            _set_attributes(root, {"Conventions": "CF-1.8", **beside.attributes})
+            root.dimensions = dict(beside.lengths)
+            for each in beside.variables:
+                _add(root, each)
+            values = [_create(root, *each) for each in zip(regions, outlines, strict=True)]
 
-        def put(step: int, frame: Frame) -> None:
+        def put(outline: Outline, values: Any, step: int, frame: Frame) -> None:
             with file.calling():
                 place, ordered = outline.place(step, frame)
-                values[place] = ordered.astype(dtype, copy=False)
+                values[place] = ordered.astype(values.dtype, copy=False)
 
-        yield put
+        yield [partial(put, *each) for each in zip(outlines, values, strict=True)]
 
 
-def _create(root: Any, region: Region, outline: Outline, dtype: np.dtype[Any]) -> Any:
-    """Create the empty variable in `root`, with its attributes, dimensions and all beside it."""
-    _set_attributes(root, {"Conventions": "CF-1.8", **outline.file_attributes})
-    root.dimensions = dict(outline.lengths)
-    for each in outline.variables:
-        _add(root, each)
+def _create(root: Any, region: Region, outline: Outline) -> Any:
+    """Create the empty variable in `root`, whose dimensions are there, with its attributes."""
+    dtype = little_endian(region.dtype)
     fill = np.nan if dtype.kind == "f" else None
     fill = fill if region.fill is None else dtype.type(region.fill)
     values = root.create_variable(
@@ -90,4 +94,6 @@ def _set_attributes(place: Any, attributes: Mapping[str, Any]) -> None:
         place.attrs[key] = hdf5_value(value)
 
 
-NETCDF = Writer(name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open)
+NETCDF = Writer(
+    name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open, several=True
+)

@@ -14,6 +14,7 @@ from fhash_formats.writers.common.writer import (
     Put,
     Writer,
     little_endian,
+    of_one,
     one_output,
     write_frame,
 )
@@ -36,4 +37,4 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         yield put
 
 
-NPY = Writer(name="NumPy", suffixes=(".npy",), outputs=one_output, open=_open)
+NPY = Writer(name="NumPy", suffixes=(".npy",), outputs=one_output, open=of_one(_open))

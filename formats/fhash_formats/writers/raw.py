@@ -26,7 +26,14 @@ from fhash_formats.series import AXES
 from fhash_formats.writers.common.labels import printable
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.spacing import even_spacing
-from fhash_formats.writers.common.writer import Frame, Put, Writer, little_endian, write_frame
+from fhash_formats.writers.common.writer import (
+    Frame,
+    Put,
+    Writer,
+    little_endian,
+    of_one,
+    write_frame,
+)
 
 NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are called as in numpy
 
@@ -119,4 +126,4 @@ def _space(region: Region, axes: str) -> list[str]:
     ]
 
 
-RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=_open)
+RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=of_one(_open))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.atomic import check_output, replacing_all
 from fhash_formats.writers.common.region import Region
-from fhash_formats.writers.common.writer import Frame, Writer
+from fhash_formats.writers.common.writer import Frame, Put, Writer
 from fhash_formats.writers.hdf5 import HDF5
 from fhash_formats.writers.netcdf import NETCDF
 from fhash_formats.writers.npy import NPY
@@ -31,18 +31,28 @@ def save_check(
     force: bool = False,
     region: Region | None = None,
     sources: Sequence[str | Path] = (),
+    *,
+    variables: int = 1,
 ) -> None:
     """Make the checks of `save_region` that need no work; all checks where the region is given.
 
+    variables: how many will be written.
+
     Raises:
-        InputError: a suffix that no writer has, a region that the format cannot hold, or an output
-            that is one of the `sources`.
+        InputError: a suffix that no writer has, a region that the format cannot hold, a format that
+            holds fewer variables, or an output that is one of the `sources`.
         OutputExistsError: the path, or with `region` any file that goes with it, exists and `force`
             is not given.
         OutputError: no such folder, no permission, or an existing object that must not be replaced.
     """
     target = Path(path)
     writer = _writer(target)
+    if variables > 1 and not writer.several:
+        able = ", ".join(suffix for each in WRITERS if each.several for suffix in each.suffixes)
+        raise InputError(
+            f"{path}: {writer.name} holds one variable, and there are {variables}; choose one, or"
+            f" use one of {able}"
+        )
     check_output(target, force, directory=writer.directory, sources=sources)
     if region is not None:
         for output in writer.outputs(target, region):
@@ -62,8 +72,7 @@ def save_region(
     Args:
         path: ends in .npy, .h5, .hdf5, .nc, .nc4, .zarr, .raw, .vti, .vtr, .pvd or .vtkhdf.
         region: description of the frames.
-        frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: never are two
-            held here.
+        frames: as `save_regions` takes them.
         force: replace outputs that exist; the old ones stay until the new are complete.
         sources: files and folders that the frames come from, which are never replaced.
 
@@ -76,24 +85,55 @@ def save_region(
         OutputError: it cannot be written, as on a full disk; nothing is left behind, and an old
             output is as it was.
     """
+    return save_regions(path, [(region, frames)], force=force, sources=sources)
+
+
+def save_regions(
+    path: str | Path,
+    variables: Sequence[tuple[Region, Iterable[npt.NDArray[np.generic]]]],
+    *,
+    force: bool = False,
+    sources: Sequence[str | Path] = (),
+) -> list[Path]:
+    """Write regions of several variables into one output, as `save_region` writes one.
+
+    Formats that hold several are HDF5, NetCDF and Zarr; coordinates that are equal are there once.
+
+    Args:
+        path: of the output.
+        variables: at least one region, each with its frames: one array (z, y, x) of `region.dtype`
+            for each step, taken one by one, one variable after the other: never are two held here.
+        force: see `save_region`.
+        sources: see `save_region`.
+
+    Returns:
+        The paths written.
+
+    Raises:
+        InputError: also for variables that cannot share an output, because they have one name, or,
+            in NetCDF and Zarr, dimensions or arrays of one name that differ.
+        OutputError: see `save_region`.
+    """
     target = Path(path)
-    save_check(target, force, region, sources)
+    regions = [region for region, _ in variables]
+    save_check(target, force, regions[0], sources, variables=len(regions))
     writer = _writer(target)
-    outputs = writer.outputs(target, region)
+    outputs = writer.outputs(target, regions[0])
     with (
         replacing_all(outputs, force=force, directory=writer.directory) as temporaries,
-        writer.open(region, outputs, temporaries) as put,
+        writer.open(regions, outputs, temporaries) as puts,
     ):
-        source = iter(frames)
-        for step in range(region.shape[0]):
-            put(
-                step, _frame(region, source, step)
-            )  # no variable: the frame must be gone before the next one is made
-        if _next(region, source) is not None:
-            raise InputError(
-                f"region {region.name!r}: more frames than its {region.shape[0]} steps"
-            )
+        for (region, frames), put in zip(variables, puts, strict=True):
+            _put_all(region, iter(frames), put)
     return outputs
+
+
+def _put_all(region: Region, source: Iterator[npt.NDArray[np.generic]], put: Put) -> None:
+    for step in range(region.shape[0]):
+        # no variable: the frame must be gone before the next one is made
+        put(step, _frame(region, source, step))
+    if _next(region, source) is not None:
+        raise InputError(f"region {region.name!r}: more frames than its {region.shape[0]} steps")
 
 
 def _writer(path: Path) -> Writer:

@@ -24,7 +24,14 @@ from fhash_formats.support.dates import DAY, FIRST_GREGORIAN, clock
 from fhash_formats.writers.common.labels import printable
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.spacing import even_spacing
-from fhash_formats.writers.common.writer import Frame, Put, Writer, little_endian, write_frame
+from fhash_formats.writers.common.writer import (
+    Frame,
+    Put,
+    Writer,
+    little_endian,
+    of_one,
+    write_frame,
+)
 
 SPACE = ("z", "y", "x")
 
@@ -208,4 +215,4 @@ def _collection(region: Region, files: Sequence[Path]) -> str:
     return head + "".join(rows) + "</Collection>\n</VTKFile>\n"
 
 
-VTK = Writer(name="VTK", suffixes=(".vti", ".vtr", ".pvd"), outputs=_outputs, open=_open)
+VTK = Writer(name="VTK", suffixes=(".vti", ".vtr", ".pvd"), outputs=_outputs, open=of_one(_open))

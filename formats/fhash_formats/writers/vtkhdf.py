@@ -21,7 +21,14 @@ from fhash_formats.writers.common.held_file import held_hdf5
 from fhash_formats.writers.common.labels import hdf5_value, safe_name
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.spacing import even_spacing
-from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape, little_endian
+from fhash_formats.writers.common.writer import (
+    Frame,
+    Put,
+    Writer,
+    chunk_shape,
+    little_endian,
+    of_one,
+)
 from fhash_formats.writers.hdf5 import COMPRESSION
 from fhash_formats.writers.vti import SPACE, direction
 
@@ -128,4 +135,4 @@ def _describe(times: Any, region: Region) -> None:
             times.attrs[key] = hdf5_value(str(region.coords["t"].attributes[key]))
 
 
-VTKHDF = Writer(name="VTKHDF", suffixes=(".vtkhdf",), outputs=_outputs, open=_open)
+VTKHDF = Writer(name="VTKHDF", suffixes=(".vtkhdf",), outputs=_outputs, open=of_one(_open))

@@ -1,4 +1,4 @@
-"""Writer of a Zarr v3 group: the variable and all beside it as arrays with dimension names.
+"""Writer of a Zarr v3 group: variables and all beside them as arrays with dimension names.
 
 xarray opens it as a dataset. There is one chunk per step (see `chunk_shape`), in zarr's default
 compression. zarr writes into memory, and each frame's chunks go from there to plain files: zarr's
@@ -13,6 +13,7 @@ import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from fhash_formats.source_metadata import SourceVariable
 from fhash_formats.support.attributes import json_attributes
-from fhash_formats.writers.common.outline import Outline
+from fhash_formats.writers.common.outline import Beside, Outline
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape, one_output
 
@@ -77,23 +78,40 @@ def consolidate(store: Any) -> None:
 
 
 @contextmanager
-def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+def _open(
+    regions: Sequence[Region], outputs: Sequence[Path], temporaries: Sequence[Path]
+) -> Iterator[Sequence[Put]]:
     import zarr
     from zarr.storage import MemoryStore
 
+    outlines = [Outline.of(region) for region in regions]
+    beside = Beside.of(outlines)
     memory: dict[str, Any] = {}
     folder = temporaries[0]
     folder.mkdir()
-    outline = Outline.of(region)
     store = MemoryStore(memory)
-    file_attributes = json_attributes(outline.file_attributes)
-    root = zarr.create_group(store=store, zarr_format=3, attributes=file_attributes)
+    attributes = json_attributes(beside.attributes)
+    root = zarr.create_group(store=store, zarr_format=3, attributes=attributes)
     with warnings.catch_warnings():
         # types of texts are not yet in Zarr's specification
         warnings.simplefilter("ignore")
-        for each in outline.variables:
+        for each in beside.variables:
             add_beside(root, each)
-    values = root.create_array(
+    values = [_create(root, *each) for each in zip(regions, outlines, strict=True)]
+    consolidate(store)
+    flush(memory, folder)
+
+    def put(outline: Outline, values: Any, step: int, frame: Frame) -> None:
+        place, ordered = outline.place(step, frame)
+        values[place] = ordered
+        flush(memory, folder)
+
+    yield [partial(put, *each) for each in zip(outlines, values, strict=True)]
+
+
+def _create(root: Any, region: Region, outline: Outline) -> Any:
+    """Create the empty array of a variable."""
+    return root.create_array(
         outline.name,
         shape=outline.shape,
         dtype=region.dtype,
@@ -105,15 +123,13 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
             "write_empty_chunks": True
         },  # a chunk that is missing is then always a fault, not a frame of fill values
     )
-    consolidate(store)
-    flush(memory, folder)
-
-    def put(step: int, frame: Frame) -> None:
-        place, ordered = outline.place(step, frame)
-        values[place] = ordered
-        flush(memory, folder)
-
-    yield put
 
 
-ZARR = Writer(name="Zarr", suffixes=(".zarr",), outputs=one_output, open=_open, directory=True)
+ZARR = Writer(
+    name="Zarr",
+    suffixes=(".zarr",),
+    outputs=one_output,
+    open=_open,
+    directory=True,
+    several=True,
+)

@@ -47,14 +47,19 @@ def safe_names(region: Region) -> tuple[str, dict[str, str]]:
     used = {variable}
     names = {}
     for axis in AXES:
-        name = unique = safe_name(region.coords[axis].name or axis)
-        number = 2
-        while unique in used:
-            unique = f"{name}_{number}"
-            number += 1
-        used.add(unique)
-        names[axis] = unique
+        names[axis] = unused_name(region.coords[axis].name or axis, used)
     return variable, names
+
+
+def unused_name(name: str, used: set[str]) -> str:
+    """A safe name that is not in use; it is put among those that are."""
+    safe = unique = safe_name(name)
+    number = 2
+    while unique in used:
+        unique = f"{safe}_{number}"
+        number += 1
+    used.add(unique)
+    return unique
 
 
 def variable_attributes(region: Region) -> dict[str, Any]:

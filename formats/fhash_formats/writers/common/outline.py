@@ -7,13 +7,14 @@ Elsewhere it has the four axes and their coordinates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.errors import InputError
 from fhash_formats.series import AXES
 from fhash_formats.source_metadata import (
     COORDINATES,
@@ -31,7 +32,7 @@ from fhash_formats.writers.common.labels import (
 )
 from fhash_formats.writers.common.region import Region
 
-__all__ = ["Outline"]
+__all__ = ["Beside", "Outline"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +92,58 @@ class Outline:
         )
         order = [space.index(axis) for axis in present if axis in space]
         return index, values.transpose(order)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beside:
+    """The rest of an output of several variables, each part once.
+
+    Attributes:
+        lengths: of every dimension.
+        variables: arrays that no outline is of.
+        attributes: of the file.
+    """
+
+    lengths: Mapping[str, int]
+    variables: tuple[SourceVariable, ...]
+    attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, outlines: Sequence[Outline]) -> Beside:
+        """The rest of an output of some variables.
+
+        Raises InputError for variables of one name, and where two do not agree on a length or an
+        array: they cannot share an output.
+        """
+        lengths: dict[str, int] = {}
+        variables: dict[str, SourceVariable] = {}
+        attributes: dict[str, Any] = {}
+        names = [outline.name for outline in outlines]
+        for outline in outlines:
+            if names.count(outline.name) > 1:
+                raise InputError(f"two variables would have the name {outline.name}")
+            for name, length in outline.lengths.items():
+                if lengths.setdefault(name, length) != length:
+                    raise _apart(outline, f"{length} of {name}, another {lengths[name]}")
+            for each in outline.variables:
+                if each.name not in names and not _same(
+                    variables.setdefault(each.name, each), each
+                ):
+                    raise _apart(outline, f"another {each.name} than the one before")
+            attributes = {**outline.file_attributes, **attributes}
+        return cls(lengths=lengths, variables=tuple(variables.values()), attributes=attributes)
+
+
+def _same(one: SourceVariable, other: SourceVariable) -> bool:
+    """Whether two arrays beside variables have the same dimensions and values."""
+    if tuple(one.dimensions) != tuple(other.dimensions):
+        return False
+    floats = one.values.dtype.kind == other.values.dtype.kind == "f"
+    return bool(np.array_equal(one.values, other.values, equal_nan=floats))
+
+
+def _apart(outline: Outline, what: str) -> InputError:
+    return InputError(f"variable {outline.name} has {what}; write the variables one by one")
 
 
 def _as_in_source(region: Region, metadata: SourceMetadata) -> Outline:

@@ -1,16 +1,16 @@
 """The contract of a writer: each format is one `Writer`, and `registry` lists them.
 
-A writer sees one frame at a time. `open` writes what precedes the values and gives a function that
-is called with (step, frame) once per step, in order; at the end of the block it writes what follows
-the values. It writes to temporary paths and cleans nothing up: `support.atomic` turns them into
-outputs, or removes them if anything fails. Frames arrive checked: (z, y, x), C-contiguous, of
-`region.dtype`, as many as the region has steps.
+A writer sees one frame at a time. `open` writes what precedes the values, and gives for each
+variable a function that is called with (step, frame) once per step, in order, one variable after
+the other; at the end of the block it writes what follows the values. It writes to temporary paths
+and cleans nothing up: `support.atomic` turns them into outputs, or removes them if anything fails.
+Frames arrive checked: (z, y, x), C-contiguous, of `region.dtype`, as many as the region has steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,6 +23,10 @@ from fhash_formats.writers.common.region import Region
 
 Frame = npt.NDArray[Any]
 Put = Callable[[int, Frame], None]
+Open = Callable[
+    [Sequence[Region], Sequence[Path], Sequence[Path]], AbstractContextManager[Sequence[Put]]
+]
+OpenOne = Callable[[Region, Sequence[Path], Sequence[Path]], AbstractContextManager[Put]]
 
 CHUNK_BYTES = 16 * 2**20
 
@@ -36,16 +40,32 @@ class Writer:
         suffixes: suffixes of its outputs, lower case with the dot.
         outputs: (path, region) -> every path that will be written, in the order in which they take
             their names; raises InputError where the format cannot hold the region.
-        open: (region, outputs, temporaries) -> context manager that gives the function for the
+        open: (regions, outputs, temporaries) -> context manager that gives the functions for the
             frames; the temporaries stand for the outputs one by one.
         directory: whether the output is a directory.
+        several: whether an output holds several variables; `outputs` then depends on none.
     """
 
     name: str
     suffixes: tuple[str, ...]
     outputs: Callable[[Path, Region], list[Path]]
-    open: Callable[[Region, Sequence[Path], Sequence[Path]], AbstractContextManager[Put]]
+    open: Open
     directory: bool = False
+    several: bool = False
+
+
+def of_one(open_one: OpenOne) -> Open:
+    """The `open` of a format whose outputs hold one variable."""
+
+    @contextmanager
+    def opened(
+        regions: Sequence[Region], outputs: Sequence[Path], temporaries: Sequence[Path]
+    ) -> Iterator[Sequence[Put]]:
+        (region,) = regions
+        with open_one(region, outputs, temporaries) as put:
+            yield [put]
+
+    return opened
 
 
 def one_output(path: Path, region: Region) -> list[Path]:
