@@ -8,7 +8,6 @@ import stat
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -98,23 +97,44 @@ class FileSource(Source):
         except OSError as error:
             raise InputError(f"{path}: cannot be opened: {error.strerror}") from error
         self._lock = ForkLock()
+        self._readers, self._closed = 0, False
         self.size = self._file.seek(0, 2)
         self._state = self._current_state()
 
     def read(self, offset: int, size: int) -> bytes:
-        """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
+        """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there.
+
+        Threads read side by side: where a file lies far away, each waits for its own bytes alone.
+        """
         check_range(self, offset, size)
-        # The lock keeps the file open. Decoding takes longer, and is outside it.
         with self._lock:
-            if self._file.closed:
+            if self._closed:
                 raise InputError("the container is closed")
-            return b"".join(_pieces(partial(_read_at, self._file), offset, size))
+            self._readers += 1
+        try:
+            return b"".join(_pieces(self._read_at, offset, size))
+        finally:
+            with self._lock:
+                self._readers -= 1
+                self._close_if_idle()
+
+    def _read_at(self, offset: int, size: int) -> bytes:
+        """Bytes from an offset, up to `size`.
+
+        Forked processes read the same open file, and share its position; only Windows, which has no
+        os.pread, does not fork.
+        """
+        if hasattr(os, "pread"):
+            return os.pread(self._file.fileno(), size, offset)
+        with self._lock:
+            self._file.seek(offset)
+            return self._file.read(size)
 
     def changed(self) -> bool:
         """Whether the file was written to since it was opened, as a growing file's are in turns."""
         with self._lock:
             try:
-                return not self._file.closed and self._current_state() != self._state
+                return not self._closed and self._current_state() != self._state
             except OSError:  # of a server that knows the file no more
                 return True
 
@@ -124,8 +144,13 @@ class FileSource(Source):
         return found.st_mtime_ns, found.st_size
 
     def close(self) -> None:
-        """Release the file, once no other thread reads it."""
+        """Read no more; the file is released once no thread reads it."""
         with self._lock:
+            self._closed = True
+            self._close_if_idle()
+
+    def _close_if_idle(self) -> None:
+        if self._closed and not self._readers:
             self._file.close()
 
 
@@ -170,18 +195,6 @@ class OpenFileSource(Source):
         """Read no more; the file stays open."""
         with self._lock:
             self._closed = True
-
-
-def _read_at(file: io.FileIO, offset: int, size: int) -> bytes:
-    """Bytes of a file from an offset, up to `size`.
-
-    Forked processes read the same open file, and share its position; only Windows, which has no
-    os.pread, does not fork.
-    """
-    if hasattr(os, "pread"):
-        return os.pread(file.fileno(), size, offset)
-    file.seek(offset)
-    return file.read(size)
 
 
 def _pieces(read: Callable[[int, int], bytes], offset: int, size: int) -> Iterator[bytes]:

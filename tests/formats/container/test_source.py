@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 
@@ -86,6 +88,24 @@ def test_bytes_that_were_read_are_counted(tmp_path) -> None:
         source.read(7, 2)
     assert source.bytes_read == 4
     source.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "pread"), reason="one thread at a time without os.pread")
+def test_threads_read_side_by_side_and_the_last_one_lets_go(tmp_path, monkeypatch) -> None:
+    (tmp_path / "a").write_bytes(b"abcdefgh")
+    source, pread, both = FileSource(tmp_path / "a"), os.pread, threading.Barrier(2, timeout=30)
+
+    def slow(file: int, size: int, offset: int) -> bytes:
+        both.wait()
+        source.close()
+        return pread(file, size, offset)
+
+    monkeypatch.setattr(os, "pread", slow)
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(source.read, (0, 5), (3, 3))) == [b"abc", b"fgh"]
+    assert source._file.closed
+    with pytest.raises(InputError, match="closed"):
+        source.read(0, 1)
 
 
 @needs_fork
