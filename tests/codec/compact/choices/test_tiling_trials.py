@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy.typing as npt
 import pytest
 from planned import plan_task, waves
 
+from fhash_codec.compact.choices import tiling_trials
 from fhash_codec.compact.choices.tiling_trials import FAR, Trials
 from fhash_codec.compact.stages import first_guess, first_settings
 
@@ -91,6 +93,27 @@ def test_a_tiling_far_from_the_quality_of_the_first_is_coded_with_another_step(
     trials._psnr += 2.0  # as if the first one had been that much better
     assert trials.size((4, 8, 24, 24)) > first
     assert steps[0] < 0.8 * settled.step
+
+
+def test_under_a_bound_one_tile_keeps_it_with_bases_that_were_fitted_again(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coded without the bound it would take a fraction, and all cuts would seem dear."""
+    values = np.random.default_rng(2).normal(size=(4, 8, 24, 24)).astype(np.float32)
+    trials = trials_on(values, workers, max_error=0.5)
+    errors: list[float] = []
+    original = Trials._note
+
+    def noted(self: Trials, sample: Any, outcome: Any, settings: Any) -> None:
+        errors.append(outcome.max_error)
+        original(self, sample, outcome, settings)
+
+    monkeypatch.setattr(Trials, "_note", noted)
+    monkeypatch.setattr(tiling_trials, "refit", lambda _, settings: replace(settings))
+    trials.settle(None)
+    trials.size((4, 8, 12, 12))
+    assert len(errors) == 2
+    assert max(errors) <= 0.5
 
 
 @pytest.mark.parametrize("promise", [{"max_error_rel": 0.02}, {"ratio": 20.0}])
