@@ -96,12 +96,17 @@ class Trials:
         if in_space is not None:
             self._picked(in_space)
         found, _ = self._picked(self.shape)
+        coding = self._coding
+        if self.shape != self._task.blocks.shape:
+            # A part coded without its bound seems cheap, and wins. With it columns of many steps
+            # win under loose bounds, where they took 1.7 times the bytes (a shock within 5 %).
+            coding = replace(coding, error=None)
         sample = self._sample(self.shape, 1 << 62)
-        found, outcome = find_step(sample, found, self._coding, goal, tries=2, tried=self._settled)
+        found, outcome = find_step(sample, found, coding, goal, tries=2, tried=self._settled)
         # Bases made for the finer step of the first guess would take too many bytes beside others.
         refitted = refit(sample, found)
         if refitted is not found:
-            found, outcome = refitted, sample.run(refitted, self._coding)
+            found, outcome = refitted, sample.run(refitted, coding)
         self._settings = replace(found, transform=settings.transform)
         self._note(sample, outcome, found)
         return self._settings
