@@ -212,11 +212,15 @@ def opened_variables(
     import fhash_codec
     from fhash_codec.feature_volume import only_features
 
+    if not several:
+        with opened(run, fill, features, variables) as volume:
+            yield [volume]
+        return
     with fhash_codec.open(run, fill=fill) as whole:
         every = list(whole) if isinstance(whole, fhash_codec.Dataset) else [whole.name]
         if variables is None:
-            names = every if several else [whole.container.select(None).variable or every[0]]
-        elif variables in every or not several:
+            names = every
+        elif variables in every:
             names = [variables]
         else:
             names = list(dict.fromkeys(part.strip() for part in variables.split(",")))

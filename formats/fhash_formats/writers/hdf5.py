@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.writers.common.held_file import held_hdf5
 from fhash_formats.writers.common.labels import (
@@ -46,13 +45,9 @@ def _open(
 ) -> Iterator[Sequence[Put]]:
     import h5py
 
-    variables = [safe_name(region.name) for region in regions]
-    for name in variables:
-        if variables.count(name) > 1:
-            raise InputError(f"two variables would have the name {name}")
     with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w")) as (file, root):
         with file.calling():
-            taken, scales = set(variables), list[_Scale]()
+            taken, scales = {safe_name(region.name) for region in regions}, list[_Scale]()
             values = [_create(root, region, scales, taken) for region in regions]
 
         def put(values: Any, step: int, frame: Frame) -> None:

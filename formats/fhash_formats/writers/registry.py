@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.atomic import check_output, replacing_all
+from fhash_formats.writers.common.labels import safe_name
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import Frame, Put, Writer
 from fhash_formats.writers.hdf5 import HDF5
@@ -117,6 +118,10 @@ def save_regions(
     target = Path(path)
     regions = [region for region, _ in variables]
     save_check(target, force, regions[0], sources, variables=len(regions))
+    names = [safe_name(region.name) for region in regions]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two variables would have the name {name}")
     writer = _writer(target)
     outputs = writer.outputs(target, regions[0])
     with (

@@ -112,7 +112,7 @@ class Beside:
     def of(cls, outlines: Sequence[Outline]) -> Beside:
         """The rest of an output of some variables.
 
-        Raises InputError for variables of one name, and where two do not agree on a length or an
+        outlines: of different names. Raises InputError where two do not agree on a length or an
         array: they cannot share an output.
         """
         lengths: dict[str, int] = {}
@@ -120,8 +120,6 @@ class Beside:
         attributes: dict[str, Any] = {}
         names = [outline.name for outline in outlines]
         for outline in outlines:
-            if names.count(outline.name) > 1:
-                raise InputError(f"two variables would have the name {outline.name}")
             for name, length in outline.lengths.items():
                 if lengths.setdefault(name, length) != length:
                     raise _apart(outline, f"{length} of {name}, another {lengths[name]}")

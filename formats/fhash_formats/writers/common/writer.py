@@ -41,7 +41,7 @@ class Writer:
         outputs: (path, region) -> every path that will be written, in the order in which they take
             their names; raises InputError where the format cannot hold the region.
         open: (regions, outputs, temporaries) -> context manager that gives the functions for the
-            frames; the temporaries stand for the outputs one by one.
+            frames; the temporaries stand for the outputs one by one. Safe names of regions differ.
         directory: whether the output is a directory.
         several: whether an output holds several variables; `outputs` then depends on none.
     """
