@@ -1,17 +1,26 @@
-"""A view over HTTP: every key of the hierarchy is a file to GET, with ranges, ETag and CORS."""
+"""A view over HTTP: every key of the hierarchy is a file to GET, with ranges, ETag and CORS.
+
+A server on loopback answers requests for names of loopback alone: a page of the Internet whose name
+is made to resolve to 127.0.0.1 (DNS rebinding) asks for its own name, and gets nothing. Pages of
+other origins read what the user allows them to.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import os
 import socket
 import socketserver
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote, urlsplit
 
 from fhash_codec.zarr_view.ranges import UNSATISFIABLE, byte_range, names_tag
 from fhash_codec.zarr_view.view import ZarrView
@@ -23,11 +32,14 @@ IDLE_SECONDS = 60
 """Seconds after which a connection without a request is closed."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 """Names of this machine that no other reaches it by."""
-CORS = {
-    "Access-Control-Allow-Origin": "*",
-    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
-}
-"""Headers of every answer, so that pages of other origins may read it."""
+MAX_CONNECTIONS = 256
+"""Connections that are served at once, each by a thread; browsers and aiohttp open up to 100."""
+EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+"""Errors of accepting a connection that last until others are closed."""
+PAUSE_SECONDS = 0.2
+"""Seconds to wait where no connection can be accepted, instead of trying again at once."""
+EXPOSED = "Accept-Ranges, Content-Length, Content-Range, ETag"
+"""Headers of an answer that pages of allowed origins may read."""
 PREFLIGHT = {
     "Access-Control-Allow-Methods": "GET, HEAD, OPTIONS",
     "Access-Control-Allow-Headers": "*, Range, If-Match, If-None-Match, If-Range, Cache-Control",
@@ -38,6 +50,11 @@ PREFLIGHT = {
 
 Without the last one Chrome keeps pages of the Internet from servers of the own machine.
 """
+BUSY = (
+    b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\n"
+    b"Connection: close\r\n\r\n"
+)
+"""The answer to a connection beyond MAX_CONNECTIONS."""
 NEWS = Callable[[str], None]
 """Is told a line for each answer that is an error of the server."""
 
@@ -49,6 +66,7 @@ class Server(ThreadingHTTPServer):
         view: what is served.
         url: where, with a slash at the end.
         is_local: whether no other machine reaches it.
+        origins: origins whose pages may read the answers.
     """
 
     daemon_threads = True
@@ -58,13 +76,24 @@ class Server(ThreadingHTTPServer):
     allow_reuse_address = os.name == "posix"
 
     def __init__(
-        self, view: ZarrView, *, host: str = "127.0.0.1", port: int = 0, news: NEWS = print
+        self,
+        view: ZarrView,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        origins: Sequence[str] = (),
+        news: NEWS = print,
     ) -> None:
         """Listen at a port, 0 for any that is free; `serve_forever` answers.
 
-        Raises InputError where the port is taken or the host is no address of this machine.
+        origins: what a browser calls them, `https://example.org`; `*` is every page, and `null`
+        one that was opened from a file.
+        Raises InputError where the port is taken, the host is no address of this machine, or an
+        origin is none.
         """
         self.view, self.news = view, news
+        self.origins = frozenset(map(_origin, origins))
+        self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
         try:
             family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             self.address_family = family
@@ -79,6 +108,53 @@ class Server(ThreadingHTTPServer):
         """Take the address; the base class would look up the host's full name, too, and wait."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = map(str, self.server_address[:2])  # type: ignore[assignment]
+
+    def is_meant(self, host: str | None) -> bool:
+        """Whether a request's Host names this server; on loopback alone it can be a foreign one."""
+        if not self.is_local or host is None:  # no browser leaves it out
+            return True
+        try:
+            return urlsplit(f"//{host}").hostname in LOOPBACK
+        except ValueError:
+            return False
+
+    def allowed(self, origin: str | None) -> str | None:
+        """The origin that an answer names as allowed to read it; None for none."""
+        if "*" in self.origins:
+            return "*"
+        return origin if origin in self.origins else None
+
+    def get_request(self) -> tuple[Any, Any]:
+        """Accept a connection; waits where descriptors or memory have run out."""
+        try:
+            return super().get_request()
+        except OSError as error:
+            if error.errno in EXHAUSTED:
+                self.news(f"no connection can be accepted: {error.strerror}")
+                time.sleep(PAUSE_SECONDS)
+            raise
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread, or refuse it at once where too many are open."""
+        if not self._places.acquire(blocking=False):
+            # Answers of a few bytes fit the buffer of a new connection: nothing waits here.
+            request.setblocking(False)
+            with contextlib.suppress(OSError):
+                request.send(BUSY)
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._places.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection to its end, and give its place back."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Tell what went wrong beyond a request; a client that goes away is no error."""
@@ -108,8 +184,23 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(body=False)
 
     def do_OPTIONS(self) -> None:
-        """Answer a browser that asks what pages of other origins may do."""
-        self._send(HTTPStatus.NO_CONTENT, headers={**PREFLIGHT, "Allow": "GET, HEAD, OPTIONS"})
+        """Answer a browser that asks what pages of another origin may do."""
+        may = PREFLIGHT if self.server.allowed(self.headers.get("Origin")) else {}
+        self._send(HTTPStatus.NO_CONTENT, headers={**may, "Allow": "GET, HEAD, OPTIONS"})
+
+    def parse_request(self) -> bool:
+        """Read a request; one that is meant for another server is refused."""
+        if not super().parse_request():
+            return False
+        host = self.headers.get("Host")
+        if self.server.is_meant(host):
+            return True
+        self.close_connection = True
+        # The name is a stranger's and may be of any bytes: it is not repeated.
+        self._tell(
+            HTTPStatus.MISDIRECTED_REQUEST, f"this is {self.server.url}; ask it by that name"
+        )
+        return False
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of single requests."""
@@ -202,7 +293,15 @@ class _Handler(BaseHTTPRequestHandler):
     ) -> None:
         """Send an answer. length: bytes that a body would have, where none is sent."""
         self.send_response(status)
-        for name, value in {**CORS, **headers}.items():
+        # A request that could not be read has no headers.
+        asking = getattr(self, "headers", None)
+        origin = self.server.allowed(asking.get("Origin") if asking else None)
+        if origin is not None:
+            self.send_header("Access-Control-Allow-Origin", origin)
+            self.send_header("Access-Control-Expose-Headers", EXPOSED)
+        if self.server.origins - {"*"}:
+            self.send_header("Vary", "Origin")
+        for name, value in headers.items():
             self.send_header(name, value)
         if status not in (HTTPStatus.NO_CONTENT, HTTPStatus.NOT_MODIFIED):
             self.send_header("Content-Length", str(len(data) if length is None else length))
@@ -210,6 +309,21 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Connection", "close")
         self.end_headers()
         self.wfile.write(data)
+
+
+def _origin(text: str) -> str:
+    """An origin as browsers write it. Raises InputError for what is none."""
+    if text in ("*", "null"):
+        return text
+    try:
+        parts = urlsplit(text)
+        if parts.scheme and parts.hostname and parts.path in ("", "/") and not parts.query:
+            return f"{parts.scheme}://{parts.netloc}".lower()
+    except ValueError:
+        pass
+    raise InputError(
+        f"origin '{text}' is none; https://example.org or http://localhost:8080 is one"
+    )
 
 
 def _key_tag(tag: str, key: str) -> str:

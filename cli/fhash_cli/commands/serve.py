@@ -30,19 +30,28 @@ PORT = 8642
     help="Address to listen at. The default is this machine alone; 0.0.0.0 is every address of it,"
     " so that whoever reaches it may read RUN.fhz.",
 )
+@click.option(
+    "--origin",
+    "origins",
+    multiple=True,
+    metavar="ORIGIN",
+    help="Web pages that may read it, such as https://neuroglancer-demo.appspot.com; may be"
+    " repeated. * is every page. Default: none.",
+)
 @json_option
-def command(run: str, port: int, host: str, as_json: bool) -> None:
+def command(run: str, port: int, host: str, origins: tuple[str, ...], as_json: bool) -> None:
     """Give decoded values of RUN.fhz over HTTP until Ctrl-C.
 
     Clients see a Zarr v3 hierarchy without any codec of fhash: the values over the whole domain,
-    coordinates, and levels of detail. Only the chunks that a client reads are decoded. Pages of any
-    origin may read it (CORS). docs/zarr.md shows xarray, tensorstore, zarrita and neuroglancer.
+    coordinates, and levels of detail. Only the chunks that a client reads are decoded. Web pages
+    may read it where --origin names theirs. docs/zarr.md shows xarray, tensorstore, zarrita and
+    neuroglancer.
     """
     from fhash_codec.zarr_view.server import Server
     from fhash_codec.zarr_view.view import opened_view
 
     volume, view = opened_view(run)
-    with volume, Server(view, host=host, port=port, news=say) as server:
+    with volume, Server(view, host=host, port=port, origins=origins, news=say) as server:
         arrays = list(view.names.values())
         emit(
             {"path": run, "url": server.url, "arrays": arrays},

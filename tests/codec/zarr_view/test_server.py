@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
 import socket
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,10 +28,12 @@ Ask = Callable[..., Answer]
 
 
 @contextmanager
-def serving(path: Path, news: Callable[[str], None] = print) -> Iterator[Server]:
+def serving(
+    path: Path, news: Callable[[str], None] = print, origins: Sequence[str] = ()
+) -> Iterator[Server]:
     """A server in a thread of its own."""
     volume, view = opened_view(path)
-    with volume, Server(view, news=news) as server:
+    with volume, Server(view, news=news, origins=origins) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
@@ -142,17 +146,94 @@ def test_tags_are_of_the_file_and_not_of_the_server(whole: Path, feature: Path) 
 
 
 @pytest.mark.parametrize("path", ["/zarr.json", CHUNK, "/nope"])
-def test_pages_of_other_origins_may_read(ask: Ask, path: str) -> None:
-    _, headers, _ = ask(path, Origin="https://example.org")
-    assert headers["Access-Control-Allow-Origin"] == "*"
-    assert "ETag" in headers["Access-Control-Expose-Headers"]
-    status, headers, body = ask(
-        path, "OPTIONS", Origin="https://example.org", Access_Control_Request_Method="GET"
-    )
-    assert (status, body) == (204, b"")
-    assert headers["Access-Control-Allow-Origin"] == "*"
-    assert "Range" in headers["Access-Control-Allow-Headers"]
-    assert headers["Access-Control-Allow-Methods"] == "GET, HEAD, OPTIONS"
+@pytest.mark.parametrize("origin", ["https://example.org", "null"])
+def test_pages_of_named_origins_may_read(whole: Path, path: str, origin: str) -> None:
+    with serving(whole, origins=["HTTPS://Example.org/", "null"]) as server:
+        ask = asking(server)
+        _, headers, _ = ask(path, Origin=origin)
+        assert (headers["Access-Control-Allow-Origin"], headers["Vary"]) == (origin, "Origin")
+        assert "ETag" in headers["Access-Control-Expose-Headers"]
+        status, headers, body = ask(
+            path, "OPTIONS", Origin=origin, Access_Control_Request_Method="GET"
+        )
+        assert (status, body) == (204, b"")
+        assert headers["Access-Control-Allow-Origin"] == origin
+        assert "Range" in headers["Access-Control-Allow-Headers"]
+        assert headers["Access-Control-Allow-Methods"] == "GET, HEAD, OPTIONS"
+
+
+@pytest.mark.parametrize("origins", [[], ["https://example.org"]])
+def test_pages_of_other_origins_may_not(whole: Path, origins: list[str]) -> None:
+    with serving(whole, origins=origins) as server:
+        for method in ("GET", "OPTIONS"):
+            for other in ("https://example.org.evil.net", "http://example.org", "null"):
+                _, headers, _ = asking(server)("/zarr.json", method, Origin=other)
+                assert not [name for name in headers if name.startswith("Access-Control")]
+    with serving(whole, origins=["*"]) as server:
+        assert asking(server)("/nope", Origin="null")[1]["Access-Control-Allow-Origin"] == "*"
+
+
+@pytest.mark.parametrize("text", ["example.org", "https://", "https://a/b", "https://[", ""])
+def test_what_is_no_origin_is_refused(whole: Path, text: str) -> None:
+    with serving(whole) as server, pytest.raises(InputError, match=r"origin '.*' is none"):
+        Server(server.view, origins=[text])
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.net", "[", ""])
+def test_names_of_other_machines_get_nothing_on_loopback(whole: Path, host: str) -> None:
+    with serving(whole) as server:
+        ask = asking(server)
+        for path, method in (("/zarr.json", "GET"), (CHUNK, "HEAD"), ("/zarr.json", "OPTIONS")):
+            status, _, body = ask(path, method, Host=host)
+            assert (status, b"shape" in body) == (421, False)
+        for name in ("localhost", "LOCALHOST:1", "[::1]:80", "127.0.0.1"):
+            assert ask("/zarr.json", Host=name)[0] == 200
+        with socket.create_connection(server.server_address[:2], timeout=30) as raw:
+            raw.sendall(b"GET /zarr.json HTTP/1.0\r\n\r\n")
+            assert raw.recv(15) == b"HTTP/1.1 200 OK"
+    volume, view = opened_view(whole)
+    with volume, Server(view, host="0.0.0.0") as everywhere:
+        assert everywhere.is_meant("a.name.of.this.machine")
+
+
+def test_connections_beyond_the_limit_are_told_so(
+    whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fhash_codec.zarr_view.server.MAX_CONNECTIONS", 2)
+    with serving(whole) as server:
+        held = [http.client.HTTPConnection("127.0.0.1", server.server_address[1]) for _ in "ab"]
+        for connection in held:
+            connection.request("GET", "/zarr.json")
+            assert connection.getresponse().read()
+        status, headers, _ = asking(server)("/zarr.json")
+        assert (status, headers["Retry-After"]) == (503, "1")
+        for connection in held:
+            connection.close()
+        for _ in range(200):  # the server sees the end of a connection when its thread runs
+            status = asking(server)("/zarr.json")[0]
+            if status == 200:
+                break
+            time.sleep(0.05)
+        assert status == 200
+
+
+def test_without_descriptors_the_server_waits(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    news: list[str] = []
+    failures = iter([OSError(errno.EMFILE, "Too many open files")] * 2)
+    accept = socket.socket.accept
+
+    def accept_later(self: socket.socket) -> object:
+        for failure in failures:
+            raise failure
+        return accept(self)
+
+    pauses: list[float] = []
+    monkeypatch.setattr(socket.socket, "accept", accept_later)
+    monkeypatch.setattr("fhash_codec.zarr_view.server.time.sleep", pauses.append)
+    with serving(whole, news.append) as server:
+        assert asking(server)("/zarr.json")[0] == 200
+    assert news == ["no connection can be accepted: Too many open files"] * 2
+    assert len(pauses) == 2
 
 
 @pytest.mark.parametrize(
