@@ -93,7 +93,8 @@ class Server(ThreadingHTTPServer):
         """
         self.view, self.news = view, news
         self.origins = frozenset(map(_origin, origins))
-        self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._places = threading.Semaphore(MAX_CONNECTIONS)
+        self._is_exhausted = False
         try:
             family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             self.address_family = family
@@ -127,12 +128,16 @@ class Server(ThreadingHTTPServer):
     def get_request(self) -> tuple[Any, Any]:
         """Accept a connection; waits where descriptors or memory have run out."""
         try:
-            return super().get_request()
+            accepted = super().get_request()
         except OSError as error:
             if error.errno in EXHAUSTED:
-                self.news(f"no connection can be accepted: {error.strerror}")
+                if not self._is_exhausted:
+                    self.news(f"no connection can be accepted for now: {error.strerror}")
+                self._is_exhausted = True
                 time.sleep(PAUSE_SECONDS)
             raise
+        self._is_exhausted = False
+        return accepted
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve a connection in a thread, or refuse it at once where too many are open."""
@@ -145,7 +150,7 @@ class Server(ThreadingHTTPServer):
             return
         try:
             super().process_request(request, client_address)
-        except BaseException:
+        except Exception:  # no thread could be started
             self._places.release()
             raise
 
