@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.extent import Extent
-from fhash_formats.series import Series
+from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.sections import Shape
 
@@ -232,7 +232,12 @@ class Blocks:
         return self._last_layer[1]
 
     def _load(self, steps: range) -> Tile:
-        """Read the box at some steps from the series."""
+        """Read the box at some steps from the series; an array in memory is not copied."""
+        held = self._series.values if isinstance(self._series, ArraySeries) else None
+        if held is not None and held.dtype == self.dtype:
+            values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
+            values.flags.writeable = False  # it is the caller's
+            return Tile(values, self._masks(steps))
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
         for number, step in enumerate(steps):
             frame = self._series.read(step)[self._extent.box.slices()]
@@ -241,9 +246,13 @@ class Blocks:
                 frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
                 frame = np.where(np.isfinite(frame), frame, 0.0)
             values[number] = frame
+        return Tile(values, self._masks(steps))
+
+    def _masks(self, steps: range) -> Mask | None:
+        """Return which vertices of the box are in the coreset at some steps; None for all."""
         if self.complete:
-            return Tile(values, None)
-        return Tile(values, np.stack([self._extent.mask(step) for step in steps]))
+            return None
+        return np.stack([self._extent.mask(step) for step in steps])
 
 
 def _region(place: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
