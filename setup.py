@@ -4,8 +4,11 @@ The rest of the build is described in pyproject.toml. The extensions are optiona
 compiler the build says so and goes on: the package then computes the same in numpy, more slowly.
 """
 
+import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
@@ -38,9 +41,24 @@ MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
 class BuildNative(build_ext):
-    """`build_ext` with the flags of the compiler that is there."""
+    """`build_ext` with the flags of the compiler that is there, for all files side by side."""
 
     def build_extensions(self) -> None:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            if self.compiler.compiler_type != "msvc":  # that one initialises itself on the way
+                self._compile_in(pool)
+            self._build_extensions()
+
+    def _compile_in(self, pool: ThreadPoolExecutor) -> None:
+        compile_some = self.compiler.compile
+
+        def compile_each(sources: list[str], **options: Any) -> list[str]:
+            jobs = [pool.submit(compile_some, [source], **options) for source in sources]
+            return [path for job in jobs for path in job.result()]
+
+        self.compiler.compile = compile_each
+
+    def _build_extensions(self) -> None:
         for extension in self.extensions:
             msvc = self.compiler.compiler_type == "msvc"
             own = extension.extra_compile_args
@@ -75,6 +93,5 @@ setup(
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
     cmdclass={"build_ext": BuildNative},
-    # The libraries take up to a minute each; they are built side by side.
-    options={"bdist_wheel": {"py_limited_api": "cp311"}, "build_ext": {"parallel": 2}},
+    options={"bdist_wheel": {"py_limited_api": "cp311"}, "build_ext": {"parallel": 3}},
 )

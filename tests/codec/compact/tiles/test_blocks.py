@@ -9,14 +9,14 @@ from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
+from fhash_formats.series import ArraySeries, StepsSeries
 
 SHAPE = (5, 6, 7, 8)
 VALUES = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
 
 
 def blocks_of(tile: tuple[int, int, int, int], features: tuple[str, ...] = ("all",)) -> Blocks:
-    series = ArraySeries(VALUES)
+    series = StepsSeries(ArraySeries(VALUES), range(len(VALUES)))  # read by frames, as a file is
     config = EncodeConfig(features=features, dilation=0)
     return Blocks(series, select_features(series, config, silent).extent, tile)
 
@@ -114,9 +114,9 @@ def test_by_layers_only_the_layer_that_is_asked_for_is_read(
 ) -> None:
     blocks = blocks_of((2, 4, 7, 5))
     read: list[int] = []
-    usual = ArraySeries.read
+    usual = StepsSeries.read
     monkeypatch.setattr(
-        ArraySeries, "read", lambda self, step: read.append(step) or usual(self, step)
+        StepsSeries, "read", lambda self, step: read.append(step) or usual(self, step)
     )
     layers = blocks.by_layers()
     assert not layers.in_memory
@@ -126,3 +126,22 @@ def test_by_layers_only_the_layer_that_is_asked_for_is_read(
         assert blocks.in_memory
         first = VALUES[2:4, 4 * index[1], 0, 5 * index[3]]
         np.testing.assert_array_equal(tile.values[:, 0, 0, 0], first)
+
+
+@pytest.mark.parametrize("features", [("all",), ("interval:0:1",)])
+def test_an_array_in_memory_is_neither_copied_nor_written(features: tuple[str, ...]) -> None:
+    array = VALUES.copy()
+    series = ArraySeries(array)
+    config = EncodeConfig(features=features, dilation=0)
+    blocks = Blocks(series, select_features(series, config, silent).extent, SHAPE)
+    tile, expected = blocks.read((0, 0, 0, 0)), blocks_of(SHAPE, features).read((0, 0, 0, 0))
+    np.testing.assert_array_equal(tile.values, expected.values)
+    np.testing.assert_array_equal(
+        np.ones(1) if tile.counted is None else tile.counted,
+        np.ones(1) if expected.counted is None else expected.counted,
+    )
+    if features == ("all",):
+        assert np.shares_memory(tile.values, array)
+        with pytest.raises(ValueError, match="read-only"):
+            tile.values[0, 0, 0, 0] = 0
+    assert array.flags.writeable
