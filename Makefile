@@ -1,14 +1,16 @@
-# Everything runs in .venv, which is made (or brought up to date) on the first call. Needs python3 >= 3.11 with venv and pip.
+# Everything runs in .venv, which is made (or brought up to date) on the first call. Needs python3 >= 3.11 with venv and pip,
+# and a C++17 compiler.
 PYTHON ?= python3
 BIN := .venv/bin
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test types units hard every wheels clean
 
-# Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
-demo: .venv/.stamp
+# Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
+demo: .venv/.plain
 	$(BIN)/fhash demo -o demo --force
 
 # Types are checked beside the tests: mypy takes a minute of one processor.
@@ -48,12 +50,18 @@ wheels: .venv/.stamp
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
 # the choice is made before any other requirement counts. Python compiles what it imports; pip would compile all of torch,
 # scipy and vtk, which takes minutes.
-.venv/.stamp: pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit("fhash needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
+.venv/.stamp: pyproject.toml constraints.txt | .venv/bin/python
+	$(INSTALL) torch
+	$(INSTALL) -e '.[dev]'
+	touch $@ .venv/.plain
+
+.venv/.plain: pyproject.toml constraints.txt | .venv/bin/python
+	$(INSTALL) -e .
 	touch $@
+
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit("fhash needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv
 
 clean:
 	rm -rf .venv build dist demo *.egg-info .mypy_cache .ruff_cache .hypothesis
