@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import ipaddress
 import os
 import socket
 import socketserver
@@ -101,7 +102,8 @@ class Server(ThreadingHTTPServer):
             super().__init__(address[:2], _Handler)  # type: ignore[arg-type]
         except (OSError, UnicodeError, OverflowError) as error:
             raise InputError(_refused(host, port, error)) from error
-        self.is_local = host in LOOPBACK
+        self.is_local = ipaddress.ip_address(str(self.server_address[0])).is_loopback
+        self._names = {*LOOPBACK, host.lower()}
         name = f"[{host}]" if ":" in host else host
         self.url = f"http://{name}:{self.server_address[1]}/"
 
@@ -115,7 +117,7 @@ class Server(ThreadingHTTPServer):
         if not self.is_local or host is None:  # no browser leaves it out
             return True
         try:
-            return urlsplit(f"//{host}").hostname in LOOPBACK
+            return urlsplit(f"//{host}").hostname in self._names
         except ValueError:
             return False
 

@@ -194,6 +194,10 @@ def test_names_of_other_machines_get_nothing_on_loopback(whole: Path, host: str)
     volume, view = opened_view(whole)
     with volume, Server(view, host="0.0.0.0") as everywhere:
         assert everywhere.is_meant("a.name.of.this.machine")
+        with Server(view, host="127.0.0.2") as other:
+            assert other.is_local
+            assert other.is_meant("127.0.0.2:80")
+            assert not other.is_meant("evil.example")
 
 
 def test_connections_beyond_the_limit_are_told_so(
