@@ -17,7 +17,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.xarray_backend import FhashBackend
 from fhash_formats import open_series
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
 ROOT = Path(__file__).resolve().parents[2]
@@ -252,3 +252,44 @@ def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None
             assert 0 < error <= found[name].attrs["fhash_max_error"] * (1 + 1e-6)
             same = same.assign({name: found[name].copy(data=whole[name].values)})
         xr.testing.assert_identical(without_own(whole), without_own(same))
+
+
+def packed_part(number: int, **encoding: Any) -> xr.Dataset:
+    """Two steps of counts of 16 bits whose scale and offset fit these steps alone."""
+    values = smooth(2, 4, 5, 6) + 40 * number
+    step, middle = (values.max() - values.min()) / 65000, (values.max() + values.min()) / 2
+    days = ("time", 2.0 * number + np.arange(2), {"units": "days since 2000-01-01"})
+    data = xr.Dataset(
+        {"t2m": (("time", "z", "y", "x"), values, {"units": "K", "valid_min": np.int16(-32000)})},
+        {"time": days},
+    )
+    packing = {"dtype": "int16", "scale_factor": step, "add_offset": middle, "_FillValue": -32767}
+    data["t2m"].encoding = {**packing, **encoding}
+    return data
+
+
+@pytest.mark.parametrize("way", ["files", "labelled", "fill"])
+def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: str) -> None:
+    # a fill value between the values: one that is coded as it would be missing later
+    parts = [packed_part(0, **({"_FillValue": 5} if way == "fill" else {}))]
+    parts += [] if way == "fill" else [packed_part(1)]
+    for number, part in enumerate(parts):
+        part.to_netcdf(tmp_path / f"part_{number}.nc", engine="h5netcdf")
+    source: Any = str(tmp_path / "part_*.nc")
+    read = [xr.load_dataset(path) for path in sorted(tmp_path.glob("part_*.nc"))]
+    whole = xr.concat(read, "time", data_vars="all")
+    if way == "labelled":
+        source = whole.copy()
+        source["t2m"].encoding = read[0]["t2m"].encoding
+        fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    elif way == "files":
+        with pytest.warns(FhashWarning, match=r"add_offset \(differs .*, scale_factor \(of a packing"):
+            fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    else:
+        fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    with opened(tmp_path / "run.fhz") as stored:
+        error = stored["t2m"].attrs["fhash_max_error"]
+        assert "valid_min" not in stored["t2m"].attrs
+        stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "again.nc") as again:
+        np.testing.assert_allclose(again["t2m"].values, whole["t2m"].values, atol=error)
