@@ -18,7 +18,12 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.layout import Dimension, must_select
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    must_select,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.netcdf_surroundings import stored_variable
 from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate
 from fhash_formats.readers.common.surroundings import Stored, Wanted, surroundings
@@ -114,8 +119,7 @@ class LabelledSeries(Series):
 
     def __init__(self, array: Any, beside: Any) -> None:
         self.source, self.name = "array", str(array.name or "values")
-        names = [str(dim) for dim in array.dims]
-        self._axes = _axes(self.name, names, array.shape, array.coords)
+        self._axes = _axes(self.name, array, beside)
         self._array = array
         lengths = dict(zip(self._axes, array.shape, strict=True))
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], array.dtype)
@@ -214,15 +218,14 @@ def _stored(name: Any, array: Any) -> Stored:
     return replace(stored, attributes={**stored.attributes, **named})
 
 
-def _axes(name: str, dims: list[str], shape: tuple[int, ...], labels: Any) -> tuple[str, ...]:
-    """The axis of each dimension of a labelled array; raises InputError where it has others."""
-    roles = [role_of_coordinate(dim, labels[dim].attrs if dim in labels else {}) for dim in dims]
-    if not any(roles) and len(dims) <= len(AXES):
-        return AXES[-len(dims) :]
-    known = [
-        Dimension(name=dim, length=length, role=role)
-        for dim, length, role in zip(dims, shape, roles, strict=True)
-    ]
+def _axes(name: str, array: Any, beside: Any) -> tuple[str, ...]:
+    """The axis of each dimension of a labelled array; raises InputError where it has others.
+
+    beside: a Dataset, whose other arrays may tell what a dimension is.
+    """
+    others = [each for each in beside.data_vars.values() if each.dtype.kind in "iuf"]
+    known = with_roles(_dimensions(array), shared_roles(map(_dimensions, [*others, array])))
+    dims = [each.name or "" for each in known]
     open_dims = [dims[place] for place in must_select(known, {})]
     if open_dims:
         choice = ", ".join(f"{dim}=0" for dim in open_dims)
@@ -230,7 +233,21 @@ def _axes(name: str, dims: list[str], shape: tuple[int, ...], labels: Any) -> tu
             f"array '{name}' has the dimensions {', '.join(dims)}, and a series only t, z, y and"
             f" x; select one index of the others, such as array.isel({choice})"
         )
-    return assign_axes(f"array '{name}'", shape, roles, dims, None)
+    roles = [each.role for each in known]
+    return assign_axes(f"array '{name}'", array.shape, roles, dims, None)
+
+
+def _dimensions(array: Any) -> list[Dimension]:
+    """The dimensions of a labelled array, with what their names and coordinates say."""
+    labels = array.coords
+    roles = {
+        dim: role_of_coordinate(str(dim), getattr(labels.get(dim), "attrs", {}))
+        for dim in array.dims
+    }
+    return [
+        Dimension(name=str(dim), length=length, role=roles[dim])
+        for dim, length in zip(array.dims, array.shape, strict=True)
+    ]
 
 
 def _coordinate(name: str, label: Any) -> Coordinate:

@@ -283,7 +283,9 @@ def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: st
         source["t2m"].encoding = read[0]["t2m"].encoding
         fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
     elif way == "files":
-        with pytest.warns(FhashWarning, match=r"add_offset \(differs .*, scale_factor \(of a packing"):
+        with pytest.warns(
+            FhashWarning, match=r"add_offset \(differs .*, scale_factor \(of a packing"
+        ):
             fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
     else:
         fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)

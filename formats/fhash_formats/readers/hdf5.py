@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,26 @@ from fhash_formats.readers.common.hdf5_tree import (
     units_of,
     variables,
 )
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside
 from fhash_formats.readers.common.real_time import counts_steps
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
+from fhash_formats.readers.common.variables import (
+    Variable,
+    choose,
+    parent,
+    plain_name,
+    series_like,
+)
 from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
@@ -85,9 +99,16 @@ class Hdf5File:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the file says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         if variable.members:
             steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self.dimensions(variable.members[0])]
+            return [steps, *self._stated(variable.members[0])]
         dataset = variable.handle
         stated = openpmd.axes(self._attributes(parent(variable.name)), dataset.attrs, dataset.shape)
         return [

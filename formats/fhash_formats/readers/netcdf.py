@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,14 @@ from fhash_formats.readers.common import step_groups
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.netcdf_store import (
     CLASSIC,
@@ -35,7 +43,7 @@ from fhash_formats.readers.common.positions import Column, beside, coordinate, u
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose
+from fhash_formats.readers.common.variables import Variable, choose, series_like
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
@@ -115,6 +123,13 @@ class NetcdfFile:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the file says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         scope = self.scope(variable)
         found = []
         for name, length in zip(*_named_lengths(self.array(variable)), strict=True):

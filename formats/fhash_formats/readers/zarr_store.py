@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +19,26 @@ from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import sibling
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
+from fhash_formats.readers.common.variables import (
+    Variable,
+    choose,
+    parent,
+    plain_name,
+    series_like,
+)
 from fhash_formats.readers.common.zarr_nodes import (
     METADATA,
     metadata_of,
@@ -125,9 +139,16 @@ class ZarrTree:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the store says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         if variable.members:
             steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self.dimensions(variable.members[0])]
+            return [steps, *self._stated(variable.members[0])]
         path, array = variable.handle
         columns = self._places(path)
         stored = zip(dimension_names(array), array.shape, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +98,11 @@ class Variable:
         if 0 in self.shape:
             return f"an axis of length 0, shape {self.shape}; there is nothing to read"
         return ""
+
+
+def series_like(variables: Iterable[Variable]) -> Iterator[Variable]:
+    """Variables of a file that may be series and hold data."""
+    return (each for each in variables if not each.auxiliary and not each.problem(booleans=True))
 
 
 def choose(
