@@ -34,7 +34,7 @@ from fhash_formats.container import is_container
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import SCALING
 from fhash_formats.series import AXES
-from fhash_formats.source_metadata import SourceVariable, with_history
+from fhash_formats.source_metadata import SourceVariable, meant, with_history
 from fhash_formats.support.attributes import PACKING
 
 __all__ = ["FhashBackend"]
@@ -92,12 +92,10 @@ class FhashBackend(BackendEntrypoint):
         place = place_of(filename_or_obj)
         handle = acquire(place, storage_options)
         names = list(handle.volumes)
-        if variable is not None and variable not in names:
-            raise InputError(f"{place} has no variable {variable!r}; it has {', '.join(names)}")
-        chosen = {
-            name: Shown(handle.volumes[name], lod, outside)
-            for name in (names if variable is None else [variable])
-        }
+        if variable is not None and len(names := meant(variable, names)) != 1:
+            listed = ", ".join(handle.volumes)
+            raise InputError(f"{place} has no single variable {variable!r}; it has {listed}")
+        chosen = {name: Shown(handle.volumes[name], lod, outside) for name in names}
         shown_as = shown_names({name: handle.volumes[name].name for name in chosen})
         joined = SideBySide(
             {shown_as[name]: shown.form.dimensions for name, shown in chosen.items()}

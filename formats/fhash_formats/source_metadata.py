@@ -22,8 +22,10 @@ __all__ = [
     "SourceMetadata",
     "SourceVariable",
     "is_plain_name",
+    "meant",
     "references",
     "renamed",
+    "shown_name",
     "with_history",
     "without_names",
 ]
@@ -186,6 +188,30 @@ def with_history(attributes: Mapping[str, Any], line: str) -> dict[str, Any]:
     before = attributes.get("history")
     text = f"{before.rstrip()}\n{line}" if isinstance(before, str) and before.strip() else line
     return {**attributes, "history": text}
+
+
+def shown_name(name: str, taken: Collection[str]) -> str:
+    """The name of a variable, or another where a dimension has its last part as a name.
+
+    The component "B/x" of a vector on a grid of x, y and z is B_x then, and an array without a
+    group values_x. taken: names of the dimensions.
+    """
+    *groups, last = name.split("/")
+    if last not in taken:
+        return name
+    return f"{next((each for each in groups[::-1] if each and '*' not in each), 'values')}_{last}"
+
+
+def meant(wish: str, names: Collection[str]) -> list[str]:
+    """The names that a wish means: the whole of one, else its last parts, "E/x", "x" or E_x."""
+    name = wish.strip("/")
+    if name in names:
+        return [name]
+    return [
+        each
+        for each in names
+        if each.endswith((f"/{name}", f".{name}")) or "_".join(each.split("/")[-2:]) == name
+    ]
 
 
 def is_plain_name(name: object) -> bool:

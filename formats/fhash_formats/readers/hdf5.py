@@ -48,7 +48,8 @@ from fhash_formats.readers.common.variables import (
     plain_name,
     series_like,
 )
-from fhash_formats.series import Coordinate
+from fhash_formats.series import AXIS_NAMES, Coordinate
+from fhash_formats.source_metadata import shown_name
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -211,15 +212,17 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     first = (variable.members or (variable,))[0]
     chunks = first.handle.chunks
     trailing = first.shape[first.handle.ndim :]
+    coords = found.coordinates(variable, layout)
+    names = {*AXIS_NAMES.values()} | {each.name for each in coords.values()}
     return FileSeries(
         source=source,
-        name=plain_name(variable.name),
+        name=plain_name(shown_name(variable.name, names)),
         shape=layout.shape,
         dtype=variable.dtype if packed is None else packed.dtype,
         axes=layout.axes,
         fetch=layout.fetch(found.reading(variable)),
         stamp=stamp,
-        coords=found.coordinates(variable, layout),
+        coords=coords,
         attributes=json_attributes(
             variable.handle.attrs,
             # counts have not the unit of the values

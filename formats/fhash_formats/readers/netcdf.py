@@ -43,9 +43,10 @@ from fhash_formats.readers.common.positions import Column, beside, coordinate, u
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose, series_like
+from fhash_formats.readers.common.variables import Variable, choose, plain_name, series_like
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
+from fhash_formats.source_metadata import shown_name
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 if TYPE_CHECKING:
@@ -267,9 +268,11 @@ def _series(
 
     try:
         chunks = array.encoding.get("chunksizes")
+        # without names, dimensions have those of the axes
+        names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
         series = FileSeries(
             source=source,
-            name=variable.handle[1],
+            name=plain_name(shown_name(variable.name, names)),
             shape=layout.shape,
             dtype=array.dtype,
             axes=layout.axes,

@@ -48,6 +48,7 @@ from fhash_formats.readers.common.zarr_nodes import (
 )
 from fhash_formats.readers.common.zarr_surroundings import dimension_names, zarr_metadata
 from fhash_formats.series import Coordinate
+from fhash_formats.source_metadata import shown_name
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
 
 if TYPE_CHECKING:
@@ -257,9 +258,11 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     trailing = variable.shape[len(chunks) :]
     # counts have not the unit of the values
     without = PLUMBING | PACKING | ({"units"} if scaled else frozenset())
+    # without names, dimensions have those of the axes
+    names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
     series = FileSeries(
         source=found.source,
-        name=plain_name(variable.name),
+        name=plain_name(shown_name(variable.name, names)),
         shape=layout.shape,
         dtype=variable.dtype if packed is None else packed.dtype,
         axes=layout.axes,

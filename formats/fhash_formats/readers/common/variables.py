@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
+from fhash_formats.source_metadata import meant
 
 MAX_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
@@ -171,11 +172,8 @@ def named(
 
     candidates: variables that a message lists. Raises InputError for no such name, or several.
     """
-    name = var.strip("/")
-    found = [variable for variable in variables if variable.name == name]
-    found = found or [
-        variable for variable in variables if variable.name.endswith((f"/{name}", f".{name}"))
-    ]
+    names = set(meant(var, [variable.name for variable in variables]))
+    found = [variable for variable in variables if variable.name in names]
     if len(found) > 1:
         # a series of steps comes before each of its steps
         found = [variable for variable in found if not variable.auxiliary] or found
@@ -189,7 +187,7 @@ def named(
     nearest = sorted(
         candidates,
         key=lambda variable: (
-            -difflib.SequenceMatcher(None, name.lower(), variable.name.lower()).ratio()
+            -difflib.SequenceMatcher(None, var.lower(), variable.name.lower()).ratio()
         ),
     )
     raise InputError(
