@@ -8,6 +8,7 @@ CF makes the same of it as of the source.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -52,6 +53,9 @@ NAMING = (
     "interior_ring",
 )
 """Attributes that name further variables, as "name name" or "key: name key: name"."""
+
+LOOSELY_NAMING = re.compile(r"edges|mesh|.+_vars?|.+_variables?", re.IGNORECASE)
+"""Further attributes whose words name variables, if there are such: A_var, PS_var, edges."""
 
 Places = int | Sequence[int] | None
 """Places along a dimension: some of them in order, one of them, which takes the dimension away, or
@@ -155,9 +159,15 @@ def without_names(attributes: Mapping[str, Any], names: Collection[str]) -> dict
     return {**others, COORDINATES: kept} if kept else others
 
 
-def references(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Attributes that name other variables, each with a name in it, in order."""
-    for key in (COORDINATES, *NAMING):
+def references(
+    attributes: Mapping[str, Any], *, loosely: bool = False
+) -> Iterator[tuple[str, str]]:
+    """Attributes that name other variables, each with a name in it, in order.
+
+    loosely: those of LOOSELY_NAMING as well, whose words need not be names.
+    """
+    more = [key for key in attributes if loosely and LOOSELY_NAMING.fullmatch(key)]
+    for key in dict.fromkeys((COORDINATES, *NAMING, *more)):
         text = attributes.get(key)
         for word in text.split() if isinstance(text, str) else ():
             if not word.endswith(":"):
@@ -178,7 +188,9 @@ def renamed(attributes: Mapping[str, Any], names: Mapping[str, str]) -> dict[str
             word(old) if key == "grid_mapping" or not old.endswith(":") else old
             for old in attributes[key].split()
         )
-        for key in dict.fromkeys(key for key, name in references(attributes) if name in names)
+        for key in dict.fromkeys(
+            key for key, name in references(attributes, loosely=True) if name in names
+        )
     }
     return {**attributes, **changed}
 

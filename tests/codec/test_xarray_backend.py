@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import tomllib
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from cf_files import KINDS, Kind, smooth
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.coreset.labelled import labelled_series
 from fhash_codec.xarray_backend import FhashBackend
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
@@ -295,3 +297,31 @@ def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: st
         stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")
     with xr.open_dataset(tmp_path / "again.nc") as again:
         np.testing.assert_allclose(again["t2m"].values, whole["t2m"].values, atol=error)
+
+
+@pytest.mark.parametrize("kind", [name for name in KINDS if name != "ensemble"])
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: str) -> None:
+    made = KINDS[kind]()
+    source = made.write(tmp_path / "source.nc")
+    read = partial(xr.open_dataset, source, decode_times=False)
+    if form == "zarr":
+        with read() as data:
+            source = tmp_path / "source.zarr"
+            data.to_zarr(source, consolidated=False)
+        read = partial(xr.open_zarr, source, decode_times=False, consolidated=False)
+    with open_series(source, var=made.variable) as series:
+        fhash_codec.encode(series, tmp_path / "path.fhz", QUICK)
+    for name, options in (("plain", {}), ("all", {"decode_coords": "all"})):
+        with read(**options) as data:
+            series = labelled_series(data, made.variable)
+            fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)
+        same = (tmp_path / f"{name}.fhz").read_bytes() == (tmp_path / "path.fhz").read_bytes()
+        assert same, name
+
+
+def test_data_in_memory_name_no_file(tmp_path) -> None:
+    source = KINDS["packed"]().write(tmp_path / "source.nc")
+    with xr.load_dataset(source) as data:
+        metadata = labelled_series(data).metadata
+    assert (metadata.file, metadata.digest) == (None, None)

@@ -47,7 +47,7 @@ from fhash_formats.readers.common.variables import Variable, choose, plain_name,
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import shown_name
-from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
+from fhash_formats.support.attributes import STORED, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -250,7 +250,7 @@ def _series(
     layout = arrange(source, variable.name, found.dimensions(variable), request)
     array = found.array(variable)
     packed = declared(source, array)
-    without = PLUMBING | PACKING
+    without = STORED
     if request.raw_values:
         stored = open_groups(source, path, magic_of(path), raw=True)
         opened = [groups, stored]

@@ -49,7 +49,7 @@ from fhash_formats.readers.common.zarr_nodes import (
 from fhash_formats.readers.common.zarr_surroundings import dimension_names, zarr_metadata
 from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import shown_name
-from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
+from fhash_formats.support.attributes import PACKING, PLUMBING, STORED, json_attributes
 
 if TYPE_CHECKING:
     import zarr
@@ -257,7 +257,7 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     chunks = (*((1,) if variable.members else ()), *array.chunks)
     trailing = variable.shape[len(chunks) :]
     # counts have not the unit of the values
-    without = PLUMBING | PACKING | ({"units"} if scaled else frozenset())
+    without = STORED | ({"units"} if scaled else frozenset())
     # without names, dimensions have those of the axes
     names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
     series = FileSeries(

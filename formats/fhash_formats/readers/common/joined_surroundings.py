@@ -7,7 +7,6 @@ and one warning names it.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.errors import FhashWarning
+from fhash_formats.readers.common.surroundings import warn_left_out
 from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import (
     SourceMetadata,
@@ -49,13 +48,7 @@ def joined_metadata(
     if collected is None:
         return None
     metadata = collected.result(Path(source).name)
-    if collected.left_out:
-        told = ", ".join(f"{name} ({why})" for name, why in collected.left_out.items())
-        warnings.warn(
-            f"{source}: not everything beside the values is kept: {told}",
-            FhashWarning,
-            stacklevel=2,
-        )
+    warn_left_out(f"{source}: not everything beside the values is kept", collected.left_out)
     return metadata
 
 

@@ -23,10 +23,7 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
-    kept_dimensions,
-    other_type,
-    surroundings,
-    with_attributes,
+    metadata_of,
 )
 from fhash_formats.source_metadata import SourceMetadata
 
@@ -66,22 +63,13 @@ def netcdf_metadata(
                     for dataset in reversed(scope)
                     for name, array in dataset.variables.items()
                 }
-                name = handle[1]
-                own = variables[name]
-                variables[name] = with_attributes(own, layout.attributes())
-                kept, picked = kept_dimensions(source, name, layout, own.dimensions, request.select)
                 wanted = Wanted(
-                    source=source,
-                    name=name,
-                    dimensions=kept,
-                    picked=picked,
-                    used=used,
-                    without=without,
-                    stored=None if packed is None else other_type(packed),
-                    path=path,
-                    digested=request.digested,
+                    source=source, name=handle[1], used=used, without=without, path=path
                 )
-                return surroundings(wanted, variables, scope[0].attrs)
+                attributes = scope[0].attrs
+                return metadata_of(
+                    handle[1], variables, attributes, layout, request, wanted, packed
+                )
             finally:
                 close_groups(opened)
 

@@ -20,10 +20,7 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
-    kept_dimensions,
-    other_type,
-    surroundings,
-    with_attributes,
+    metadata_of,
 )
 from fhash_formats.source_metadata import SourceMetadata
 from fhash_formats.support.attributes import PLUMBING
@@ -75,23 +72,17 @@ def zarr_metadata(
                 for place in dict.fromkeys(["", group])  # those of the nearest place count
                 for each, stored in _stored_in(arrays, place)
             }
-            own = variables.get(name)
-            if own is None or not name:
+            if not name or name not in variables:
                 return None
-            variables[name] = with_attributes(own, layout.attributes())
-            kept, picked = kept_dimensions(source, name, layout, own.dimensions, request.select)
             wanted = Wanted(
                 source=source,
                 name=name,
-                dimensions=kept,
-                picked=picked,
                 used=[each.rpartition("/")[2] for each in used],
                 without=without,
-                stored=None if packed is None else other_type(packed),
                 path=root,
-                digested=request.digested,
             )
-            return surroundings(wanted, variables, groups.get(group, {}))
+            attributes = groups.get(group, {})
+            return metadata_of(name, variables, attributes, layout, request, wanted, packed)
 
     return read
 
