@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.cf_packing import note_packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
@@ -30,6 +30,7 @@ from fhash_formats.readers.common.surroundings import (
     metadata_of,
     warn_left_out,
 )
+from fhash_formats.readers.common.times import settled
 from fhash_formats.readers.common.variables import MAX_LISTED, MIN_DIMENSIONS
 from fhash_formats.readers.netcdf import NetcdfFile
 from fhash_formats.series import (
@@ -141,6 +142,9 @@ class LabelledSeries(Series):
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
         } | found.coordinates(variable, layout)
+        self.coords["t"], self.remark = settled(self.coords["t"])
+        if self.remark:
+            warnings.warn(f"{found.source}: {self.remark}", FhashWarning, stacklevel=4)
         check_coords(self.source, self.coords, self.shape)
         self.attributes = json_attributes(array.attrs, without=STORED) | layout.attributes()
         self.units = str(self.attributes.get("units", ""))
@@ -200,7 +204,8 @@ class LabelledSeries(Series):
         )
         of_file = {key: value for key, value in beside.attrs.items() if key != COORDINATES}
         packed = self._packing
-        return metadata_of(self.name, variables, of_file, self._layout, request, wanted, packed)
+        layout, time = self._layout, self.coords["t"]
+        return metadata_of(self.name, variables, of_file, layout, request, wanted, packed, time)
 
 
 def _as_file(array: Any, beside: Any, name: str, failed: dict[str, str]) -> xr.Dataset:

@@ -25,6 +25,7 @@ from fhash_formats.readers.common.hdf5_tree import (
     packing_of,
     require_filters,
     require_sources,
+    texts_of,
     units_of,
     variables,
 )
@@ -38,9 +39,9 @@ from fhash_formats.readers.common.layout import (
 )
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside
-from fhash_formats.readers.common.real_time import counts_steps
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.times import counts_steps, written_times
 from fhash_formats.readers.common.variables import (
     Variable,
     choose,
@@ -168,6 +169,11 @@ class Hdf5File:
             tied.remove("t")  # a time beside the numbers of steps comes first
         named = beside(self.source, layout.axes, layout.shape, places, certain=certain, tied=tied)
         coords = layout.coordinates(self.source, fitting) | named
+        if "t" in layout.axes and ("t" not in coords or not coords["t"].attributes):
+            length = layout.shape[layout.axes.index("t")]
+            texts = [text for place in (group, "") for text in texts_of(self.tree, place, length)]
+            written = written_times("time", texts)
+            coords |= {} if written is None else {"t": written}
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
             step_groups.require_positions(

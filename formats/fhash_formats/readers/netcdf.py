@@ -14,6 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from fhash_formats.readers.common import step_groups
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
@@ -40,9 +42,9 @@ from fhash_formats.readers.common.netcdf_store import (
 )
 from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.times import only_counts, real_time, written_times
 from fhash_formats.readers.common.variables import Variable, choose, plain_name, series_like
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
@@ -53,6 +55,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
+MAX_LETTERS = 64
+"""Letters of a date."""
 MADE_UP = "phony_dim_"
 """Prefix of the names that xarray makes up for dimensions without one."""
 
@@ -288,7 +292,6 @@ def _series(
         close()
         raise
     if not variable.members and not any(str(name).startswith(MADE_UP) for name in array.dims):
-        used = [coordinate.name for coordinate in series.coords.values()]
         scope = _upwards(variable.handle[0])
         series.metadata = netcdf_metadata(
             path,
@@ -296,7 +299,7 @@ def _series(
             scope,
             layout,
             request,
-            used,
+            series.coords,
             packed,
             without if request.raw_values else (),
         )
@@ -343,6 +346,20 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
                 )
                 if kind == rank and array.dims == (dimension,) and usable(array.dtype):
                     yield str(key), array
+
+
+def _texts(
+    dimension: str, length: int, scope: Sequence[xr.Dataset]
+) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+    """Variables of texts along one dimension, or of letters: name, texts and attributes."""
+    for dataset in scope:
+        for name, array in dataset.variables.items():
+            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
+            texts = array.ndim == 1 and array.dtype.kind in "SUO"
+            if (letters or texts) and array.dims[0] == dimension and len(array) == length:
+                found = array.to_numpy()
+                rows = [b"".join(row) for row in found.tolist()] if letters else found
+                yield str(name), np.asarray(rows), array.attrs
 
 
 def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
@@ -398,6 +415,11 @@ def _coordinates(
         roles = (each for each in others if role_of_coordinate(each.name, each.attributes) == axis)
         found = real_time(named, others) if axis == "t" else named
         found = found or next(roles, None)
+        if axis == "t" and (found is None or only_counts(found)):
+            written = written_times(dimension, _texts(dimension, length, scope))
+            if written is not None:
+                coords[axis] = written
+                continue
         if found is not None:
             coords[axis] = coordinate(source, found.name, found.read(), found.attributes)
     for key, scalar in values.coords.items():

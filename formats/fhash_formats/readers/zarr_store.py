@@ -29,9 +29,9 @@ from fhash_formats.readers.common.layout import (
 )
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.times import only_counts, real_time, written_times
 from fhash_formats.readers.common.variables import (
     Variable,
     choose,
@@ -203,6 +203,17 @@ class ZarrTree:
                 if column is not None and column.numeric and column.length == dimension.length
             },
         )
+        time, dimension = found.get("t"), dict(named).get("t")
+        if dimension is not None and (time is None or not time.numeric or only_counts(time)):
+            texts = [
+                (each.name, each.read(), each.attributes)
+                for place in columns
+                for each in place.values()
+                if not each.numeric
+                and (each.along, each.length) == (dimension.name, dimension.length)
+            ]
+            written = written_times(str(dimension.name), texts)
+            coords |= {} if written is None else {"t": written}
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
             step_groups.require_positions(self.source, variable, layout, coords, self._own_columns)
@@ -278,7 +289,6 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         packing=packed,
     )
     if not variable.members and not variable.field:
-        used = [coordinate.name for coordinate in series.coords.values()]
         series.metadata = zarr_metadata(
             root,
             path,
@@ -286,7 +296,7 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
             found.groups,
             layout,
             request,
-            used,
+            series.coords,
             packed,
             without if request.raw_values else (),
         )

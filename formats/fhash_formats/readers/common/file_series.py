@@ -14,6 +14,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, missing_values, note_packing
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.times import settled
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 from fhash_formats.support.attributes import plain_text
 
@@ -80,11 +81,14 @@ class FileSeries(Series):
         self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
-        self.given = frozenset(coords or {})
+        coords = dict(coords or {})
+        if "t" in coords:
+            coords["t"], self.remark = settled(coords["t"])
+        self.given = frozenset(coords)
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | dict(coords or {})
+        } | coords
         self._axes, self._fetch, self._close = tuple(axes), fetch, close
         self._quick = (stamp, *map(Stamp.of, beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (

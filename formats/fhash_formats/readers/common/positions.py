@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.roles import NAMES
+from fhash_formats.readers.common.times import real_time
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.support.attributes import STORED, json_attributes
 

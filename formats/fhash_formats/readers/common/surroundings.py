@@ -24,7 +24,9 @@ from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.layout import Layout, picks
 from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.times import with_times
 from fhash_formats.readers.common.variables import MIN_DIMENSIONS
+from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import (
     COORDINATES,
     NO_AXIS,
@@ -188,11 +190,12 @@ def metadata_of(
     request: Request,
     wanted: Wanted,
     packed: Packing | None,
+    time: Coordinate,
 ) -> SourceMetadata:
     """All that belongs to a variable as it was arranged; see `surroundings`.
 
     wanted: without dimensions. packed: how the values are packed; None where they are read as they
-        are stored.
+        are stored. time: the times of the steps, which may stand for those of the file.
     """
     own = variables[name]
     kept, picked = kept_dimensions(wanted.source, name, layout, own.dimensions, request.select)
@@ -204,7 +207,7 @@ def metadata_of(
         digested=request.digested,
     )
     selected = replace(own, attributes={**own.attributes, **layout.attributes()})
-    return surroundings(wanted, {**variables, name: selected}, attributes)
+    return with_times(surroundings(wanted, {**variables, name: selected}, attributes), time)
 
 
 def digest_of(path: Path) -> str | None:

@@ -22,6 +22,7 @@ from fhash_formats.readers.common.surroundings import (
     Wanted,
     metadata_of,
 )
+from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import SourceMetadata
 from fhash_formats.support.attributes import PLUMBING
 
@@ -53,7 +54,7 @@ def zarr_metadata(
     groups: Mapping[str, Mapping[str, Any]],
     layout: Layout,
     request: Request,
-    used: Collection[str],
+    coords: Mapping[str, Coordinate],
     packed: Packing | None,
     without: Collection[str],
 ) -> Callable[[], SourceMetadata | None]:
@@ -77,12 +78,14 @@ def zarr_metadata(
             wanted = Wanted(
                 source=source,
                 name=name,
-                used=[each.rpartition("/")[2] for each in used],
+                used=[each.name.rpartition("/")[2] for each in coords.values()],
                 without=without,
                 path=root,
             )
             attributes = groups.get(group, {})
-            return metadata_of(name, variables, attributes, layout, request, wanted, packed)
+            return metadata_of(
+                name, variables, attributes, layout, request, wanted, packed, coords["t"]
+            )
 
     return read
 
