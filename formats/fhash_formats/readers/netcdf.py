@@ -44,7 +44,12 @@ from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.times import only_counts, real_time, written_times
+from fhash_formats.readers.common.times import (
+    MAX_LETTERS,
+    only_counts,
+    real_time,
+    written_times,
+)
 from fhash_formats.readers.common.variables import Variable, choose, plain_name, series_like
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
@@ -55,8 +60,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
-MAX_LETTERS = 64
-"""Letters of a date."""
 MADE_UP = "phony_dim_"
 """Prefix of the names that xarray makes up for dimensions without one."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -31,7 +31,12 @@ from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.times import only_counts, real_time, written_times
+from fhash_formats.readers.common.times import (
+    MAX_LETTERS,
+    only_counts,
+    real_time,
+    written_times,
+)
 from fhash_formats.readers.common.variables import (
     Variable,
     choose,
@@ -205,13 +210,7 @@ class ZarrTree:
         )
         time, dimension = found.get("t"), dict(named).get("t")
         if dimension is not None and (time is None or not time.numeric or only_counts(time)):
-            texts = [
-                (each.name, each.read(), each.attributes)
-                for place in columns
-                for each in place.values()
-                if not each.numeric
-                and (each.along, each.length) == (dimension.name, dimension.length)
-            ]
+            texts = self._texts(variable.handle[0], str(dimension.name), dimension.length)
             written = written_times(str(dimension.name), texts)
             coords |= {} if written is None else {"t": written}
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
@@ -223,6 +222,19 @@ class ZarrTree:
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]
+
+    def _texts(
+        self, path: str, dimension: str, length: int
+    ) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+        """Arrays of texts along one dimension, or of letters: name, texts and attributes."""
+        for name, array in self.arrays.items():
+            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
+            texts = array.ndim == 1 and array.dtype.kind in "SUTO"
+            near = parent(name) in (parent(path), "") and (letters or texts)
+            if near and dimension_names(array)[0] == dimension and array.shape[0] == length:
+                found = np.asarray(array[...])
+                rows = [b"".join(row) for row in found.tolist()] if letters else found
+                yield name, np.asarray(rows), dict(array.attrs)
 
     def _own_columns(self, group: str) -> dict[str, Column]:
         columns = _columns(self.source, self.arrays, group)

@@ -216,7 +216,8 @@ def of_texts(texts: Sequence[str], calendar: str) -> tuple[list[float], dict[str
             return None
     if not exact:
         return None
-    usable = ((UNITS[name], name) for name in ("days", "hours", "minutes", "seconds"))
+    names = ("days", "hours", "minutes", "seconds")[len(exact) == 1 :]  # files of a step an hour
+    usable = ((UNITS[name], name) for name in names)
     whole = (pair for pair in usable if not any((each - exact[0]) % pair[0] for each in exact))
     unit, name = next(whole, (SECOND, "seconds"))
     counted = Clock(unit=unit, epoch=exact[0], calendar=calendar)

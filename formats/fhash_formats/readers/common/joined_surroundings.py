@@ -128,7 +128,8 @@ class _Joined:
         """The times of all steps, in the type of the first file where that holds them."""
         first = self._first.named(self._time.name)
         values: Any = self._time.values
-        if first is None:
+        if first is None or first.attributes.get("units") != self._time.attributes.get("units"):
+            # the numbers of the steps stand for times, as some file has none
             return SourceVariable(
                 name=dimension,
                 dimensions=(dimension,),

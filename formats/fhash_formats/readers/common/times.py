@@ -37,6 +37,9 @@ STANDARD_NAMES = ("time", "forecast_period", "forecast_reference_time")
 """Standard names of CF for coordinates that count time."""
 
 
+MAX_LETTERS = 64
+"""Letters of a date."""
+
 NUMBERED = "step numbers stand for the times"
 
 LOSS = Fraction(1, 10**6)
