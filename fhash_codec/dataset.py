@@ -10,6 +10,7 @@ from typing import Any
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_formats.container import Container, Place, StorageOptions
+from fhash_formats.source_metadata import meant
 
 __all__ = ["Dataset", "open"]
 
@@ -64,11 +65,18 @@ class Dataset(Mapping[str, Volume]):
         self._volumes: dict[str, Volume] = {}
 
     def __getitem__(self, name: str) -> Volume:
-        """The volume of a variable; raises KeyError that lists the names for no such variable."""
+        """The volume of a variable, by its name or a last part that no other has.
+
+        Raises KeyError that lists the names for no such variable, and for several.
+        """
         if name not in self._volumes:
-            if name not in self.container.variables:
+            found = meant(name, self.container.variables)
+            if len(found) != 1:
                 listed = ", ".join(self.container.variables)[:400]
-                raise KeyError(f"{self.path} has no variable {name!r:.80}; it holds {listed}")
+                what = f"{len(found)} variables named" if found else "no variable"
+                raise KeyError(f"{self.path} has {what} {name!r:.80}; it holds {listed}")
+            if found != [name]:
+                return self[found[0]]
             volume = Volume(self.container.variables[name], fill=self._fill)
             # Another thread may have made it meanwhile.
             return self._volumes.setdefault(name, volume)
@@ -81,7 +89,7 @@ class Dataset(Mapping[str, Volume]):
         return len(self.container.variables)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.container.variables
+        return isinstance(name, str) and len(meant(name, self.container.variables)) == 1
 
     def verify(self, progress: Progress = silent) -> int:
         """Read and check every array; return their number. Raises DamagedFileError."""

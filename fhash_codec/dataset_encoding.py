@@ -30,6 +30,7 @@ from fhash_formats.container import Container, ContainerWriter, SeveralWriter, V
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.readers.common.listing import Listed
 from fhash_formats.series import Series
+from fhash_formats.source_metadata import shown_name
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.attributes import json_attributes
 
@@ -131,7 +132,7 @@ class _Sources:
                 raise InputError(f"no variable {name[:80]!r}; the source has {listed}") from None
             with open_source(source) as series:
                 if not isinstance(source, Series | str | Path):
-                    series.name = name
+                    series.name = shown_name(name, [each.name for each in series.coords.values()])
                 yield series
             return
         with (self._open or self._open_file)(name) as series:

@@ -32,8 +32,9 @@ from fhash_codec.value_type import holds
 from fhash_codec.volume import OUTSIDE, Volume
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf_packing import SCALING
 from fhash_formats.series import AXES
-from fhash_formats.source_metadata import SourceVariable, with_history
+from fhash_formats.source_metadata import SourceVariable, meant, with_history
 from fhash_formats.support.attributes import PACKING
 
 __all__ = ["FhashBackend"]
@@ -91,12 +92,10 @@ class FhashBackend(BackendEntrypoint):
         place = place_of(filename_or_obj)
         handle = acquire(place, storage_options)
         names = list(handle.volumes)
-        if variable is not None and variable not in names:
-            raise InputError(f"{place} has no variable {variable!r}; it has {', '.join(names)}")
-        chosen = {
-            name: Shown(handle.volumes[name], lod, outside)
-            for name in (names if variable is None else [variable])
-        }
+        if variable is not None and len(names := meant(variable, names)) != 1:
+            listed = ", ".join(handle.volumes)
+            raise InputError(f"{place} has no single variable {variable!r}; it has {listed}")
+        chosen = {name: Shown(handle.volumes[name], lod, outside) for name in names}
         shown_as = shown_names({name: handle.volumes[name].name for name in chosen})
         joined = SideBySide(
             {shown_as[name]: shown.form.dimensions for name, shown in chosen.items()}
@@ -178,9 +177,10 @@ class Shown:
         return {**metadata.attributes, **source_attributes(metadata)}
 
     def packing(self) -> dict[str, Any]:
-        """The packing of the source, for `encoding`.
+        """The packing of the source, for `encoding`; none where the decoded values do not fit it.
 
-        It is left out where a vertex without a value would then be written as some number.
+        A value beyond the stored type would wrap, one that is coded as the fill value would become
+        a missing one, and a vertex without a value would be written as some number.
         """
         if self._metadata is None or self._volume.dtype.kind != "f":
             return {}
@@ -191,7 +191,29 @@ class Shown:
             if self._volume.value_type.has_gaps and not set(FILLS) & set(found):
                 return {}
             found["dtype"] = np.dtype(stored)
-        return found
+        return found if self._fits(found) else {}
+
+    def _fits(self, packing: Mapping[str, Any]) -> bool:
+        """Whether every decoded value has a number of the packed type that is no fill value."""
+        header = self._volume.container.header
+        dtype = np.dtype(packing.get("dtype", self._volume.dtype))
+        scale, offset = (
+            float(np.asarray(packing.get(key, usual)).reshape(-1)[0])
+            for key, usual in (("scale_factor", 1), ("add_offset", 0))
+        )
+        ends = [float(end) for end in header["value_range"]]
+        with np.errstate(all="ignore"):
+            ends = sorted(float((np.float64(end) - offset) / scale) for end in ends)
+        if not np.isfinite(ends).all():
+            return False
+        low, high = ends
+        if dtype.kind in "iu":
+            limits, (low, high) = np.iinfo(dtype), (round(low), round(high))
+            if low < limits.min or high > limits.max:
+                return False
+        fills = [np.ravel(packing[key]) for key in FILLS if key in packing]
+        exact = header["quality"].get("max_abs_error") == 0
+        return exact or not any(low <= fill <= high for fill in np.concatenate([[], *fills]))
 
     def _variables(self) -> tuple[SourceVariable, ...]:
         """The arrays beside the values, cut to the vertices that are shown."""
@@ -221,7 +243,10 @@ class Shown:
             raw = {**volume.attrs, **({"units": volume.units} if volume.units else {})}
         else:
             raw = dict(self._metadata.variable_attributes)
-        found = {key: value for key, value in raw.items() if key not in PACKING or key in VALID}
+        # limits of packed numbers mean nothing where the packing is not handed on
+        lost = SCALING & raw.keys() and not self.packing()
+        shown = () if lost else VALID
+        found = {key: value for key, value in raw.items() if key not in PACKING or key in shown}
         if volume.dtype.kind in "iu" and self.form.lod is None:
             gaps = volume.value_type.has_gaps
             fill = volume.fill if gaps else volume.value_type.fill

@@ -52,7 +52,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("rendering",),
         ("simulation",),
         ("comparison", "demo", "isosurface"),
-        ("shared_volumes",),
+        ("shared_volumes", "side_by_side"),
         ("lazy_array",),
         ("appending",),
         ("encoding",),

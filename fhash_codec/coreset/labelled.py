@@ -9,8 +9,8 @@ variable is taken as xarray would write it to a file.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Iterator
-from dataclasses import replace
+from collections.abc import Hashable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,30 +18,42 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.layout import Dimension, must_select
+from fhash_formats.readers.common.cf_packing import note_packing
+from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
+from fhash_formats.readers.common.netcdf_store import declared
 from fhash_formats.readers.common.netcdf_surroundings import stored_variable
-from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate
-from fhash_formats.readers.common.surroundings import Stored, Wanted, surroundings
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.surroundings import (
+    Stored,
+    Wanted,
+    metadata_of,
+    warn_left_out,
+)
+from fhash_formats.readers.common.times import settled
 from fhash_formats.readers.common.variables import MAX_LISTED, MIN_DIMENSIONS
+from fhash_formats.readers.netcdf import NetcdfFile
 from fhash_formats.series import (
     AXES,
     ArraySeries,
-    Coordinate,
     Series,
     check_coords,
     check_values,
     index_coordinate,
 )
-from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata
-from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
+from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata, references
+from fhash_formats.support.attributes import PACKING, STORED, json_attributes
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["LabelledSeries", "array_series", "labelled_series"]
 
-OF_FILE = (*NAMING, *sorted(PACKING - {"dtype"}))
+OF_FILE = (COORDINATES, *NAMING, *sorted(PACKING - {"dtype"}))
 """Keys of `encoding` that are attributes in a file."""
+FILL = "_FillValue"
+SINCE_1970 = "seconds since 1970-01-01"
+"""Units of dates that no file has counted."""
 
 
 def array_series(source: Any) -> Series:
@@ -104,7 +116,7 @@ def _listed(dataset: xr.Dataset) -> str:
 
 
 class LabelledSeries(Series):
-    """A labelled array, read frame by frame.
+    """A labelled array, read frame by frame; its dimensions, positions and metadata as of a file.
 
     array: the DataArray. beside: a Dataset with all that its attributes may name.
 
@@ -114,24 +126,33 @@ class LabelledSeries(Series):
 
     def __init__(self, array: Any, beside: Any) -> None:
         self.source, self.name = "array", str(array.name or "values")
-        names = [str(dim) for dim in array.dims]
-        self._axes = _axes(self.name, names, array.shape, array.coords)
-        self._array = array
-        lengths = dict(zip(self._axes, array.shape, strict=True))
+        self._failed: dict[str, str] = {}
+        request = Request(asked=False)
+        file = _as_file(array, beside, self.name, self._failed)
+        found = NetcdfFile(f"array '{self.name}'", Path(), {"/": file}, request)
+        variable = next(each for each in found.variables if each.handle == ("/", self.name))
+        dimensions = found.dimensions(variable)
+        self._layout = layout = _arranged(found.source, self.name, array, dimensions, request)
+        self._axes = layout.axes
+        lengths = dict(zip(self._axes, layout.shape, strict=True))
+        self._array = array = array.isel({array.dims[n]: at for n, at in layout.picked.items()})
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], array.dtype)
         self.dtype = array.dtype.newbyteorder("=")
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | {
-            axis: _coordinate(str(dim), array.coords[dim])
-            for axis, dim in zip(self._axes, array.dims, strict=True)
-            if dim in array.coords and array.coords[dim].dtype.kind in "iufMO"
-        }
+        } | found.coordinates(variable, layout)
+        self.coords["t"], self.remark = settled(self.coords["t"])
+        if self.remark:
+            warnings.warn(f"{found.source}: {self.remark}", FhashWarning, stacklevel=4)
         check_coords(self.source, self.coords, self.shape)
-        self.attributes = json_attributes(array.attrs, without=PLUMBING | PACKING)
+        self.attributes = json_attributes(array.attrs, without=STORED) | layout.attributes()
         self.units = str(self.attributes.get("units", ""))
-        self.metadata = lambda: self._metadata_of(beside)
+        self._packing = declared(found.source, array.variable)
+        self._origin = _origin(array, beside)
+        if self._origin is not None and self._packing is not None:
+            note_packing(self, self._packing)
+        self.metadata = lambda: self._metadata_of(array, beside, request)
         self.lazy = LazyFrames(self._in_order(array)) if is_lazy(array) else None
 
     def _in_order(self, array: Any) -> Any:
@@ -152,103 +173,129 @@ class LabelledSeries(Series):
         ordered = values.transpose([space.index(axis) for axis in AXES if axis in space])
         return np.ascontiguousarray(ordered.reshape(self.shape[1:]), dtype=self.dtype)
 
-    def _metadata_of(self, beside: Any) -> SourceMetadata:
-        array, name = self._array, self.name
-        failed: dict[str, str] = {}
+    def _metadata_of(self, array: Any, beside: Any, request: Request) -> SourceMetadata:
+        arrays = {str(key): each for key, each in beside.variables.items() if key != array.name}
         variables = {
-            str(key): stored for key, stored in _encoded(beside, failed) if key != array.name
+            key: _stored(key, each) for key, each in arrays.items() if key not in self._failed
         }
-        attributes = dict(array.attrs)
-        attributes |= {key: array.encoding[key] for key in OF_FILE if key in array.encoding}
-        listed = str(array.encoding.get(COORDINATES, "")).split()
-        if kept := " ".join(each for each in listed if each in variables):
-            attributes[COORDINATES] = kept
-        coordinates = [str(key) for key in array.coords]
-        variables[name] = Stored(
-            dimensions=tuple(map(str, array.dims)),
-            shape=array.shape,
-            dtype=array.dtype,
-            attributes=attributes,
+        own = array.variable
+        variables[self.name] = Stored(
+            dimensions=tuple(each.name or "" for each in self._layout.dimensions),
+            shape=tuple(each.length for each in self._layout.dimensions),
+            dtype=own.dtype,
+            attributes=_attributes(own),
             read=lambda places: np.empty(0),
         )
-        if failed:
-            told = ", ".join(f"{key} ({why})" for key, why in failed.items())
-            warnings.warn(
-                f"array '{name}': not everything beside it is kept: {told}",
-                FhashWarning,
-                stacklevel=2,
-            )
-        stored = np.dtype(array.encoding.get("dtype", array.dtype))
+        source = f"array '{self.name}'"
+        warn_left_out(f"{source}: not everything beside it is kept", self._failed)
+        # a coordinate is what the dataset calls so, unless it is named in another way
+        naming = {
+            name
+            for each in variables.values()
+            for key, name in references(each.attributes)
+            if key != COORDINATES
+        }
         wanted = Wanted(
-            source=f"array '{name}'",
-            name=name,
-            dimensions=dict(zip(map(str, array.dims), self._axes, strict=True)),
-            picked={},
-            coordinates=coordinates,
-            stored=stored.name if stored != array.dtype and stored.kind in "iuf" else None,
+            source=source,
+            name=self.name,
+            coordinates=[key for key in map(str, array.coords) if key not in naming],
+            used=[coordinate.name for coordinate in self.coords.values()],
+            path=self._origin,
         )
         of_file = {key: value for key, value in beside.attrs.items() if key != COORDINATES}
-        return surroundings(wanted, variables, of_file)
+        packed = self._packing
+        layout, time = self._layout, self.coords["t"]
+        return metadata_of(self.name, variables, of_file, layout, request, wanted, packed, time)
 
 
-def _encoded(dataset: Any, failed: dict[str, str]) -> Iterator[tuple[Any, Stored]]:
-    """The variables of a dataset as they stand in a file; those that cannot are noted."""
-    for name, array in dataset.variables.items():
-        try:
-            yield name, _stored(name, array)
-        except Exception as error:  # indices of several levels, and objects of all kinds
-            failed[str(name)] = str(error).split("\n", 1)[0][:80]
+def _as_file(array: Any, beside: Any, name: str, failed: dict[str, str]) -> xr.Dataset:
+    """A dataset as a NetCDF file gives it: times are numbers, and nothing is read.
 
-
-def _stored(name: Any, array: Any) -> Stored:
-    """A variable as xarray would write it; numbers stay unpacked, and are not read."""
+    failed: takes the variables that no file holds, with the reason.
+    """
     import xarray as xr
 
-    plain = array.to_base_variable()
-    if plain.dtype.kind not in "iuf":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of types, which are as good as another here
-            return stored_variable(xr.conventions.encode_cf_variable(plain, name=name))
-    stored = stored_variable(plain)
-    named = {key: plain.encoding[key] for key in NAMING if key in plain.encoding}
-    return replace(stored, attributes={**stored.attributes, **named})
+    arrays = {}
+    for key, each in {**beside.variables, name: array.variable}.items():
+        try:
+            arrays[str(key)] = each if each.dtype.kind in "iuf" else _encoded(str(key), each)
+        except Exception as error:  # indices of several levels, and objects of all kinds
+            failed[str(key)] = condense(error)
+    plain = {key: each.to_base_variable() for key, each in arrays.items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of references to variables that are not there
+        decoded = xr.decode_cf(
+            xr.Dataset(plain),
+            decode_times=False,
+            decode_timedelta=False,
+            mask_and_scale=False,
+            decode_coords="all",
+        )
+    return decoded.set_coords([each for each in beside.coords if each in decoded])
 
 
-def _axes(name: str, dims: list[str], shape: tuple[int, ...], labels: Any) -> tuple[str, ...]:
-    """The axis of each dimension of a labelled array; raises InputError where it has others."""
-    roles = [role_of_coordinate(dim, labels[dim].attrs if dim in labels else {}) for dim in dims]
-    if not any(roles) and len(dims) <= len(AXES):
-        return AXES[-len(dims) :]
-    known = [
-        Dimension(name=dim, length=length, role=role)
-        for dim, length, role in zip(dims, shape, roles, strict=True)
-    ]
-    open_dims = [dims[place] for place in must_select(known, {})]
+def _arranged(
+    source: str, name: str, array: Any, dimensions: Sequence[Dimension], request: Request
+) -> Layout:
+    """The reading of an array; raises InputError where an index must be selected."""
+    picked = single(dimensions, {})
+    open_dims = [dimensions[place].name for place in must_select(dimensions, picked)]
     if open_dims:
         choice = ", ".join(f"{dim}=0" for dim in open_dims)
         raise InputError(
-            f"array '{name}' has the dimensions {', '.join(dims)}, and a series only t, z, y and"
-            f" x; select one index of the others, such as array.isel({choice})"
+            f"array '{name}' has the dimensions {', '.join(map(str, array.dims))}, and a series"
+            f" only t, z, y and x; select one index of the others, such as array.isel({choice})"
         )
-    return assign_axes(f"array '{name}'", shape, roles, dims, None)
+    return arrange(source, name, dimensions, request)
 
 
-def _coordinate(name: str, label: Any) -> Coordinate:
-    """The coordinate of a labelled axis.
+def _encoded(name: str, array: Any) -> Any:
+    """A variable as xarray writes it to a file, and as the file that it comes from has it."""
+    import xarray as xr
 
-    Dates are counted as the file that they come from counted them; else they become seconds since
-    1970. Labels that are no dates leave the index.
-    """
-    values, attributes = np.asarray(label), json_attributes(label.attrs)
-    if values.dtype.kind == "O" or (values.dtype.kind == "M" and "units" in label.encoding):
-        try:
-            stored = _stored(name, label.variable)
-        except (NotImplementedError, TypeError, ValueError):  # objects of all kinds
-            stored = None
-        if stored is None or stored.dtype.kind not in "iuf":
-            return replace(index_coordinate("t", values.size), name=name)
-        values, attributes = stored.read((slice(None),)), json_attributes(stored.attributes)
-    elif values.dtype.kind == "M":
-        values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-        attributes = {"units": "seconds since 1970-01-01", "calendar": "proleptic_gregorian"}
-    return Coordinate(name=name, values=values.astype(np.float64), attributes=attributes)
+    plain = array.to_base_variable()
+    encoding = {**plain.encoding}
+    if FILL not in encoding and FILL not in plain.attrs:
+        encoding[FILL] = None  # xarray adds one
+    if plain.dtype.kind == "M" and "units" not in encoding:
+        encoding |= {"units": SINCE_1970, "calendar": "proleptic_gregorian", "dtype": "float64"}
+    plain.encoding = encoding
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of types, which are as good as another here
+        encoded = xr.conventions.encode_cf_variable(plain, name=name)
+        if encoded.dtype.kind == "S" and "char_dim_name" in encoding:
+            coder: Any = xr.coding.strings.CharacterArrayCoder()
+            encoded = coder.encode(encoded, name=name)
+    encoded.attrs = {key: value for key, value in encoded.attrs.items() if value is not None}
+    return encoded
+
+
+def _stored(name: str, array: Any) -> Stored:
+    """A variable as it stands in a file; numbers are packed when they are read."""
+    if array.dtype.kind not in "iuf":
+        return stored_variable(_encoded(name, array))
+    return Stored(
+        dimensions=tuple(map(str, array.dims)),
+        shape=array.shape,
+        dtype=np.dtype(array.encoding.get("dtype", array.dtype)),
+        attributes=_attributes(array),
+        read=lambda places: np.asarray(_encoded(name, array[places]).values),
+    )
+
+
+def _attributes(array: Any) -> dict[str, Any]:
+    """The attributes that a variable of numbers has in a file."""
+    encoding = {key: array.encoding.get(key) for key in OF_FILE}
+    found = {**array.attrs, **{key: each for key, each in encoding.items() if each is not None}}
+    dtype = np.dtype(array.encoding.get("dtype", array.dtype))
+    if isinstance(found.get(FILL), int | float) and dtype.kind in "iuf":
+        found[FILL] = dtype.type(found[FILL])  # of Zarr, which has no types of attributes
+    return found
+
+
+def _origin(array: Any, beside: Any) -> Path | None:
+    """The file that an array comes from; None for one in memory, which may have been changed."""
+    place = array.encoding.get("source", beside.encoding.get("source"))
+    if not isinstance(place, str) or array.variable._in_memory or not Path(place).exists():
+        return None
+    return Path(place)

@@ -71,6 +71,7 @@ class Series(ABC):
         keep_extremes: whether the user said that extreme values which repeat are data.
         unlikely: values that stand for the lowest integers of the stored type, where counts are
             unpacked; they are hardly ever data.
+        remark: what is to be said of the times, "" for nothing.
     """
 
     source: str
@@ -86,6 +87,7 @@ class Series(ABC):
     occurring: AbstractSet[float] = frozenset()
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
+    remark: str = ""
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property

@@ -8,6 +8,7 @@ CF makes the same of it as of the source.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -22,8 +23,10 @@ __all__ = [
     "SourceMetadata",
     "SourceVariable",
     "is_plain_name",
+    "meant",
     "references",
     "renamed",
+    "shown_name",
     "with_history",
     "without_names",
 ]
@@ -50,6 +53,9 @@ NAMING = (
     "interior_ring",
 )
 """Attributes that name further variables, as "name name" or "key: name key: name"."""
+
+LOOSELY_NAMING = re.compile(r"edges|mesh|.+_vars?|.+_variables?", re.IGNORECASE)
+"""Further attributes whose words name variables, if there are such: A_var, PS_var, edges."""
 
 Places = int | Sequence[int] | None
 """Places along a dimension: some of them in order, one of them, which takes the dimension away, or
@@ -153,9 +159,15 @@ def without_names(attributes: Mapping[str, Any], names: Collection[str]) -> dict
     return {**others, COORDINATES: kept} if kept else others
 
 
-def references(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Attributes that name other variables, each with a name in it, in order."""
-    for key in (COORDINATES, *NAMING):
+def references(
+    attributes: Mapping[str, Any], *, loosely: bool = False
+) -> Iterator[tuple[str, str]]:
+    """Attributes that name other variables, each with a name in it, in order.
+
+    loosely: those of LOOSELY_NAMING as well, whose words need not be names.
+    """
+    more = [key for key in attributes if loosely and LOOSELY_NAMING.fullmatch(key)]
+    for key in dict.fromkeys((COORDINATES, *NAMING, *more)):
         text = attributes.get(key)
         for word in text.split() if isinstance(text, str) else ():
             if not word.endswith(":"):
@@ -176,7 +188,9 @@ def renamed(attributes: Mapping[str, Any], names: Mapping[str, str]) -> dict[str
             word(old) if key == "grid_mapping" or not old.endswith(":") else old
             for old in attributes[key].split()
         )
-        for key in dict.fromkeys(key for key, name in references(attributes) if name in names)
+        for key in dict.fromkeys(
+            key for key, name in references(attributes, loosely=True) if name in names
+        )
     }
     return {**attributes, **changed}
 
@@ -186,6 +200,30 @@ def with_history(attributes: Mapping[str, Any], line: str) -> dict[str, Any]:
     before = attributes.get("history")
     text = f"{before.rstrip()}\n{line}" if isinstance(before, str) and before.strip() else line
     return {**attributes, "history": text}
+
+
+def shown_name(name: str, taken: Collection[str]) -> str:
+    """The name of a variable, or another where a dimension has its last part as a name.
+
+    The component "B/x" of a vector on a grid of x, y and z is B_x then, and an array without a
+    group values_x. taken: names of the dimensions.
+    """
+    *groups, last = name.split("/")
+    if last not in taken:
+        return name
+    return f"{next((each for each in groups[::-1] if each and '*' not in each), 'values')}_{last}"
+
+
+def meant(wish: str, names: Collection[str]) -> list[str]:
+    """The names that a wish means: the whole of one, else its last parts, "E/x", "x" or E_x."""
+    name = wish.strip("/")
+    if name in names:
+        return [name]
+    return [
+        each
+        for each in names
+        if each.endswith((f"/{name}", f".{name}")) or "_".join(each.split("/")[-2:]) == name
+    ]
 
 
 def is_plain_name(name: object) -> bool:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+import pytest
 import xarray as xr
 
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.side_by_side import SideBySide, shown_names
+from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Coordinate
 from fhash_formats.source_metadata import SourceMetadata, SourceVariable
 
@@ -114,3 +118,49 @@ def test_a_variable_alone_keeps_the_names_of_its_source() -> None:
 def test_names_are_those_of_the_sources_where_these_differ() -> None:
     assert shown_names({"a/u": "u", "b/v": "v"}) == {"a/u": "u", "b/v": "v"}
     assert shown_names({"a": "u", "b": "u", "c": "b"}) == {"a": "a", "b": "b", "c": "c"}
+
+
+def vector_file(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """A vector whose components have the names of the axes; their values."""
+    arrays = {name: values(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
+    with h5py.File(path, "w") as file:
+        for step, (name, array) in product((0, 1), arrays.items()):
+            place = f"data/{step}/meshes/B/{name}" if kind == "openpmd" else f"velocity/{name}"
+            if kind == "openpmd":
+                file.require_group(f"data/{step}").attrs["time"] = float(step)
+                file.require_group(f"data/{step}/meshes/B").attrs["axisLabels"] = list("xyz")
+                file[place] = array[step]
+            elif not step:
+                file[place] = array
+    return arrays
+
+
+@pytest.mark.parametrize("kind", ["openpmd", "groups", "arrays"])
+def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> None:
+    source, path = tmp_path / "run.h5", tmp_path / "run.fhz"
+    arrays = vector_file(source, kind)
+    word = {"openpmd": "B", "groups": "velocity", "arrays": "values"}[kind]
+    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, CONFIG)
+    with xr.open_dataset(path, engine="fhash") as found:
+        assert set(found.data_vars) == {f"{word}_{name}" for name in "xyz"}
+        assert sum(each**2 for each in found.data_vars.values()).dims == ("time", "z", "y", "x")
+        assert found.sizes.keys() == {"time", "z", "y", "x"}
+    with fhash_codec.open(path) as dataset:
+        assert dataset["y"].name == f"{word}_y"
+        assert "y" in dataset
+        assert "w" not in dataset
+        with pytest.raises(KeyError, match="no variable 'w'"):
+            dataset["w"]
+    with fhash_codec.open(path, variable="z") as volume:
+        assert volume.name == f"{word}_z"
+
+
+def test_a_last_part_of_several_names_is_refused(tmp_path: Path) -> None:
+    arrays = {name: values(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
+    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", CONFIG)
+    with fhash_codec.open(tmp_path / "run.fhz") as dataset:
+        assert [dataset[name].name for name in ("E/x", "B_x", "rho")] == ["E_x", "B_x", "B/rho"]
+        with pytest.raises(KeyError, match="2 variables named 'x'"):
+            dataset["x"]
+    with pytest.raises(InputError, match="2 variables named 'x'"):
+        fhash_codec.open(tmp_path / "run.fhz", variable="x")

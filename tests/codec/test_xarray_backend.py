@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import tomllib
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,10 @@ from cf_files import KINDS, Kind, smooth
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.coreset.labelled import labelled_series
 from fhash_codec.xarray_backend import FhashBackend
 from fhash_formats import open_series
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
 ROOT = Path(__file__).resolve().parents[2]
@@ -252,3 +254,74 @@ def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None
             assert 0 < error <= found[name].attrs["fhash_max_error"] * (1 + 1e-6)
             same = same.assign({name: found[name].copy(data=whole[name].values)})
         xr.testing.assert_identical(without_own(whole), without_own(same))
+
+
+def packed_part(number: int, **encoding: Any) -> xr.Dataset:
+    """Two steps of counts of 16 bits whose scale and offset fit these steps alone."""
+    values = smooth(2, 4, 5, 6) + 40 * number
+    step, middle = (values.max() - values.min()) / 65000, (values.max() + values.min()) / 2
+    days = ("time", 2.0 * number + np.arange(2), {"units": "days since 2000-01-01"})
+    data = xr.Dataset(
+        {"t2m": (("time", "z", "y", "x"), values, {"units": "K", "valid_min": np.int16(-32000)})},
+        {"time": days},
+    )
+    packing = {"dtype": "int16", "scale_factor": step, "add_offset": middle, "_FillValue": -32767}
+    data["t2m"].encoding = {**packing, **encoding}
+    return data
+
+
+@pytest.mark.parametrize("way", ["files", "labelled", "fill"])
+def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: str) -> None:
+    # a fill value between the values: one that is coded as it would be missing later
+    parts = [packed_part(0, **({"_FillValue": 5} if way == "fill" else {}))]
+    parts += [] if way == "fill" else [packed_part(1)]
+    for number, part in enumerate(parts):
+        part.to_netcdf(tmp_path / f"part_{number}.nc", engine="h5netcdf")
+    source: Any = str(tmp_path / "part_*.nc")
+    read = [xr.load_dataset(path) for path in sorted(tmp_path.glob("part_*.nc"))]
+    whole = xr.concat(read, "time", data_vars="all")
+    if way == "labelled":
+        source = whole.copy()
+        source["t2m"].encoding = read[0]["t2m"].encoding
+        fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    elif way == "files":
+        with pytest.warns(
+            FhashWarning, match=r"add_offset \(differs .*, scale_factor \(of a packing"
+        ):
+            fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    else:
+        fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
+    with opened(tmp_path / "run.fhz") as stored:
+        error = stored["t2m"].attrs["fhash_max_error"]
+        assert "valid_min" not in stored["t2m"].attrs
+        stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "again.nc") as again:
+        np.testing.assert_allclose(again["t2m"].values, whole["t2m"].values, atol=error)
+
+
+@pytest.mark.parametrize("kind", [name for name in KINDS if name != "ensemble"])
+@pytest.mark.parametrize("form", ["nc", "zarr"])
+def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: str) -> None:
+    made = KINDS[kind]()
+    source = made.write(tmp_path / "source.nc")
+    read = partial(xr.open_dataset, source, decode_times=False)
+    if form == "zarr":
+        with read() as data:
+            source = tmp_path / "source.zarr"
+            data.to_zarr(source, consolidated=False)
+        read = partial(xr.open_zarr, source, decode_times=False, consolidated=False)
+    with open_series(source, var=made.variable) as series:
+        fhash_codec.encode(series, tmp_path / "path.fhz", QUICK)
+    for name, options in (("plain", {}), ("all", {"decode_coords": "all"})):
+        with read(**options) as data:
+            series = labelled_series(data, made.variable)
+            fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)
+        same = (tmp_path / f"{name}.fhz").read_bytes() == (tmp_path / "path.fhz").read_bytes()
+        assert same, name
+
+
+def test_data_in_memory_name_no_file(tmp_path) -> None:
+    source = KINDS["packed"]().write(tmp_path / "source.nc")
+    with xr.load_dataset(source) as data:
+        metadata = labelled_series(data).metadata
+    assert (metadata.file, metadata.digest) == (None, None)

@@ -82,13 +82,14 @@ def _open(
     """The series of the data: of several variables, the one that the container has the name of."""
     from fhash_codec.volume import open as open_volume
     from fhash_formats.readers.common.variables import SeveralVariablesError
+    from fhash_formats.source_metadata import meant
 
     try:
         return source.open(data, progress)
     except SeveralVariablesError as error:
         with open_volume(run) as volume:
             name = volume.name
-        alike = [full for full in error.names if f"/{full}".endswith((f"/{name}", f".{name}"))]
+        alike = meant(name, error.names)
         if len(alike) != 1:
             raise
         return dataclasses.replace(source, var=alike[0]).open(data, progress)

@@ -34,6 +34,7 @@ from fhash_formats.container.zip_checked import (
 )
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.series import Coordinate
+from fhash_formats.source_metadata import meant
 
 CACHE_BYTES = 256 << 20
 """Bytes of decoded chunks that an open container keeps."""
@@ -261,9 +262,11 @@ class Container:
                 f"{self.path} holds several variables, {listed}; choose one, such as"
                 f" --var {names[0]} (in Python: variable={names[0]!r})"
             )
-        if variable is not None and variable not in names:
-            raise InputError(f"{self.path} has no variable {variable[:80]!r}; it holds {listed}")
-        return self.variables[variable or names[0]].closing_file() if self.variables else self
+        found = names if variable is None else meant(variable, names)
+        if variable is not None and len(found) != 1:
+            several = f"{len(found)} variables named" if found else "no variable"
+            raise InputError(f"{self.path} has {several} {variable[:80]!r}; it holds {listed}")
+        return self.variables[found[0]].closing_file() if self.variables else self
 
     def close(self) -> None:
         """Release the file and the cache."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +25,32 @@ from fhash_formats.readers.common.hdf5_tree import (
     packing_of,
     require_filters,
     require_sources,
+    texts_of,
     units_of,
     variables,
 )
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside
-from fhash_formats.readers.common.real_time import counts_steps
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
-from fhash_formats.series import Coordinate
+from fhash_formats.readers.common.times import counts_steps, written_times
+from fhash_formats.readers.common.variables import (
+    Variable,
+    choose,
+    parent,
+    plain_name,
+    series_like,
+)
+from fhash_formats.series import AXIS_NAMES, Coordinate
+from fhash_formats.source_metadata import shown_name
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -85,9 +101,16 @@ class Hdf5File:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the file says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         if variable.members:
             steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self.dimensions(variable.members[0])]
+            return [steps, *self._stated(variable.members[0])]
         dataset = variable.handle
         stated = openpmd.axes(self._attributes(parent(variable.name)), dataset.attrs, dataset.shape)
         return [
@@ -146,6 +169,11 @@ class Hdf5File:
             tied.remove("t")  # a time beside the numbers of steps comes first
         named = beside(self.source, layout.axes, layout.shape, places, certain=certain, tied=tied)
         coords = layout.coordinates(self.source, fitting) | named
+        if "t" in layout.axes and ("t" not in coords or not coords["t"].attributes):
+            length = layout.shape[layout.axes.index("t")]
+            texts = [text for place in (group, "") for text in texts_of(self.tree, place, length)]
+            written = written_times("time", texts)
+            coords |= {} if written is None else {"t": written}
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
             step_groups.require_positions(
@@ -190,15 +218,17 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     first = (variable.members or (variable,))[0]
     chunks = first.handle.chunks
     trailing = first.shape[first.handle.ndim :]
+    coords = found.coordinates(variable, layout)
+    names = {*AXIS_NAMES.values()} | {each.name for each in coords.values()}
     return FileSeries(
         source=source,
-        name=plain_name(variable.name),
+        name=plain_name(shown_name(variable.name, names)),
         shape=layout.shape,
         dtype=variable.dtype if packed is None else packed.dtype,
         axes=layout.axes,
         fetch=layout.fetch(found.reading(variable)),
         stamp=stamp,
-        coords=found.coordinates(variable, layout),
+        coords=coords,
         attributes=json_attributes(
             variable.handle.attrs,
             # counts have not the unit of the values

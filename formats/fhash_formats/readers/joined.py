@@ -20,7 +20,7 @@ from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.failures import FolderStamp, Stamp
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.joined_surroundings import joined_metadata
-from fhash_formats.readers.common.times import join_times
+from fhash_formats.readers.common.times import is_numbered, join_times
 from fhash_formats.series import Coordinate, Series, index_coordinate
 from fhash_formats.source_metadata import SourceMetadata
 
@@ -87,6 +87,7 @@ class JoinedSeries(Series):
         self._current: tuple[int, FileSeries] | None = None
         self._parts: list[_Part] = []
         names: list[str] = []
+        counted = True
         files: list[Path] = []
         first: Series | None = None
         for path in paths:
@@ -98,6 +99,8 @@ class JoinedSeries(Series):
                     _Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time)
                 )
                 names.append(part.name)
+                self.remark = self.remark or part.remark
+                counted = counted and not is_numbered(part.remark)
                 files += part.files
         assert first is not None
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
@@ -107,7 +110,7 @@ class JoinedSeries(Series):
         self.occurring = self._met
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
-        self.coords = {**first.coords, "t": times or self._times()}
+        self.coords = {**first.coords, "t": times or self._times(counted)}
         self.metadata = self._joined_metadata
 
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -156,9 +159,10 @@ class JoinedSeries(Series):
 
         return joined_metadata(self.source, each(), self.coords["t"])
 
-    def _times(self) -> Coordinate:
+    def _times(self, counted: bool) -> Coordinate:
+        """The times of all files; the numbers of the steps unless all files count theirs."""
         times = [(part.path, part.time) for part in self._parts if part.time is not None]
-        if not times:
+        if not times or not counted:
             return index_coordinate("t", self.shape[0])
         for part in self._parts:
             if part.time is None:

@@ -10,14 +10,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fhash_formats.readers.common import step_groups
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.netcdf_store import (
     CLASSIC,
@@ -32,13 +42,19 @@ from fhash_formats.readers.common.netcdf_store import (
 )
 from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose
+from fhash_formats.readers.common.times import (
+    MAX_LETTERS,
+    only_counts,
+    real_time,
+    written_times,
+)
+from fhash_formats.readers.common.variables import Variable, choose, plain_name, series_like
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
-from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
+from fhash_formats.source_metadata import shown_name
+from fhash_formats.support.attributes import STORED, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -115,6 +131,13 @@ class NetcdfFile:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the file says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         scope = self.scope(variable)
         found = []
         for name, length in zip(*_named_lengths(self.array(variable)), strict=True):
@@ -234,7 +257,7 @@ def _series(
     layout = arrange(source, variable.name, found.dimensions(variable), request)
     array = found.array(variable)
     packed = declared(source, array)
-    without = PLUMBING | PACKING
+    without = STORED
     if request.raw_values:
         stored = open_groups(source, path, magic_of(path), raw=True)
         opened = [groups, stored]
@@ -252,9 +275,11 @@ def _series(
 
     try:
         chunks = array.encoding.get("chunksizes")
+        # without names, dimensions have those of the axes
+        names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
         series = FileSeries(
             source=source,
-            name=variable.handle[1],
+            name=plain_name(shown_name(variable.name, names)),
             shape=layout.shape,
             dtype=array.dtype,
             axes=layout.axes,
@@ -270,7 +295,6 @@ def _series(
         close()
         raise
     if not variable.members and not any(str(name).startswith(MADE_UP) for name in array.dims):
-        used = [coordinate.name for coordinate in series.coords.values()]
         scope = _upwards(variable.handle[0])
         series.metadata = netcdf_metadata(
             path,
@@ -278,7 +302,7 @@ def _series(
             scope,
             layout,
             request,
-            used,
+            series.coords,
             packed,
             without if request.raw_values else (),
         )
@@ -325,6 +349,20 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
                 )
                 if kind == rank and array.dims == (dimension,) and usable(array.dtype):
                     yield str(key), array
+
+
+def _texts(
+    dimension: str, length: int, scope: Sequence[xr.Dataset]
+) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+    """Variables of texts along one dimension, or of letters: name, texts and attributes."""
+    for dataset in scope:
+        for name, array in dataset.variables.items():
+            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
+            texts = array.ndim == 1 and array.dtype.kind in "SUO"
+            if (letters or texts) and array.dims[0] == dimension and len(array) == length:
+                found = array.to_numpy()
+                rows = [b"".join(row) for row in found.tolist()] if letters else found
+                yield str(name), np.asarray(rows), array.attrs
 
 
 def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
@@ -380,6 +418,11 @@ def _coordinates(
         roles = (each for each in others if role_of_coordinate(each.name, each.attributes) == axis)
         found = real_time(named, others) if axis == "t" else named
         found = found or next(roles, None)
+        if axis == "t" and (found is None or only_counts(found)):
+            written = written_times(dimension, _texts(dimension, length, scope))
+            if written is not None:
+                coords[axis] = written
+                continue
         if found is not None:
             coords[axis] = coordinate(source, found.name, found.read(), found.attributes)
     for key, scalar in values.coords.items():

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fhash_formats.errors import FhashError, InputError, MissingInputError
+from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
 from fhash_formats.readers import (
     hdf5,
     metaimage,
@@ -176,6 +177,8 @@ def open_series(
         keep_extremes=keep_extremes,
     )
     series = open_whole(path, request)
+    if series.remark:
+        warnings.warn(f"{path}: {series.remark}", FhashWarning, stacklevel=2)
     if steps is None:
         return series
     try:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,13 +19,31 @@ from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import sibling
-from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    shared_roles,
+    with_roles,
+)
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
+from fhash_formats.readers.common.times import (
+    MAX_LETTERS,
+    only_counts,
+    real_time,
+    written_times,
+)
+from fhash_formats.readers.common.variables import (
+    Variable,
+    choose,
+    parent,
+    plain_name,
+    series_like,
+)
 from fhash_formats.readers.common.zarr_nodes import (
     METADATA,
     metadata_of,
@@ -34,7 +53,8 @@ from fhash_formats.readers.common.zarr_nodes import (
 )
 from fhash_formats.readers.common.zarr_surroundings import dimension_names, zarr_metadata
 from fhash_formats.series import Coordinate
-from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
+from fhash_formats.source_metadata import shown_name
+from fhash_formats.support.attributes import PACKING, PLUMBING, STORED, json_attributes
 
 if TYPE_CHECKING:
     import zarr
@@ -125,9 +145,16 @@ class ZarrTree:
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the store says about each."""
+        return with_roles(self._stated(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._stated, series_like(self.variables)))
+
+    def _stated(self, variable: Variable) -> list[Dimension]:
         if variable.members:
             steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self.dimensions(variable.members[0])]
+            return [steps, *self._stated(variable.members[0])]
         path, array = variable.handle
         columns = self._places(path)
         stored = zip(dimension_names(array), array.shape, strict=True)
@@ -181,6 +208,11 @@ class ZarrTree:
                 if column is not None and column.numeric and column.length == dimension.length
             },
         )
+        time, dimension = found.get("t"), dict(named).get("t")
+        if dimension is not None and (time is None or not time.numeric or only_counts(time)):
+            texts = self._texts(variable.handle[0], str(dimension.name), dimension.length)
+            written = written_times(str(dimension.name), texts)
+            coords |= {} if written is None else {"t": written}
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
             step_groups.require_positions(self.source, variable, layout, coords, self._own_columns)
@@ -190,6 +222,19 @@ class ZarrTree:
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]
+
+    def _texts(
+        self, path: str, dimension: str, length: int
+    ) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+        """Arrays of texts along one dimension, or of letters: name, texts and attributes."""
+        for name, array in self.arrays.items():
+            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
+            texts = array.ndim == 1 and array.dtype.kind in "SUTO"
+            near = parent(name) in (parent(path), "") and (letters or texts)
+            if near and dimension_names(array)[0] == dimension and array.shape[0] == length:
+                found = np.asarray(array[...])
+                rows = [b"".join(row) for row in found.tolist()] if letters else found
+                yield name, np.asarray(rows), dict(array.attrs)
 
     def _own_columns(self, group: str) -> dict[str, Column]:
         columns = _columns(self.source, self.arrays, group)
@@ -235,10 +280,12 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     chunks = (*((1,) if variable.members else ()), *array.chunks)
     trailing = variable.shape[len(chunks) :]
     # counts have not the unit of the values
-    without = PLUMBING | PACKING | ({"units"} if scaled else frozenset())
+    without = STORED | ({"units"} if scaled else frozenset())
+    # without names, dimensions have those of the axes
+    names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
     series = FileSeries(
         source=found.source,
-        name=plain_name(variable.name),
+        name=plain_name(shown_name(variable.name, names)),
         shape=layout.shape,
         dtype=variable.dtype if packed is None else packed.dtype,
         axes=layout.axes,
@@ -254,7 +301,6 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         packing=packed,
     )
     if not variable.members and not variable.field:
-        used = [coordinate.name for coordinate in series.coords.values()]
         series.metadata = zarr_metadata(
             root,
             path,
@@ -262,7 +308,7 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
             found.groups,
             layout,
             request,
-            used,
+            series.coords,
             packed,
             without if request.raw_values else (),
         )

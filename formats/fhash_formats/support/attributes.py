@@ -7,7 +7,15 @@ from typing import Any
 
 from fhash_formats.support.plain_json import UnknownValueError, attribute_json, plain_text
 
-__all__ = ["PACKING", "PLUMBING", "REFERENCES", "json_attributes", "plain_text", "text_of"]
+__all__ = [
+    "PACKING",
+    "PLUMBING",
+    "REFERENCES",
+    "STORED",
+    "json_attributes",
+    "plain_text",
+    "text_of",
+]
 
 STORAGE_NAMES = """CLASS NAME DIMENSION_LIST REFERENCE_LIST DIMENSION_LABELS _ARRAY_DIMENSIONS
 _Netcdf4Dimid _Netcdf4Coordinates _NCProperties _nc3_strict"""
@@ -24,9 +32,14 @@ from readers that obey it.
 """
 
 REFERENCE_NAMES = """coordinates grid_mapping bounds climatology cell_measures
-ancillary_variables formula_terms compress geometry"""
+ancillary_variables formula_terms compress geometry node_coordinates node_count
+part_node_count interior_ring"""
 REFERENCES = frozenset(REFERENCE_NAMES.split())
 """Attributes that name other variables of the same file."""
+
+
+STORED = PLUMBING | PACKING | REFERENCES
+"""Attributes that tell of a stored array and of its file, and not of its values."""
 
 
 def json_attributes(

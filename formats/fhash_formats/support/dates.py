@@ -2,7 +2,8 @@
 
 Source: CF 1.11, section 4.4. Days are counted from 0000-03-01 of the proleptic Gregorian calendar,
 or from year 0 of the calendars of models; times of a day are whole nanoseconds. Years are numbered
-as astronomers do, with a year 0. Units of changing length (months, years) name no date.
+as astronomers do, with a year 0. Times in units of changing length (months, years) are counted anew
+in days, as months of their calendar.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ UNIT_NAMES = {
 UNITS = {name: length for length, names in UNIT_NAMES.items() for name in names.split()}
 """Nanoseconds of each unit of time."""
 
+MONTH_UNITS = {"month": 1, "months": 1, "year": 12, "years": 12, "yr": 12, "yrs": 12}
+"""Months of each unit of changing length."""
+
 CALENDARS = {
     "standard": "standard",
     "gregorian": "standard",
@@ -46,6 +50,7 @@ CALENDARS = {
     "all_leap": "all_leap",
     "366_day": "all_leap",
     "360_day": "360_day",
+    "360": "360_day",
 }
 """The usual name of each calendar that has dates."""
 
@@ -63,6 +68,14 @@ MARCH_OF_YEAR_0_JULIAN = 1_721_118
 
 LARGEST_YEAR = 10**6
 """Years beyond it are no dates."""
+
+SINCE = re.compile(r"\s*(\S+)\s+since\s+(\S.*?)\s*", re.IGNORECASE)
+"""Units of a time that is counted since something."""
+
+WRITTEN = re.compile(
+    r"(\d{4})[-/.]?(\d\d)[-/.]?(\d\d)(?:[-_T ]*(\d\d):?(\d\d)?:?(\d\d(?:\.\d+)?)?)?Z?"
+)
+"""A date as models write it: 2018-10-15_03:00:00, 20181015, 2018/10/15 03:00."""
 
 DATE = re.compile(
     r"(?P<year>[+-]?\d{1,6})-(?P<month>\d{1,2})(?:-(?P<day>\d{1,2}))?"
@@ -140,6 +153,76 @@ def clock(attributes: Mapping[str, Any]) -> Clock | None:
     except InputError:
         return None
     return Clock(unit=unit, epoch=epoch, calendar=calendar)
+
+
+def in_days(
+    values: Sequence[float], attributes: Mapping[str, Any]
+) -> tuple[list[float], dict[str, str]] | None:
+    """Finite times in days since their date, and the units and the calendar of these.
+
+    A whole month or year leads to the same day of a later month, or to its last day; a fraction is
+    a share of the month in which it lies. None where the units and the calendar name no date.
+    """
+    match = SINCE.fullmatch(str(attributes.get("units", "")))
+    calendar = CALENDARS.get(str(attributes.get("calendar") or "standard").strip().lower())
+    known, months = clock(attributes), None if match is None else MONTH_UNITS.get(match[1].lower())
+    try:
+        if known is not None:
+            days = Clock(unit=DAY, epoch=known.epoch, calendar=known.calendar)
+            exact = [known.instant(value) for value in values]
+        elif match is not None and months is not None and calendar is not None:
+            days = Clock(unit=DAY, epoch=instants(match[2], calendar)[0], calendar=calendar)
+            exact = [_months_later(days, Fraction(value) * months) for value in values]
+        else:
+            return None
+    except InputError:
+        return None
+    units = f"days since {date_text(days.epoch, days.calendar).replace('T', ' ')}"
+    return [days.value(each) for each in exact], {"units": units, "calendar": days.calendar}
+
+
+def _months_later(start: Clock, months: Fraction) -> Fraction:
+    """The instant some months after the date of a clock; raises InputError beyond LARGEST_YEAR."""
+    if abs(months) > 12 * LARGEST_YEAR:
+        raise InputError("years of more than six digits are no dates")
+    whole = math.floor(months)
+    day, rest = divmod(start.epoch, DAY)
+    year, month, number = date_of_day(day, start.calendar)
+    ends = []
+    for later in (whole, whole + 1):
+        then_year, then_month = divmod(12 * year + month - 1 + later, 12)
+        last = days_of_month(then_year, then_month + 1, start.calendar)
+        at = day_number(then_year, then_month + 1, min(number, last), start.calendar)
+        ends.append(at * DAY + rest)
+    return ends[0] + (months - whole) * (ends[1] - ends[0])
+
+
+def of_texts(texts: Sequence[str], calendar: str) -> tuple[list[float], dict[str, str]] | None:
+    """Times that are written as dates, counted since the first, with their units and calendar.
+
+    The unit is the longest of day, hour, minute and second that counts all in whole numbers. None
+    where some text is no date of the calendar.
+    """
+    exact = []
+    for text in texts:
+        match = WRITTEN.fullmatch(text.strip())
+        if match is not None:
+            year, month, day, *of_day = match.groups()
+            hour, minute, second = (part or "00" for part in of_day)
+            text = f"{year}-{month}-{day}T{hour}:{minute}:{second}"
+        try:
+            exact.append(instants(text, calendar)[0])
+        except InputError:
+            return None
+    if not exact:
+        return None
+    names = ("days", "hours", "minutes", "seconds")[len(exact) == 1 :]  # files of a step an hour
+    usable = ((UNITS[name], name) for name in names)
+    whole = (pair for pair in usable if not any((each - exact[0]) % pair[0] for each in exact))
+    unit, name = next(whole, (SECOND, "seconds"))
+    counted = Clock(unit=unit, epoch=exact[0], calendar=calendar)
+    units = f"{name} since {date_text(exact[0], calendar).replace('T', ' ')}"
+    return [counted.value(each) for each in exact], {"units": units, "calendar": calendar}
 
 
 def instants(text: str, calendar: str) -> tuple[int, int]:

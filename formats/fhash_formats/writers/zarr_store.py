@@ -71,9 +71,10 @@ def consolidate(store: Any) -> None:
     """Write the metadata of all arrays into those of the root, where xarray looks for them."""
     import zarr
 
-    # that this is not yet in Zarr's specification; xarray warns where it is not there
+    # that this and types of texts are not yet in Zarr's specification; xarray warns where it is not
+    # there
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        warnings.simplefilter("ignore")
         zarr.consolidate_metadata(store)
 
 

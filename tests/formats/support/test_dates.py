@@ -5,9 +5,13 @@ from __future__ import annotations
 import datetime
 import itertools
 import random
+import re
 from fractions import Fraction
 
+import cftime
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fhash_formats.errors import InputError
 from fhash_formats.support.dates import (
@@ -18,7 +22,10 @@ from fhash_formats.support.dates import (
     date_of_day,
     date_text,
     day_number,
+    days_of_month,
+    in_days,
     instants,
+    of_texts,
 )
 
 USUAL = sorted(set(CALENDARS.values()))
@@ -180,3 +187,77 @@ def test_texts_are_read_back() -> None:
         for grain in (1, 10**3, 10**9, 60 * 10**9, DAY):
             instant = choose.randrange(2_400_000 * DAY // grain) * grain + 1_700_000 * DAY
             assert instants(date_text(instant, calendar), calendar)[0] == instant
+
+
+@pytest.mark.parametrize("calendar", ["standard", "noleap", "all_leap", "julian", "360_day"])
+@pytest.mark.parametrize(("unit", "months"), [("months", 1), ("years", 12)])
+def test_months_and_years_are_those_of_the_calendar(calendar: str, unit: str, months: int) -> None:
+    attributes = {"units": f"{unit} since 1999-11-30 06:00", "calendar": calendar}
+    found = in_days([-13.0, 0.0, 3.0, 14.5], attributes)
+    assert found is not None
+    days, told = found
+
+    def instant(later: int) -> cftime.datetime:
+        year, month = divmod(12 * 1999 + 10 + later, 12)
+        last = days_of_month(year, month + 1, calendar)
+        return cftime.datetime(year, month + 1, min(30, last), 6, calendar=calendar)
+
+    def counted(later: int) -> float:
+        return float(cftime.date2num(instant(later), told["units"], told["calendar"]))
+
+    assert days[:3] == [counted(months * value) for value in (-13, 0, 3)]
+    if months == 1:
+        assert days[3] == pytest.approx((counted(14) + counted(15)) / 2, rel=1e-15)
+    else:
+        assert days[3] == counted(12 * 14 + 6)
+
+
+@given(st.floats(-500, 500), st.integers(1, 28))
+def test_months_of_30_days_are_those_of_cftime(value: float, day: int) -> None:
+    units = f"months since 1960-01-{day:02}"
+    found = in_days([value], {"units": units, "calendar": "360"})
+    assert found is not None
+    there = cftime.num2date(value, units, "360_day")
+    here = cftime.num2date(found[0][0], found[1]["units"], found[1]["calendar"])
+    assert abs((here - there).total_seconds()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {"units": "months since the start"},
+        {"units": "months since 2000-01-01", "calendar": "none"},
+        {"units": "months"},
+        {"units": "fortnights since 2000-01-01"},
+        {"units": "years since 999999-01-01"},
+    ],
+)
+def test_what_names_no_date_is_not_counted_anew(attributes: dict[str, str]) -> None:
+    assert in_days([1e7], attributes) is None
+
+
+@pytest.mark.parametrize(
+    ("texts", "values", "units"),
+    [
+        (["2018-10-15_00:00:00", "2018-10-15_03:00:00"], [0, 3], "hours since 2018-10-15"),
+        (["20200101", "20200301"], [0, 60], "days since 2020-01-01"),
+        (
+            ["2020-01-01T00:00:30Z", "2020-01-01 00:01"],
+            [0, 30],
+            "seconds since 2020-01-01 00:00:30",
+        ),
+        (["2020/01/01 06:00", "2020/01/01 06:20"], [0, 20], "minutes since 2020-01-01 06:00"),
+    ],
+)
+def test_written_dates_are_counted(texts: list[str], values: list[float], units: str) -> None:
+    found = of_texts(texts, "standard")
+    assert found == (values, {"units": units, "calendar": "standard"})
+    parsed = cftime.num2date(values, units, "standard")
+    assert [each.strftime("%Y%m%d") for each in parsed] == [
+        "".join(re.findall(r"\d", text))[:8] for text in texts
+    ]
+
+
+@pytest.mark.parametrize("texts", [["2018-02-30"], ["JJA", "SON"], ["2018-10-15", ""], []])
+def test_other_texts_are_no_dates(texts: list[str]) -> None:
+    assert of_texts(texts, "standard") is None

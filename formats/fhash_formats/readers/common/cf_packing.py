@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.series import Series
 from fhash_formats.support.attributes import text_of
 
 SCALING = frozenset(("scale_factor", "add_offset"))
@@ -101,6 +102,17 @@ def packing(
         _number(source, "add_offset", offset),
         _scaled_type(stored, scale, offset),
     )
+
+
+def note_packing(series: Series, packed: Packing) -> None:
+    """Tell a series what stood for missing values in its source, and its integer type there."""
+    if packed.fills and not packed.scaled and series.fill is None:
+        series.fill = packed.fills[0].item()
+    if packed.scaled and packed.stored.kind == "i" and packed.stored.itemsize > 1:
+        lowest = np.iinfo(packed.stored).min + np.arange(3, dtype=packed.stored)
+        series.unlikely = frozenset(packed.unpack(lowest).tolist())
+    if packed.integers:
+        series.source_dtype = packed.stored
 
 
 def missing_values(source: str, dtype: np.dtype[Any], values: Sequence[float]) -> Packing:

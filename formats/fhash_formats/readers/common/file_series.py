@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf_packing import Packing, missing_values
+from fhash_formats.readers.common.cf_packing import Packing, missing_values, note_packing
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.times import settled
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 from fhash_formats.support.attributes import plain_text
 
@@ -80,11 +81,14 @@ class FileSeries(Series):
         self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
-        self.given = frozenset(coords or {})
+        coords = dict(coords or {})
+        if "t" in coords:
+            coords["t"], self.remark = settled(coords["t"])
+        self.given = frozenset(coords)
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | dict(coords or {})
+        } | coords
         self._axes, self._fetch, self._close = tuple(axes), fetch, close
         self._quick = (stamp, *map(Stamp.of, beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (
@@ -100,7 +104,7 @@ class FileSeries(Series):
         self._met: set[float] = set()
         self.occurring = self._met
         if packing is not None:
-            self._note_fills(packing)
+            note_packing(self, packing)
 
     def hide(self, missing: Sequence[float]) -> None:
         """Make some values missing: they become NaN, and integers become floats.
@@ -112,7 +116,7 @@ class FileSeries(Series):
             for value in missing:
                 for fill in missing_values(self.source, self.dtype, [value]).fills:
                     self._sought[value] = fill
-            self._note_fills(self._missing)
+            note_packing(self, self._missing)
             self.dtype = self._missing.dtype
 
     def as_asked(self, request: Request) -> Self:
@@ -120,15 +124,6 @@ class FileSeries(Series):
         self.hide(request.missing)
         self.keep_extremes = request.keep_extremes
         return self
-
-    def _note_fills(self, packing: Packing) -> None:
-        if packing.fills and not packing.scaled and self.fill is None:
-            self.fill = packing.fills[0].item()
-        if packing.scaled and packing.stored.kind == "i" and packing.stored.itemsize > 1:
-            lowest = np.iinfo(packing.stored).min + np.arange(3, dtype=packing.stored)
-            self.unlikely = frozenset(packing.unpack(lowest).tolist())
-        if packing.integers:
-            self.source_dtype = packing.stored
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)

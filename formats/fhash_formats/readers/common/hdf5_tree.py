@@ -12,6 +12,7 @@ import numpy as np
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.positions import Column, usable
+from fhash_formats.readers.common.roles import NAMES
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
@@ -123,6 +124,20 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
         ):
             coordinates[name.lower()] = column(path, dataset)
     return coordinates
+
+
+def texts_of(
+    tree: Mapping[str, Any], group: str, length: int
+) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+    """Datasets of so many texts directly in a group, with a name of times: path, texts, attributes.
+
+    Names are those of `roles.NAMES`.
+    """
+    for path, dataset in tree.items():
+        place, _, name = path.rpartition("/")
+        told = place == group and name.lower() in NAMES["t"].split()
+        if told and dataset.shape == (length,) and dataset.dtype.kind in "SO":
+            yield path, dataset[()], json_attributes(dataset.attrs)
 
 
 def column(path: str, dataset: Any) -> Column:

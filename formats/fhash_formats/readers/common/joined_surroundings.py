@@ -7,7 +7,6 @@ and one warning names it.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.errors import FhashWarning
+from fhash_formats.readers.common.surroundings import warn_left_out
 from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import (
     SourceMetadata,
@@ -23,6 +22,7 @@ from fhash_formats.source_metadata import (
     is_plain_name,
     without_names,
 )
+from fhash_formats.support.attributes import PACKING
 from fhash_formats.support.typed_values import typed_attribute
 
 __all__ = ["joined_metadata"]
@@ -48,13 +48,7 @@ def joined_metadata(
     if collected is None:
         return None
     metadata = collected.result(Path(source).name)
-    if collected.left_out:
-        told = ", ".join(f"{name} ({why})" for name, why in collected.left_out.items())
-        warnings.warn(
-            f"{source}: not everything beside the values is kept: {told}",
-            FhashWarning,
-            stacklevel=2,
-        )
+    warn_left_out(f"{source}: not everything beside the values is kept", collected.left_out)
     return metadata
 
 
@@ -66,6 +60,7 @@ class _Joined:
         self._first, self._time = first, time
         self._along = first.along("t")
         self._attributes = dict(first.attributes)
+        self._own, self._stored = dict(first.variable_attributes), first.stored
         self._pieces = {each.name: [each] for each in first.variables}
 
     def add(self, part: SourceMetadata) -> None:
@@ -76,6 +71,7 @@ class _Joined:
             if name != "history" and not _same_attribute(value, part.attributes.get(name)):
                 del self._attributes[name]
                 self.left_out[f":{name}"] = DIFFERS
+        self._add_own(part)
         for name, pieces in list(self._pieces.items()):
             other = part.named(name)
             if other is None or not self._fits(pieces[0], other):
@@ -83,6 +79,21 @@ class _Joined:
                 self.left_out[name] = DIFFERS
             elif self._has_time(other):
                 pieces.append(other)
+
+    def _add_own(self, part: SourceMetadata) -> None:
+        """Keep the attributes of the variable that the next file has, too; a packing as a whole."""
+        there = part.variable_attributes
+        for name in [*self._own, *sorted(PACKING & (there.keys() - self._own.keys()))]:
+            if not _same_attribute(self._own.get(name), there.get(name)):
+                self._own.pop(name, None)
+                self.left_out[name] = DIFFERS
+        if PACKING & self.left_out.keys():
+            for name in sorted(PACKING & self._own.keys()):
+                del self._own[name]
+                self.left_out[name] = f"of a packing that {DIFFERS}"
+            self._stored = None
+        elif part.stored != self._stored:
+            self._stored = None
 
     def result(self, file: str) -> SourceMetadata:
         """The metadata of all files."""
@@ -106,7 +117,8 @@ class _Joined:
             self._first,
             dimensions=dimensions,
             variables=tuple(variables),
-            variable_attributes=without_names(self._first.variable_attributes, gone),
+            variable_attributes=without_names(self._own, gone),
+            stored=self._stored,
             attributes=self._attributes,
             file=file,
             digest=None,
@@ -116,7 +128,8 @@ class _Joined:
         """The times of all steps, in the type of the first file where that holds them."""
         first = self._first.named(self._time.name)
         values: Any = self._time.values
-        if first is None:
+        if first is None or first.attributes.get("units") != self._time.attributes.get("units"):
+            # the numbers of the steps stand for times, as some file has none
             return SourceVariable(
                 name=dimension,
                 dimensions=(dimension,),

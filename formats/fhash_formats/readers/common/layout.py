@@ -8,8 +8,8 @@ user by `--axes`; where two readings are likely, the user is asked.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,44 @@ class Dimension:
     def further(self) -> bool:
         """Whether its name says that it is no axis of space or time."""
         return self.role is None and (self.name or "").lower() in FURTHER
+
+
+def shared_roles(arrays: Iterable[Sequence[Dimension]]) -> dict[str, str]:
+    """The axis of each named dimension of a file that only its place in an array tells.
+
+    A dimension has one role in a file: what it is in an array of four axes, it is in one of three.
+
+    arrays: dimensions of all arrays of the file that hold data.
+    """
+    found: dict[str, str] = {}
+    for each in arrays:
+        dimensions = with_roles(each, found)
+        picked = single(dimensions, {})
+        kept = [one for place, one in enumerate(dimensions) if place not in picked]
+        if len(kept) != len(AXES) or any(one.further for one in kept):
+            continue
+        if all(one.role for one in kept) or is_asked(dimensions, picked, selected=False):
+            continue
+        try:
+            axes = assign_axes(
+                "", [n.length for n in kept], [n.role for n in kept], [n.name for n in kept], None
+            )
+        except InputError:  # of this array; it is said where the array is wanted
+            continue
+        for one, axis in zip(kept, axes, strict=True):
+            if one.role is None and one.name:
+                found[one.name] = axis
+    return found
+
+
+def with_roles(dimensions: Sequence[Dimension], roles: Mapping[str, str]) -> list[Dimension]:
+    """The dimensions, each without a role with that of its name. roles: see `shared_roles`."""
+    return [
+        replace(one, role=roles[one.name])
+        if one.role is None and one.name is not None and one.name in roles
+        else one
+        for one in dimensions
+    ]
 
 
 def label(place: int, dimension: Dimension) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +23,9 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
-    kept_dimensions,
-    other_type,
-    surroundings,
-    with_attributes,
+    metadata_of,
 )
+from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import SourceMetadata
 
 if TYPE_CHECKING:
@@ -42,14 +40,14 @@ def netcdf_metadata(
     groups: Collection[str],
     layout: Layout,
     request: Request,
-    used: Collection[str],
+    coords: Mapping[str, Coordinate],
     packed: Packing | None,
     without: Collection[str],
 ) -> Callable[[], SourceMetadata]:
     """A function that reads what belongs to a variable.
 
     handle: group and name of the variable. groups: its own group and those around it, the nearest
-        first. used: names of the variables that gave the positions. packed: how the values are
+        first. coords: positions of the axes. packed: how the values are
         packed; None where they are read as they are stored. without: attributes that do not hold
         for the values.
     """
@@ -66,22 +64,14 @@ def netcdf_metadata(
                     for dataset in reversed(scope)
                     for name, array in dataset.variables.items()
                 }
-                name = handle[1]
-                own = variables[name]
-                variables[name] = with_attributes(own, layout.attributes())
-                kept, picked = kept_dimensions(source, name, layout, own.dimensions, request.select)
+                used = [each.name for each in coords.values()]
                 wanted = Wanted(
-                    source=source,
-                    name=name,
-                    dimensions=kept,
-                    picked=picked,
-                    used=used,
-                    without=without,
-                    stored=None if packed is None else other_type(packed),
-                    path=path,
-                    digested=request.digested,
+                    source=source, name=handle[1], used=used, without=without, path=path
                 )
-                return surroundings(wanted, variables, scope[0].attrs)
+                attributes = scope[0].attrs
+                return metadata_of(
+                    handle[1], variables, attributes, layout, request, wanted, packed, coords["t"]
+                )
             finally:
                 close_groups(opened)
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.roles import NAMES
+from fhash_formats.readers.common.times import real_time
 from fhash_formats.series import AXES, Coordinate
-from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.attributes import STORED, json_attributes
 
 TIME_UNITS = {
     "D": "days",
@@ -76,7 +76,7 @@ def coordinate(
     return Coordinate(
         name=name.rsplit("/", 1)[-1],
         values=numbers,
-        attributes={**json_attributes(attributes), **extra},
+        attributes={**json_attributes(attributes, without=STORED), **extra},
     )
 
 

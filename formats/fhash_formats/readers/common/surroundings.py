@@ -1,8 +1,8 @@
 """All that belongs to a variable in its source: found by the CF conventions, read, and bounded.
 
 A variable names its surroundings by attributes: `coordinates`, `grid_mapping`, `bounds` of these,
-`formula_terms` and so on (CF 1.11, sections 4, 5, 7 and appendix A). What is too large, or a field
-of its own, is left out, and one warning names it.
+`formula_terms` and so on (CF 1.11, sections 4, 5, 7 and appendix A). What is small beside it is
+kept, too. What is too large, or a field of its own, is left out, and one warning names it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,10 @@ from fhash_formats.errors import FhashWarning
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.layout import Layout, picks
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.times import with_times
+from fhash_formats.readers.common.variables import MIN_DIMENSIONS
+from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import (
     COORDINATES,
     NO_AXIS,
@@ -41,9 +45,9 @@ __all__ = [
     "Wanted",
     "digest_of",
     "kept_dimensions",
-    "other_type",
+    "metadata_of",
     "surroundings",
-    "with_attributes",
+    "warn_left_out",
 ]
 
 MAX_ONE = 16 << 20
@@ -52,6 +56,14 @@ MAX_ALL = 64 << 20
 """Bytes of all arrays beside the data."""
 MAX_TEXTS = 1 << 14
 """Texts of one array; they stand in the header."""
+MAX_ARRAYS = 512
+"""Number of arrays beside the data; a reader takes twice as many."""
+SMALL = 100
+"""An array of the file is small beside a variable that has more than so many times its bytes."""
+SMALL_BYTES = 1 << 10
+"""Bytes of an array that is small beside any variable."""
+MAX_TOLD = 12
+"""Names in one warning."""
 MAX_ATTRIBUTE = 64 << 10
 """Bytes of one attribute as JSON; those of a file stand in the header, too."""
 DIGEST_BYTES = 256 << 20
@@ -94,8 +106,8 @@ class Wanted:
 
     source: str
     name: str
-    dimensions: Mapping[str, str]
-    picked: Mapping[str, int]
+    dimensions: Mapping[str, str] = field(default_factory=dict)
+    picked: Mapping[str, int] = field(default_factory=dict)
     coordinates: Collection[str] = ()
     used: Collection[str] = ()
     without: Collection[str] = ()
@@ -134,8 +146,17 @@ def surroundings(
     left_out: dict[str, str] = {}
     found = _Collected(wanted, variables, left_out)
     own = variables[wanted.name]
-    for name, is_coordinate in _named(wanted, own, variables, attributes).items():
+    names = _named(wanted, own, variables, attributes)
+    for name, is_coordinate in names.items():
         found.add(name, is_coordinate)
+    limit = max(_size(own.shape, own.dtype), SMALL * SMALL_BYTES)
+    for name, other in variables.items():
+        if name in names or set(own.dimensions) <= set(other.dimensions):
+            continue  # another field can be encoded itself
+        if SMALL * _size(other.shape, other.dtype) < limit:
+            found.add(name, False)
+        elif len(other.shape) < MIN_DIMENSIONS:
+            left_out[name] = "large, and nothing refers to it"
     kept = {key: value for key, value in own.attributes.items() if key not in (*wanted.without, "")}
     of_file = {key: value for key, value in attributes.items() if key != COORDINATES}
     metadata = SourceMetadata(
@@ -149,24 +170,44 @@ def surroundings(
         file=None if wanted.path is None else wanted.path.name,
         digest=digest_of(wanted.path) if wanted.path is not None and wanted.digested else None,
     )
-    if left_out:
-        told = ", ".join(f"{name} ({why})" for name, why in left_out.items())
-        warnings.warn(
-            f"{wanted.source}: not everything beside {wanted.name} is kept: {told}",
-            FhashWarning,
-            stacklevel=2,
-        )
+    warn_left_out(f"{wanted.source}: not everything beside {wanted.name} is kept", left_out)
     return metadata
 
 
-def with_attributes(stored: Stored, attributes: Mapping[str, Any]) -> Stored:
-    """The array with further attributes."""
-    return replace(stored, attributes={**stored.attributes, **attributes})
+def warn_left_out(what: str, left_out: Mapping[str, str]) -> None:
+    """Warn once (FhashWarning) of all that is left out. left_out: the reason by name."""
+    told = [f"{name} ({why})" for name, why in left_out.items()]
+    rest = f" and {len(told) - MAX_TOLD} more" if len(told) > MAX_TOLD else ""
+    if told:
+        warnings.warn(f"{what}: {', '.join(told[:MAX_TOLD])}{rest}", FhashWarning, stacklevel=3)
 
 
-def other_type(packed: Packing) -> str | None:
-    """The stored type where unpacking changes it."""
-    return packed.stored.name if packed.stored != packed.dtype else None
+def metadata_of(
+    name: str,
+    variables: Mapping[str, Stored],
+    attributes: Mapping[str, Any],
+    layout: Layout,
+    request: Request,
+    wanted: Wanted,
+    packed: Packing | None,
+    time: Coordinate,
+) -> SourceMetadata:
+    """All that belongs to a variable as it was arranged; see `surroundings`.
+
+    wanted: without dimensions. packed: how the values are packed; None where they are read as they
+        are stored. time: the times of the steps, which may stand for those of the file.
+    """
+    own = variables[name]
+    kept, picked = kept_dimensions(wanted.source, name, layout, own.dimensions, request.select)
+    wanted = replace(
+        wanted,
+        dimensions=kept,
+        picked=picked,
+        stored=None if packed is None or packed.stored == packed.dtype else packed.stored.name,
+        digested=request.digested,
+    )
+    selected = replace(own, attributes={**own.attributes, **layout.attributes()})
+    return with_times(surroundings(wanted, {**variables, name: selected}, attributes), time)
 
 
 def digest_of(path: Path) -> str | None:
@@ -186,8 +227,9 @@ def _named(
     """Names of all that belongs to a variable, in order, and whether each is a coordinate."""
     names = {name: True for name in own.dimensions}
     names |= dict.fromkeys([*_texts(own.attributes, COORDINATES), *wanted.coordinates], True)
-    for name in _texts(attributes, COORDINATES):
-        # a coordinate that belongs to no variable alone
+    # a coordinate that belongs to no variable alone, or to another one on the same vertices
+    everywhere = [each.attributes for each in variables.values()]
+    for name in (text for each in (attributes, *everywhere) for text in _texts(each, COORDINATES)):
         if name in variables and set(variables[name].dimensions) <= set(own.dimensions):
             names[name] = True
     for name in [*_references(own), *wanted.used]:
@@ -210,7 +252,8 @@ def _texts(attributes: Mapping[str, Any], key: str) -> list[str]:
 
 def _references(stored: Stored) -> list[str]:
     """Names in the attributes of a variable that name others, its coordinates excepted."""
-    return [name for key, name in references(stored.attributes) if key != COORDINATES]
+    found = references(stored.attributes, loosely=True)
+    return [name for key, name in found if key != COORDINATES]
 
 
 class _Collected:
@@ -267,6 +310,8 @@ class _Collected:
         size = _size(shape, stored.dtype)
         if not all(map(is_plain_name, [name, *names])) or len(set(names)) < len(names):
             return "its name or dimensions have no form in all formats"
+        if len(self.variables) == MAX_ARRAYS:
+            return f"more than {MAX_ARRAYS} arrays"
         if 0 in shape or any(self._lengths.get(each, length) != length for each, length in kept):
             return "its dimensions do not fit"
         if stored.dtype.kind not in "iufSUTO" or stored.dtype.itemsize > 1 << 16:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from fhash_formats.errors import InputError
+from fhash_formats.source_metadata import meant
 
 MAX_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
@@ -100,6 +101,11 @@ class Variable:
         return ""
 
 
+def series_like(variables: Iterable[Variable]) -> Iterator[Variable]:
+    """Variables of a file that may be series and hold data."""
+    return (each for each in variables if not each.auxiliary and not each.problem(booleans=True))
+
+
 def choose(
     source: str,
     variables: Sequence[Variable],
@@ -166,11 +172,8 @@ def named(
 
     candidates: variables that a message lists. Raises InputError for no such name, or several.
     """
-    name = var.strip("/")
-    found = [variable for variable in variables if variable.name == name]
-    found = found or [
-        variable for variable in variables if variable.name.endswith((f"/{name}", f".{name}"))
-    ]
+    names = set(meant(var, [variable.name for variable in variables]))
+    found = [variable for variable in variables if variable.name in names]
     if len(found) > 1:
         # a series of steps comes before each of its steps
         found = [variable for variable in found if not variable.auxiliary] or found
@@ -184,7 +187,7 @@ def named(
     nearest = sorted(
         candidates,
         key=lambda variable: (
-            -difflib.SequenceMatcher(None, name.lower(), variable.name.lower()).ratio()
+            -difflib.SequenceMatcher(None, var.lower(), variable.name.lower()).ratio()
         ),
     )
     raise InputError(

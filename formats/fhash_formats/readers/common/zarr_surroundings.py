@@ -20,11 +20,9 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
-    kept_dimensions,
-    other_type,
-    surroundings,
-    with_attributes,
+    metadata_of,
 )
+from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import SourceMetadata
 from fhash_formats.support.attributes import PLUMBING
 
@@ -56,7 +54,7 @@ def zarr_metadata(
     groups: Mapping[str, Mapping[str, Any]],
     layout: Layout,
     request: Request,
-    used: Collection[str],
+    coords: Mapping[str, Coordinate],
     packed: Packing | None,
     without: Collection[str],
 ) -> Callable[[], SourceMetadata | None]:
@@ -75,23 +73,19 @@ def zarr_metadata(
                 for place in dict.fromkeys(["", group])  # those of the nearest place count
                 for each, stored in _stored_in(arrays, place)
             }
-            own = variables.get(name)
-            if own is None or not name:
+            if not name or name not in variables:
                 return None
-            variables[name] = with_attributes(own, layout.attributes())
-            kept, picked = kept_dimensions(source, name, layout, own.dimensions, request.select)
             wanted = Wanted(
                 source=source,
                 name=name,
-                dimensions=kept,
-                picked=picked,
-                used=[each.rpartition("/")[2] for each in used],
+                used=[each.name.rpartition("/")[2] for each in coords.values()],
                 without=without,
-                stored=None if packed is None else other_type(packed),
                 path=root,
-                digested=request.digested,
             )
-            return surroundings(wanted, variables, groups.get(group, {}))
+            attributes = groups.get(group, {})
+            return metadata_of(
+                name, variables, attributes, layout, request, wanted, packed, coords["t"]
+            )
 
     return read
 

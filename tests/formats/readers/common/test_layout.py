@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.layout import Dimension, arrange
+from fhash_formats.readers.common.layout import Dimension, arrange, shared_roles
 from fhash_formats.readers.common.positions import Column
 from fhash_formats.readers.common.request import Request
 
@@ -141,3 +141,20 @@ def test_a_selection_fetches_only_what_is_selected() -> None:
     assert asked == [(slice(0, 1), slice(1, 2), slice(0, 4), slice(0, 5), slice(5, 6))]
     assert layout.chunks((1, 2, 3, 4, 5)) == (1, 3, 4)
     assert layout.attributes() == {"selection": "dim1=1, dim4=5"}
+
+
+@pytest.mark.parametrize(
+    ("arrays", "expected"),
+    [
+        (["run=7 level=5:z lat=20:y lon=24:x", "run=7 lat=20:y lon=24:x"], {"run": "t"}),
+        (["run=7 lat=20:y lon=24:x"], {}),
+        (["a=7 b=5 lat=20:y lon=24:x", "b=5 lat=20:y lon=24:x"], {"a": "t", "b": "z"}),
+        (["a=7 b=5 c=20 d=24", "b=5 a=7 d=24 c=20"], {"a": "t", "b": "z", "c": "y", "d": "x"}),
+        (["member=4 run=7 lat=20:y lon=24:x"], {}),
+        (["one=1 run=7 level=5:z lat=20:y lon=24:x"], {"run": "t"}),
+        (["run=9 a=20 b=24 c=3"], {}),  # the last may be components
+        (["a=9:z run=20:z b=24 c=30"], {}),
+    ],
+)
+def test_a_dimension_has_one_role_in_a_file(arrays: list[str], expected: dict[str, str]) -> None:
+    assert shared_roles(map(dims, arrays)) == expected

@@ -64,14 +64,46 @@ def test_all_that_is_named_is_kept() -> None:
     names = {"coordinates": "lat2d", "grid_mapping": "crs: lat2d", "cell_measures": "area: area"}
     metadata = found(some(units="K", **names, _ARRAY_DIMENSIONS=["time"]))
     kept = {each.name: each.is_coordinate for each in metadata.variables}
-    coordinates = ["time", "lat", "lat2d", "month"]
+    coordinates = ["time", "lat", "lat2d", "month", "height"]
     assert kept == {
         **dict.fromkeys(coordinates, True),
-        **dict.fromkeys(["crs", "area", "time_bnds", "corners"], False),
+        **dict.fromkeys(["crs", "area", "time_bnds", "corners", "other"], False),
     }
     assert metadata.variable_attributes == {"units": "K", **names}
     assert metadata.attributes == {"title": "a"}
     assert metadata.dimensions == DIMENSIONS
+
+
+def test_what_is_small_or_named_in_other_ways_is_kept() -> None:
+    shape = (20, 30, 40)
+    variables = {
+        "u": stored(("time", "lat", "lon"), np.zeros(shape, "f4"), PS_var="ps", units="Times"),
+        "v": stored(("time", "lat", "lon"), np.zeros(shape, "f4")),
+        "lev": stored(("lev",), [1.0], A_var="hyam", B_var="hybm"),
+        "time": stored(("time",), np.arange(20.0), edges="time_edges"),
+        "time_edges": stored(("edge",), np.arange(2000.0)),
+        "ps": stored(("time", "lon"), np.zeros((20, 40)), bounds_variable="no such"),
+        "hyam": stored(("lev",), [0.5]),
+        "hybm": stored(("lev",), [0.5]),
+        "Times": stored(("time", "letters"), np.full((20, 19), b"a")),
+        "orog": stored(("lat", "lon"), np.zeros((30, 40), "f4")),
+        "weights": stored(("many",), np.zeros(5000)),
+        "tall": stored(("time", "many", "lon"), np.zeros((20, 3, 40))),
+    }
+    with pytest.warns(FhashWarning, match=r"kept: orog \(large, .*\), weights \(.*\)$"):
+        metadata = found(variables)
+    kept = {each.name for each in metadata.variables}
+    assert kept == {"time", "time_edges", "ps", "hyam", "hybm", "lev", "Times"}
+
+
+def test_many_small_arrays_are_bounded(monkeypatch) -> None:
+    monkeypatch.setattr(module, "MAX_ARRAYS", 40)
+    many = {f"n{number}": stored((), number) for number in range(100)}
+    with pytest.warns(FhashWarning, match=r"n.. \(more than 40 arrays\).* and 5. more$") as told:
+        metadata = found({**some(coordinates="lat2d"), **many})
+    assert len(metadata.variables) == 40
+    assert len(told) == 1
+    assert metadata.named("corners") is not None
 
 
 def test_a_field_of_its_own_is_named_in_one_warning() -> None:
