@@ -294,8 +294,11 @@ def _attributes(array: Any) -> dict[str, Any]:
 
 
 def _origin(array: Any, beside: Any) -> Path | None:
-    """The file that an array comes from; None for one in memory, which may have been changed."""
-    place = array.encoding.get("source", beside.encoding.get("source"))
+    """The file that an array comes from; None for one in memory or one that was computed.
+
+    Arrays that xarray computes have no encoding, although their dataset keeps its own.
+    """
+    place = array.encoding and array.encoding.get("source", beside.encoding.get("source"))
     if not isinstance(place, str) or array.variable._in_memory or not Path(place).exists():
         return None
     return Path(place)

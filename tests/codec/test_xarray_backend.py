@@ -320,8 +320,10 @@ def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: s
         assert same, name
 
 
-def test_data_in_memory_name_no_file(tmp_path) -> None:
+def test_data_in_memory_or_computed_name_no_file(tmp_path) -> None:
     source = KINDS["packed"]().write(tmp_path / "source.nc")
-    with xr.load_dataset(source) as data:
-        metadata = labelled_series(data).metadata
-    assert (metadata.file, metadata.digest) == (None, None)
+    with xr.open_dataset(source, chunks={}) as lazy:
+        assert labelled_series(lazy).metadata.file == "source.nc"
+        for data in (xr.load_dataset(source), lazy.assign(sst=lazy["sst"] * 2)):
+            metadata = labelled_series(data, "sst").metadata
+            assert (metadata.file, metadata.digest) == (None, None)
