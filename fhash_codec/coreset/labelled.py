@@ -9,7 +9,8 @@ variable is taken as xarray would write it to a file.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,7 @@ from fhash_formats.series import (
 )
 from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata, references
 from fhash_formats.support.attributes import PACKING, STORED, json_attributes
+from fhash_formats.support.dates import clock
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,9 +177,10 @@ class LabelledSeries(Series):
 
     def _metadata_of(self, array: Any, beside: Any, request: Request) -> SourceMetadata:
         arrays = {str(key): each for key, each in beside.variables.items() if key != array.name}
-        variables = {
+        stored = {
             key: _stored(key, each) for key, each in arrays.items() if key not in self._failed
         }
+        variables = {**stored, **_bounds(stored, arrays)}
         own = array.variable
         variables[self.name] = Stored(
             dimensions=tuple(each.name or "" for each in self._layout.dimensions),
@@ -267,7 +270,23 @@ def _encoded(name: str, array: Any) -> Any:
             coder: Any = xr.coding.strings.CharacterArrayCoder()
             encoded = coder.encode(encoded, name=name)
     encoded.attrs = {key: value for key, value in encoded.attrs.items() if value is not None}
+    _as_written(encoded, encoding)
     return encoded
+
+
+def _as_written(encoded: Any, encoding: Mapping[str, Any]) -> None:
+    """Give dates the units and the calendar that their file has, where these mean the same."""
+    units, now = encoding.get("units"), clock(encoded.attrs)
+    if now is None or units is None or encoded.dtype.kind not in "iuf" or not encoded.size:
+        return
+    then = clock({"units": units, "calendar": encoded.attrs.get("calendar")})
+    if then == now:
+        encoded.attrs["units"] = units
+    # the calendars of the world differ before 1582 alone
+    usual = clock({"units": units})
+    since = usual is not None and usual.epoch == now.epoch and usual.unit == now.unit
+    if "calendar" not in encoding and since and np.nanmin(encoded.values) >= 0:
+        encoded.attrs.pop("calendar", None)
 
 
 def _stored(name: str, array: Any) -> Stored:
@@ -283,6 +302,18 @@ def _stored(name: str, array: Any) -> Stored:
     )
 
 
+def _bounds(stored: Mapping[str, Stored], arrays: Mapping[str, Any]) -> dict[str, Stored]:
+    """Bounds of dates without the units and the calendar that decoding copied to them."""
+    found = {}
+    for each in stored.values():
+        name = str(each.attributes.get("bounds"))
+        if name in stored and arrays[name].dtype.kind in "MO":
+            own = stored[name].attributes.items()
+            kept = {key: value for key, value in own if each.attributes.get(key) != value}
+            found[name] = replace(stored[name], attributes=kept)
+    return found
+
+
 def _attributes(array: Any) -> dict[str, Any]:
     """The attributes that a variable of numbers has in a file."""
     encoding = {key: array.encoding.get(key) for key in OF_FILE}
@@ -294,8 +325,11 @@ def _attributes(array: Any) -> dict[str, Any]:
 
 
 def _origin(array: Any, beside: Any) -> Path | None:
-    """The file that an array comes from; None for one in memory, which may have been changed."""
-    place = array.encoding.get("source", beside.encoding.get("source"))
+    """The file that an array comes from; None for one in memory or one that was computed.
+
+    Arrays that xarray computes have no encoding, although their dataset keeps its own.
+    """
+    place = array.encoding and array.encoding.get("source", beside.encoding.get("source"))
     if not isinstance(place, str) or array.variable._in_memory or not Path(place).exists():
         return None
     return Path(place)

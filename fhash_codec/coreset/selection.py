@@ -22,6 +22,7 @@ from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.common.times import settled
 from fhash_formats.series import Series
 
 Source = str | Path | Series | npt.ArrayLike
@@ -40,7 +41,12 @@ def open_source(source: Source) -> Iterator[Series]:
         with open_series(source) as series:
             yield series
     else:
-        yield source if isinstance(source, Series) else array_series(source)
+        series = source if isinstance(source, Series) else array_series(source)
+        time, remark = settled(series.coords["t"])
+        if remark:
+            warnings.warn(f"{series.source}: {remark}", FhashWarning, stacklevel=4)
+            series.coords = {**series.coords, "t": time}
+        yield series
 
 
 def mask_files(config: EncodeConfig) -> list[str]:

@@ -83,3 +83,11 @@ def test_a_labelled_array_of_members_is_refused_with_the_selection() -> None:
         pass
     with open_source(labelled.isel(member=0)) as series:
         assert series.shape == (3, 1, 4, 5)
+
+
+def test_a_missing_time_is_replaced_by_the_steps() -> None:
+    time = Coordinate(name="time", values=np.array([0, 1, np.nan]), attributes={"units": "s"})
+    series = ArraySeries(np.zeros((3, 4, 5, 6)), coords={"t": time})
+    told = pytest.warns(FhashWarning, match="time at step 2; step numbers stand")
+    with told, open_source(series) as opened:
+        assert opened.coords["t"].values.tolist() == [0, 1, 2]

@@ -389,3 +389,13 @@ def test_steps_of_one_series_must_be_alike(tmp_path: Path) -> None:
             file[f"step_{step}/v"].attrs["units"] = f"{step} m"
     with pytest.raises(InputError, match="holds 2 variables"):
         open_series(path)
+
+
+def test_times_that_are_written_as_dates_are_counted(tmp_path: Path) -> None:
+    texts = [b"2020-01-01T00:00", b"2020-01-01T06:00", b"2020-01-02", b"2020-01-03"]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["rho"] = np.zeros((4, 3, 5, 6), "f4")
+        file["time"] = np.array(texts)
+    with open_series(tmp_path / "a.h5") as series:
+        assert series.coords["t"].values.tolist() == [0, 6, 24, 48]
+        assert series.coords["t"].attributes["units"] == "hours since 2020-01-01"
