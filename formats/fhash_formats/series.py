@@ -11,6 +11,7 @@ The contract of every reader:
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -22,10 +23,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats.errors import FhashWarning, InputError, RegionError
 from fhash_formats.source_metadata import SourceMetadata
 
 AXES = ("t", "z", "y", "x")
+MAX_SPANS = 64
+"""Runs of steps that are told one by one."""
 AXIS_NAMES = {"t": "time", "z": "z", "y": "y", "x": "x"}
 """Name of each axis in a container, and of a coordinate that the source does not name."""
 
@@ -50,6 +53,39 @@ def index_coordinate(axis: str, length: int) -> Coordinate:
     return Coordinate(name=AXIS_NAMES[axis], values=np.arange(length, dtype=np.float64))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NotStored:
+    """Values of a series that nobody wrote: one number stands in their place.
+
+    Attributes:
+        shares: of the values of each step, 0 to 1, float64 (t,).
+        fill: that number, as it is read.
+    """
+
+    shares: npt.NDArray[np.float64]
+    fill: float | int
+
+    @property
+    def share(self) -> float:
+        """Share of all values."""
+        return float(self.shares.mean())
+
+    def spans(self) -> list[list[int]]:
+        """Steps of which something was not stored, as [first, last + 1]; the last may be longer."""
+        steps = np.flatnonzero(self.shares)
+        ends = np.flatnonzero(np.diff(steps) > 1)
+        firsts, lasts = steps[np.r_[0, ends + 1]], steps[np.r_[ends, len(steps) - 1]]
+        spans = [[int(first), int(last) + 1] for first, last in zip(firsts, lasts, strict=True)]
+        if len(spans) > MAX_SPANS:
+            spans[MAX_SPANS - 1 :] = [[spans[MAX_SPANS - 1][0], spans[-1][1]]]
+        return spans
+
+    def of_steps(self, steps: Sequence[int]) -> NotStored | None:
+        """The same of some steps; None where everything of these was stored."""
+        shares = self.shares[list(steps)]
+        return replace(self, shares=shares) if shares.any() else None
+
+
 class Series(ABC):
     """A time-varying volume (t, z, y, x), read frame by frame.
 
@@ -71,6 +107,7 @@ class Series(ABC):
         keep_extremes: whether the user said that extreme values which repeat are data.
         unlikely: values that stand for the lowest integers of the stored type, where counts are
             unpacked; they are hardly ever data.
+        not_stored: what of the values nobody wrote; None where nothing is known of such.
     """
 
     source: str
@@ -86,6 +123,7 @@ class Series(ABC):
     occurring: AbstractSet[float] = frozenset()
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
+    not_stored: NotStored | None = None
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property
@@ -131,6 +169,7 @@ class Series(ABC):
         self.source_dtype, self.fill = series.source_dtype, series.fill
         self.occurring = series.occurring
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
+        self.not_stored = series.not_stored
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
@@ -147,6 +186,29 @@ class Series(ABC):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def spans_text(spans: Sequence[Sequence[int]]) -> str:
+    """Runs of steps for people: "step 3", "steps 0 to 4, 7"."""
+    words = [str(a) if b == a + 1 else f"{a} to {b - 1}" for a, b in spans]
+    shown = [*words[:8], "..."] if len(words) > 8 else words
+    one = len(words) == 1 and spans[0][1] == spans[0][0] + 1
+    return f"step{'' if one else 's'} {', '.join(shown)}"
+
+
+def warn_not_stored(series: Series) -> None:
+    """Warn (FhashWarning) of values that nobody wrote, in one line."""
+    found = series.not_stored
+    if found is None:
+        return
+    fill = f"{found.fill:.9g}" if isinstance(found.fill, float) else str(found.fill)
+    warnings.warn(
+        f"{series.source}: {100 * found.share:.3g} % of the values of '{series.name}' are not"
+        f" stored ({spans_text(found.spans())}): read as {fill}; --missing {fill} takes that number"
+        " for a missing value",
+        FhashWarning,
+        stacklevel=3,
+    )
 
 
 def empty_selection(steps: int) -> str:
@@ -170,6 +232,8 @@ class StepsSeries(Series):
         self.source, self.name, self.units = series.source, series.name, series.units
         self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
         self.inherit(series)
+        if series.not_stored is not None:
+            self.not_stored = series.not_stored.of_steps(self.steps)
         self.metadata = self._metadata_of_steps
         self.shape = (len(self.steps), *series.shape[1:])
         time = series.coords["t"]

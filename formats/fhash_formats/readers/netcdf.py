@@ -35,6 +35,7 @@ from fhash_formats.readers.common.positions import Column, beside, coordinate, u
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.stored_parts import hdf5_parts, not_stored
 from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
@@ -251,6 +252,8 @@ def _series(
             close_groups(each)
 
     try:
+        members = [each.name for each in variable.members or (variable,)]
+        parts, beside = hdf5_parts(source, path, members)
         chunks = array.encoding.get("chunksizes")
         series = FileSeries(
             source=source,
@@ -265,6 +268,8 @@ def _series(
             chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
             close=close,
             packing=packed,
+            beside=beside,
+            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
         )
     except BaseException:
         close()

@@ -24,6 +24,7 @@ from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.stored_parts import not_stored, zarr_parts
 from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
 from fhash_formats.readers.common.zarr_nodes import (
     METADATA,
@@ -252,6 +253,11 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         chunks=layout.chunks((*chunks, *trailing)),
         close=store.close,
         packing=packed,
+        not_stored=not_stored(
+            [zarr_parts(member.handle[1]) for member in variable.members or (variable,)],
+            layout,
+            joined=bool(variable.members),
+        ),
     )
     if not variable.members and not variable.field:
         used = [coordinate.name for coordinate in series.coords.values()]

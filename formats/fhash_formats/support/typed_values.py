@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.support.number_types import DTYPES
-from fhash_formats.support.plain_json import UnknownValueError, attribute_json
+from fhash_formats.support.plain_json import UnknownValueError, attribute_json, decoded_text
 
 __all__ = [
     "MAX_BYTES",
@@ -118,7 +118,7 @@ def typed_attribute(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, bytes):
-        return typed_attribute(value.decode("utf-8", errors="replace"))
+        return typed_attribute(decoded_text(value))
     if isinstance(value, list) and value and all(isinstance(each, str) for each in value):
         return [typed_attribute(each) for each in value]
     if isinstance(value, Mapping | list | tuple) or value is None:

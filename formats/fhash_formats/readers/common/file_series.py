@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +15,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, missing_values
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.request import Request
-from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
+from fhash_formats.series import AXES, Coordinate, NotStored, Series, check_values, index_coordinate
 from fhash_formats.support.attributes import plain_text
 
 SLAB_BYTES = 64 * 2**20
@@ -48,6 +49,7 @@ class FileSeries(Series):
         beside: further files that hold values, checked likewise.
         folder: stamp of all files, which `check` alone looks at.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
+        not_stored: what nobody wrote, with the number that stands there as it is stored.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -73,6 +75,7 @@ class FileSeries(Series):
         beside: Sequence[Path] = (),
         folder: FolderStamp | None = None,
         packing: Packing | None = None,
+        not_stored: NotStored | None = None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
@@ -99,8 +102,10 @@ class FileSeries(Series):
         self._sought: dict[float, Any] = {}
         self._met: set[float] = set()
         self.occurring = self._met
+        self.not_stored = not_stored
         if packing is not None:
             self._note_fills(packing)
+        self._unpack_fill(packing)
 
     def hide(self, missing: Sequence[float]) -> None:
         """Make some values missing: they become NaN, and integers become floats.
@@ -114,6 +119,16 @@ class FileSeries(Series):
                     self._sought[value] = fill
             self._note_fills(self._missing)
             self.dtype = self._missing.dtype
+            self._unpack_fill(self._missing)
+
+    def _unpack_fill(self, packing: Packing | None) -> None:
+        """Make the number that stands for what nobody wrote a value; a missing one tells itself."""
+        found = self.not_stored
+        if found is None:
+            return
+        stored = np.array([found.fill], self.dtype if packing is None else packing.stored)
+        fill = stored[0] if packing is None else packing.unpack(stored)[0]
+        self.not_stored = None if fill != fill else replace(found, fill=fill.item())
 
     def as_asked(self, request: Request) -> Self:
         """Return this series with the values missing, or kept, that the user named."""

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+import os
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +15,13 @@ import numpy as np
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.positions import Column, usable
+from fhash_formats.readers.common.request import inside_folder
+from fhash_formats.readers.common.roles import NAMES
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
+
+CONVENTIONAL = frozenset(name for names in NAMES.values() for name in names.split())
+"""Names of coordinates, in lower case."""
 
 FILTER_NAMES = {
     305: "LZO",
@@ -34,52 +42,113 @@ FILTER_NAMES = {
 """Names of registered HDF5 filters, for messages; the name in the file is often empty."""
 
 
-def datasets(root: Any) -> Iterator[tuple[str, Any]]:
-    """Every dataset under a group with its full name (no leading slash), once, in the order of
-    names.
+class Scalar:
+    """A dataset of one number or text, which is opened again when more of it is asked for.
+
+    HDF5 is slow at many thousands of open objects.
+
+    Attributes:
+        dtype, units: of the dataset.
+    """
+
+    shape: tuple[int, ...] = ()
+    ndim, size, is_scale = 0, 1, False
+
+    def __init__(self, group: Any, name: bytes, opened: Any) -> None:
+        import h5py
+
+        self._group, self._name, self.dtype = group, name, opened.dtype
+        self.units = units_of(h5py.Dataset(opened)) if h5py.h5a.exists(opened, b"units") else ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._opened(), name)
+
+    def __getitem__(self, places: Any) -> Any:
+        return self._opened()[places]
+
+    def _opened(self) -> Any:
+        import h5py
+
+        return h5py.Dataset(h5py.h5o.open(self._group.id, self._name))
+
+
+@dataclass(frozen=True)
+class Tree:
+    """What is in a file, by full name without a leading slash.
+
+    Attributes:
+        datasets: each once, in the order of names.
+        groups: each once.
+        broken: links that lead nowhere, and where they point.
+    """
+
+    datasets: dict[str, Any] = field(default_factory=dict)
+    groups: dict[str, Any] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
+
+
+def walk(root: Any) -> Tree:
+    """All that is under a group.
 
     Soft and external links are followed where they lead somewhere (visititems would skip them). An
     object reached a second time, by a hard link or by a cycle of groups, is skipped.
     """
     import h5py
 
+    tree = Tree()
     seen: set[tuple[int, int]] = set()
-    waiting = [("", root)]
-    while waiting:
-        path, node = waiting.pop()
-        info = h5py.h5o.get_info(node.id)
+    # what a link leads to comes last, so that an object goes by its own name and not by the link's
+    waiting: list[tuple[str, Any, bytes]] = [("", root, b".")]
+    linked: deque[tuple[str, Any, bytes]] = deque()
+    while waiting or linked:
+        path, group, name = waiting.pop() if waiting else linked.popleft()
+        try:
+            opened = h5py.h5o.open(group.id, name, lapl=group._lapl)
+        except (KeyError, OSError, RuntimeError):
+            tree.broken[path] = _target(group, name)
+            continue
+        info = h5py.h5o.get_info(opened)
         if (info.fileno, info.addr) in seen:
             continue
         seen.add((info.fileno, info.addr))
-        if isinstance(node, h5py.Dataset):
-            yield path, node
-        elif isinstance(node, h5py.Group):
-            for name in sorted(node, reverse=True):
-                child = _follow(node, name)
-                # what a link leads to comes last, so that an object goes by its own name and not by
-                # the link's
-                place = (
-                    len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
-                )
-                if child is not None:
-                    waiting.insert(place, (f"{path}/{name}".lstrip("/"), child))
+        if isinstance(opened, h5py.h5d.DatasetID):
+            if opened.get_space().get_simple_extent_type() == h5py.h5s.SCALAR:
+                tree.datasets[path] = Scalar(group, name, opened)
+            else:
+                tree.datasets[path] = h5py.Dataset(opened)
+        elif isinstance(opened, h5py.h5g.GroupID):
+            node = tree.groups[path] = h5py.Group(opened)
+            for child in sorted(opened, reverse=True):
+                entry = (f"{path}/{text_of(child)}".lstrip("/"), node, child)
+                hard = opened.links.get_info(child).type == h5py.h5l.TYPE_HARD
+                waiting.append(entry) if hard else linked.append(entry)
+    return tree
 
 
-def _follow(group: Any, name: str) -> Any:
-    try:
-        return group[name]
-    except (KeyError, OSError):
-        return None  # a link to nowhere: there is no dataset behind it to offer
+def _target(group: Any, name: bytes) -> str:
+    """Where a link points."""
+    import h5py
+
+    kind = group.id.links.get_info(name).type
+    if kind == h5py.h5l.TYPE_HARD:
+        return "an object that cannot be opened"
+    value = group.id.links.get_val(name)
+    if kind == h5py.h5l.TYPE_SOFT:
+        return text_of(value)
+    return f"{text_of(value[1])} of {text_of(value[0])}"
 
 
 def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
-    """The name under which `datasets` lists an object that the user called by another of its names.
+    """The name under which `walk` lists an object that the user called by another of its names.
 
     It is the given name where there is none.
     """
     import h5py
 
-    other = _follow(file, name)
+    try:
+        other = None if name in tree else file.get(name)
+    except (KeyError, OSError, RuntimeError):  # a link to nowhere
+        other = None
     return (
         next((listed for listed, dataset in tree.items() if dataset == other), name)
         if isinstance(other, h5py.Dataset)
@@ -87,11 +156,14 @@ def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
     )
 
 
-def variables(tree: Mapping[str, Any]) -> list[Variable]:
-    """Datasets that hold values, as Variables; dimension scales and bounds are auxiliary."""
+def variables(tree: Tree) -> list[Variable]:
+    """Datasets that hold values, and links to nowhere, as Variables.
+
+    Dimension scales and bounds are auxiliary.
+    """
     bounds = set()
-    for name, dataset in tree.items():
-        if isinstance(dataset.attrs.get("bounds"), str | bytes):
+    for name, dataset in tree.datasets.items():
+        if dataset.shape and isinstance(dataset.attrs.get("bounds"), str | bytes):
             bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
     return [
         Variable(
@@ -100,15 +172,23 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
             dtype=dataset.dtype,
             auxiliary=dataset.is_scale or name in bounds,
             handle=dataset,
-            units=units_of(dataset),
+            units=dataset.units if isinstance(dataset, Scalar) else units_of(dataset),
         )
-        for name, dataset in tree.items()
+        for name, dataset in tree.datasets.items()
         if dataset.shape is not None
+    ] + [
+        Variable(
+            name=name,
+            shape=(),
+            dtype=np.dtype(object),
+            error=f"a link to {target}, which is not there",
+        )
+        for name, target in tree.broken.items()
     ]
 
 
 def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
-    """Datasets directly in a group that may be coordinates, by lower-case name.
+    """Datasets directly in a group that may be coordinates, by lower-case conventional name.
 
     They are 1-D numbers, or one number alone.
     """
@@ -117,6 +197,7 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
         place, _, name = path.rpartition("/")
         if (
             place == group
+            and name.lower() in CONVENTIONAL
             and dataset.shape is not None
             and len(dataset.shape) < 2
             and usable(dataset.dtype)
@@ -196,40 +277,69 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
             )
 
 
-def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
-    """Raise InputError if a virtual dataset refers to a file that is missing.
+def candidates(dataset: Any, name: str, *, raw: bool = False) -> list[Path]:
+    """Places of a file that holds values of a dataset, in the order in which HDF5 looks there.
 
-    HDF5 would silently give fill values for it.
+    raw: whether it is a file of raw values, for which HDF5 does not look beside the file.
     """
-    if not dataset.is_virtual:
-        return
-    for mapped in dataset.virtual_sources():
-        file = mapped.file_name
-        if (
-            file != "."
-            and "%b" not in file
-            and not (path.parent / file).exists()
-            and not Path(file).exists()
-        ):
-            raise InputError(
-                f"{source}: {name} is a virtual dataset that draws on {file}, which is not there"
-            )
-
-
-def files_beside(path: Path, dataset: Any) -> list[Path]:
-    """The other files that hold values of a dataset.
-
-    They are those of an external link, raw files, and those behind a virtual dataset.
-    """
-    names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
-    names += [name for name, _, _ in dataset.external or ()]
-    if dataset.is_virtual:
-        names += [
-            mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."
-        ]
-    # HDF5 looks for a relative name beside the file, then in the current folder
-    return list(
-        dict.fromkeys(
-            files for name in names for files in (path.parent / name, Path(name)) if files.exists()
+    folder = Path(dataset.file.filename).parent
+    key = "HDF5_EXTFILE_PREFIX" if raw else "HDF5_VDS_PREFIX"
+    prefixes = os.environ.get(key, "").replace("${ORIGIN}", str(folder))
+    places = [Path(prefix) for prefix in prefixes.split(":") if prefix]
+    if os.path.isabs(name):
+        return (
+            [Path(name)] if raw else [Path(name), *(p / Path(name).name for p in [*places, folder])]
         )
-    )
+    if raw:
+        return [(places or [Path()])[0] / name]
+    return [*(place / name for place in (*places, folder)), Path(name)]
+
+
+def require_inside(path: Path, seen: set[Path] | None = None) -> None:
+    """Raise InputError if a file refers to another one outside its folder, whatever the object is.
+
+    It looks at links, raw files and virtual datasets without following any, and at the files
+    inside the folder that they name.
+
+    seen: files that were looked at, and those that will be.
+    """
+    import h5py
+
+    seen = {path.resolve()} if seen is None else seen
+    named: dict[str, None] = {}
+    with h5py.File(path, "r") as file:
+        groups, known = [file["/"].id], set()
+        while groups:
+            group = groups.pop()
+            info = h5py.h5o.get_info(group)
+            if info.addr in known:
+                continue
+            known.add(info.addr)
+            for name in list(group):
+                kind = group.links.get_info(name).type
+                if kind == h5py.h5l.TYPE_EXTERNAL:
+                    named[text_of(group.links.get_val(name)[0])] = None
+                if kind != h5py.h5l.TYPE_HARD:
+                    continue
+                opened = h5py.h5o.open(group, name)
+                if isinstance(opened, h5py.h5g.GroupID):
+                    groups.append(opened)
+                elif isinstance(opened, h5py.h5d.DatasetID):
+                    dataset = h5py.Dataset(opened)
+                    named |= {text_of(each[0]): None for each in dataset.external or ()}
+                    if dataset.is_virtual:
+                        named |= {each.file_name: None for each in dataset.virtual_sources()}
+        named.pop(".", None)
+        places = {
+            each: candidates(file["/"], each) + candidates(file["/"], each, raw=True)
+            for each in named
+        }
+    for name, found in places.items():
+        inside_folder(path, path.parent / name)
+        for place in found:
+            if not place.exists():
+                continue
+            inside_folder(path, place)
+            if place.resolve() not in seen and place.is_file() and h5py.is_hdf5(place):
+                seen.add(place.resolve())
+                require_inside(place, seen)
