@@ -32,7 +32,7 @@ from fhash_formats.series import (
     check_values,
     index_coordinate,
 )
-from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata
+from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata, plain_form
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class LabelledSeries(Series):
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
         } | {
-            axis: _coordinate(str(dim), array.coords[dim])
+            axis: _coordinate(plain_form(str(dim)), array.coords[dim])
             for axis, dim in zip(self._axes, array.dims, strict=True)
             if dim in array.coords and array.coords[dim].dtype.kind in "iufMO"
         }

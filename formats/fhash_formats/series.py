@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, RegionError
-from fhash_formats.source_metadata import SourceMetadata
+from fhash_formats.source_metadata import SourceMetadata, with_plain_names
 
 AXES = ("t", "z", "y", "x")
 MAX_SPANS = 64
@@ -130,10 +130,21 @@ class Series(ABC):
     def metadata(self) -> SourceMetadata | None:
         """All that belongs to the variable in its source; None where nothing is known.
 
-        It is read at the first use. Warns (FhashWarning) of what is left out.
+        It is read at the first use. Warns (FhashWarning) of what is left out, and of names that
+        other files could not have and that were changed.
         """
         if callable(self._metadata):
-            self._metadata = self._metadata()
+            found = self._metadata()
+            self._metadata = found
+            if found is not None:
+                self._metadata, names = with_plain_names(found)
+                if names:
+                    told = ", ".join(f"{old[:40]!r} to {new!r}" for old, new in names.items())
+                    warnings.warn(
+                        f"{self.source}: names that other files cannot have were changed: {told}",
+                        FhashWarning,
+                        stacklevel=2,
+                    )
         return self._metadata
 
     @metadata.setter

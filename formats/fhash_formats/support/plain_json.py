@@ -52,11 +52,14 @@ def decoded_text(data: bytes) -> str:
 
 
 def plain_text(text: str) -> str:
-    """The text with "?" for each lone surrogate, which no file can hold.
+    """The text without lone surrogates, which no file can hold.
 
-    Python makes lone surrogates of the bytes of file names that are no UTF-8.
+    Python makes those of bytes that are no UTF-8: they are read as Latin-1. "?" stands for others.
     """
-    return text.encode("utf-8", errors="replace").decode("utf-8")
+    if not any("\udc80" <= letter <= "\udcff" for letter in text):
+        return text.encode("utf-8", errors="replace").decode("utf-8")
+    letters = (chr(ord(c) - 0xDC00) if "\udc80" <= c <= "\udcff" else c for c in text)
+    return plain_text("".join(letters))
 
 
 def _converted(value: Any, depth: int, *, is_figure: bool) -> Any:

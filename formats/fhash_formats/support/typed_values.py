@@ -17,7 +17,12 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.support.number_types import DTYPES
-from fhash_formats.support.plain_json import UnknownValueError, attribute_json, decoded_text
+from fhash_formats.support.plain_json import (
+    UnknownValueError,
+    attribute_json,
+    decoded_text,
+    plain_text,
+)
 
 __all__ = [
     "MAX_BYTES",
@@ -112,9 +117,9 @@ def typed_attribute(value: Any) -> Any:
     Raises UnknownValueError for a value that no container holds.
     """
     if isinstance(value, str):
-        if not _has_form(value):
+        if any("\ud800" <= letter < "\udc80" for letter in value):
             raise UnknownValueError
-        return str(value)
+        return plain_text(value)
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, bytes):

@@ -246,7 +246,7 @@ def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -
             zarr.create_array(tmp_path / "a.zarr", data=frame)
             (tmp_path / "a.zarr").rename(part)
     with open_series(tmp_path / name) as series:
-        assert series.name.encode()[:2] == b"a?"
+        assert series.name[:2] == "a\u00ff"
         np.testing.assert_array_equal(series.read(0), frame)
 
 

@@ -16,6 +16,7 @@ from fhash_formats.readers.common.cf_packing import Packing, missing_values
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.request import Request
 from fhash_formats.series import AXES, Coordinate, NotStored, Series, check_values, index_coordinate
+from fhash_formats.source_metadata import plain_form
 from fhash_formats.support.attributes import plain_text
 
 SLAB_BYTES = 64 * 2**20
@@ -87,7 +88,9 @@ class FileSeries(Series):
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | dict(coords or {})
+        } | {
+            axis: replace(each, name=plain_form(each.name)) for axis, each in (coords or {}).items()
+        }
         self._axes, self._fetch, self._close = tuple(axes), fetch, close
         self._quick = (stamp, *map(Stamp.of, beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (

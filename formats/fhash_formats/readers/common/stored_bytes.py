@@ -172,10 +172,16 @@ def numbered_files(folder: Path, form: str, words: Sequence[str], most: int) -> 
     """
     match = NUMBERED.fullmatch(form)
     if match is None or not all(re.fullmatch(r"-?[0-9]{1,9}", word) for word in words):
-        raise InputError(f"its pattern of files is {' '.join([form, *words])[:80]!r}")
+        raise InputError(
+            f"its pattern of files is {' '.join([form, *words])[:80]!r}; a name with one %d or %03d"
+            " (two digits at most), the first number, the last and the stride are needed"
+        )
     first, last, stride = map(int, words)
     if stride == 0 or not 0 <= (last - first) // stride < min(most, MAX_FILES):
-        raise InputError(f"its pattern of files is {' '.join([form, *words])!r}")
+        raise InputError(
+            f"its pattern of files is {' '.join([form, *words])!r}; 1 to {min(most, MAX_FILES)}"
+            " numbers are possible here"
+        )
     files = []
     for number in range(first, last + (1 if stride > 0 else -1), stride):
         files.append(folder / (f"{match[1]}d{match[2]}" % number))
