@@ -7,10 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fhash_cli.output import apart, extent, listed
+from fhash_cli.output import apart, extent, listed, one_line
 
 MIN_DIMENSIONS = 3
 """Dimensions of an array that may be a variable; others are named in one line."""
+
+UNOPENED = "what cannot be opened"
+"""Beginning of the problem of an array of which nothing is known."""
 
 MAX_TEXT = 300
 """Characters of an attribute that are shown."""
@@ -37,23 +40,27 @@ def listing(
         marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
         missing = f", missing where {marks}" if marks else ""
         dtype = variable["dtype"] + stored
-        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
+        lines += ["", f"{variable['name']}: {dtype}, {shape}{units}{missing}"]
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
     if len(good) > 1 and all(len(variable["commands"]) == 1 for variable in good):
         words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
-        lines.append(f"\nall in one file:\n  {shlex.join(words)}")
+        lines += ["", "all in one file:", f"  {shlex.join(words)}"]
     rest = [variable for variable in variables if variable["problem"]]
-    others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
-    small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]
+    others, small = [], []
+    for variable in rest:
+        known = len(variable["shape"]) < MIN_DIMENSIONS
+        (small if known and not variable["problem"].startswith(UNOPENED) else others).append(
+            variable
+        )
     if others:
-        lines.append("\nnot to be encoded:")
+        lines += ["", "not to be encoded:"]
         lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
     if small:
         names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
-        lines.append(f"\nbelow {MIN_DIMENSIONS} dimensions: {listed(names)}")
-    return "\n".join(lines)
+        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}"]
+    return "\n".join(map(one_line, lines))
 
 
 def _dimension(name: str, length: int, axis: str) -> str:

@@ -18,6 +18,7 @@ from fhash_cli.output import (
     listed,
     loss_rows,
     number,
+    one_line,
     quality_rows,
     size,
     spans,
@@ -93,7 +94,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
         ("file", f"{dataset.path}, format {'.'.join(map(str, version))}"),
         ("size", compared(result)),
     ]
-    more = f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one"
+    more = one_line(f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one")
     emit(result, f"{table(rows)}\n\n{table(info_table(infos))}\n\n{more}", as_json)
 
 

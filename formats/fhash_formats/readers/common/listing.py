@@ -148,7 +148,7 @@ def listing(
 def _output(name: str, whole: bool) -> str:
     """A name of a container for a variable, with its groups where the last part is not enough."""
     text = name.replace("/", "_") if whole else plain_name(name)
-    return re.sub(r"[*#\s]+", "", text).strip("._") + ".fhz"
+    return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
 
 
 def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
