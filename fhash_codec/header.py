@@ -63,6 +63,8 @@ def describe_variable(series: Series) -> dict[str, Any]:
     }
     if series.fill is not None and math.isfinite(series.fill):
         variable["fill"] = series.fill
+    elif series.dtype.kind == "f" and series.defaults:
+        variable["fill"] = min(series.defaults)
     if series.not_stored is not None:
         never = series.not_stored
         variable[NOT_STORED] = {"share": round(never.share, 6), "steps": never.spans()}

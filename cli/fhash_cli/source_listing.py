@@ -15,6 +15,9 @@ MIN_DIMENSIONS = 3
 UNOPENED = "what cannot be opened"
 """Beginning of the problem of an array of which nothing is known."""
 
+MAX_NAMES = 8
+"""Names of one line; of more `listed` leaves some out."""
+
 MAX_TEXT = 300
 """Characters of an attribute that are shown."""
 
@@ -59,7 +62,8 @@ def listing(
         lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
     if small:
         names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
-        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}"]
+        count = f"; {len(names)} in all" if len(names) > MAX_NAMES else ""
+        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}{count}"]
     return "\n".join(map(one_line, lines))
 
 

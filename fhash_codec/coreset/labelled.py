@@ -18,19 +18,23 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.common.cf_packing import packing
 from fhash_formats.readers.common.layout import Dimension, must_select
 from fhash_formats.readers.common.netcdf_surroundings import stored_variable
 from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate
+from fhash_formats.readers.common.stored_parts import labelled_parts
 from fhash_formats.readers.common.surroundings import Stored, Wanted, surroundings
 from fhash_formats.readers.common.variables import MAX_LISTED, MIN_DIMENSIONS
 from fhash_formats.series import (
     AXES,
     ArraySeries,
     Coordinate,
+    NotStored,
     Series,
     check_coords,
     check_values,
     index_coordinate,
+    warn_not_stored,
 )
 from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata, plain_form
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
@@ -133,6 +137,32 @@ class LabelledSeries(Series):
         self.units = str(self.attributes.get("units", ""))
         self.metadata = lambda: self._metadata_of(beside)
         self.lazy = LazyFrames(self._in_order(array)) if is_lazy(array) else None
+        self.not_stored = self._never_stored()
+        warn_not_stored(self)
+
+    def _never_stored(self) -> NotStored | None:
+        """What nobody wrote of the file or store behind the array, as far as xarray shows it."""
+        variable = self._array.variable
+        parts, key = labelled_parts(self.source, variable)
+        if parts is None:
+            return None
+        lengths = [int(borders[-1]) for borders in parts.edges]
+        chosen = {place: np.arange(lengths[place])[each] for place, each in key.items()}
+        # an index that is a number takes its dimension away
+        left = [n for n in range(len(lengths)) if not isinstance(key.get(n), int | np.integer)]
+        if len(left) != len(self._axes):
+            return None
+        time = left[self._axes.index("t")] if "t" in self._axes else None
+        shares = 1 - parts.along(time, chosen)
+        told = variable.encoding
+        stored = np.dtype(told.get("dtype", variable.dtype))
+        fill = np.array([parts.fill])
+        if stored.kind in "iuf":
+            packed = packing(self.source, stored, {key: told[key] for key in OF_FILE if key in told})
+            fill = packed.unpack(fill.astype(stored))
+        if not shares.any() or fill[0] != fill[0]:
+            return None
+        return NotStored(shares=shares, fill=fill[0].item())
 
     def _in_order(self, array: Any) -> Any:
         """The dask array of a labelled one, as (t, z, y, x)."""

@@ -108,6 +108,8 @@ class Series(ABC):
         unlikely: values that stand for the lowest integers of the stored type, where counts are
             unpacked; they are hardly ever data.
         not_stored: what of the values nobody wrote; None where nothing is known of such.
+        defaults: default fill values of the format that were met in the frames read so far, of an
+            array that declares no other. Among floats they are missing.
     """
 
     source: str
@@ -124,6 +126,7 @@ class Series(ABC):
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
     not_stored: NotStored | None = None
+    defaults: AbstractSet[float] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property
@@ -180,7 +183,7 @@ class Series(ABC):
         self.source_dtype, self.fill = series.source_dtype, series.fill
         self.occurring = series.occurring
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
-        self.not_stored = series.not_stored
+        self.not_stored, self.defaults = series.not_stored, series.defaults
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
@@ -220,6 +223,18 @@ def warn_not_stored(series: Series) -> None:
         FhashWarning,
         stacklevel=3,
     )
+
+
+def warn_defaults(series: Series) -> None:
+    """Warn (FhashWarning) of default fill values that were met, in one line."""
+    for value in series.defaults:
+        what = f"{series.source}: '{series.name}' declares no fill value and has the default one of"
+        what += f" NetCDF, {value:.9g}, which stands for values that nobody wrote: "
+        if series.dtype.kind == "f":
+            what += "it is missing, by NetCDF's convention; --keep-extremes keeps the number"
+        else:
+            what += f"it is kept as a number; --missing {value} takes it for a missing value"
+        warnings.warn(what, FhashWarning, stacklevel=3)
 
 
 def empty_selection(steps: int) -> str:

@@ -142,6 +142,8 @@ class JoinedSeries(Series):
             self.not_stored = replace(never, shares=np.concatenate(shares))
         self._met = set(first.occurring)
         self.occurring = self._met
+        self._defaults = set(first.defaults)
+        self.defaults = self._defaults
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times()}
@@ -156,6 +158,7 @@ class JoinedSeries(Series):
         part = self._current[1]
         frame = part.read(step - (self._ends[number] - self._parts[number].steps))
         self._met.update(part.occurring)
+        self._defaults.update(part.defaults)
         return frame
 
     def check(self) -> None:

@@ -25,6 +25,7 @@ from fhash_formats.readers.common.netcdf_store import (
     check_filters,
     close_groups,
     declared,
+    default_fill,
     exactly_filled,
     magic_of,
     open_groups,
@@ -270,6 +271,7 @@ def _series(
             packing=packed,
             beside=beside,
             not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+            default_fill=None if request.raw_values else default_fill(array, packed),
         )
     except BaseException:
         close()

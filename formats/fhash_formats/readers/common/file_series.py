@@ -51,6 +51,8 @@ class FileSeries(Series):
         folder: stamp of all files, which `check` alone looks at.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
         not_stored: what nobody wrote, with the number that stands there as it is stored.
+        default_fill: value as it is read that stands for one that nobody wrote, see
+            `Series.defaults`.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -77,6 +79,7 @@ class FileSeries(Series):
         folder: FolderStamp | None = None,
         packing: Packing | None = None,
         not_stored: NotStored | None = None,
+        default_fill: float | None = None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
@@ -106,6 +109,8 @@ class FileSeries(Series):
         self._met: set[float] = set()
         self.occurring = self._met
         self.not_stored = not_stored
+        self._default, self._defaults = default_fill, set[float]()
+        self.defaults = self._defaults
         if packing is not None:
             self._note_fills(packing)
         self._unpack_fill(packing)
@@ -120,6 +125,7 @@ class FileSeries(Series):
             for value in missing:
                 for fill in missing_values(self.source, self.dtype, [value]).fills:
                     self._sought[value] = fill
+                    self._default = None if fill == self._default else self._default
             self._note_fills(self._missing)
             self.dtype = self._missing.dtype
             self._unpack_fill(self._missing)
@@ -137,6 +143,11 @@ class FileSeries(Series):
         """Return this series with the values missing, or kept, that the user named."""
         self.hide(request.missing)
         self.keep_extremes = request.keep_extremes
+        if self.keep_extremes:
+            self._default = None
+        told = self.not_stored
+        if told is not None and told.fill == self._default and self.dtype.kind == "f":
+            self.not_stored = None  # missing, as the frames will show
         return self
 
     def _note_fills(self, packing: Packing) -> None:
@@ -192,6 +203,10 @@ class FileSeries(Series):
                 f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed"
                 " while it was being read"
             )
+        if self._default is not None and (unwritten := values == self._default).any():
+            self._defaults.add(self._default)
+            if values.dtype.kind == "f":
+                values = np.where(unwritten, values.dtype.type(np.nan), values)
         if self._missing is not None:
             self._met.update(
                 value

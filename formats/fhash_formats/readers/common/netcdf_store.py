@@ -28,6 +28,18 @@ if TYPE_CHECKING:
 Values = npt.NDArray[Any]
 Exact = Callable[[Values, tuple[slice, ...]], Values]
 
+DEFAULT_FILLS = {
+    "i2": -32767,
+    "u2": 65535,
+    "i4": -2147483647,
+    "u4": 4294967295,
+    "i8": -9223372036854775806,
+    "u8": 18446744073709551614,
+    "f4": 9.969209968386869e36,
+    "f8": 9.969209968386869e36,
+}
+"""NC_FILL_SHORT and so on of netcdf.h; bytes have none that counts."""
+
 CLASSIC = (b"CDF\x01", b"CDF\x02")
 CLASSIC_64 = b"CDF\x05"
 
@@ -152,6 +164,20 @@ def declared(source: str, array: xr.Variable) -> Packing | None:
     """The packing of a variable that xarray unpacks; None for types that cannot be packed."""
     stored = np.dtype(array.encoding.get("dtype", array.dtype))
     return packing(source, stored, array.encoding) if stored.kind in "iuf" else None
+
+
+def default_fill(array: xr.Variable, packed: Packing | None) -> float | int | None:
+    """The number that NetCDF puts where nobody wrote, as it is read.
+
+    None for bytes, and where the variable declares a fill value of its own.
+    """
+    if packed is None or {"_FillValue", "missing_value"} & {*array.encoding, *array.attrs}:
+        return None
+    stored = DEFAULT_FILLS.get(packed.stored.str[1:])
+    if stored is None:
+        return None
+    value: float | int = packed.unpack(np.array([stored], packed.stored))[0].item()
+    return value
 
 
 def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:

@@ -11,6 +11,7 @@ import contextlib
 import itertools
 import operator
 import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.hdf5_tree import candidates
 from fhash_formats.readers.common.layout import Layout
@@ -29,7 +30,7 @@ from fhash_formats.series import NotStored
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["Hdf5Sources", "StoredParts", "hdf5_parts", "not_stored", "zarr_parts"]
+__all__ = ["Hdf5Sources", "StoredParts", "hdf5_parts", "labelled_parts", "not_stored", "zarr_parts"]
 
 MAX_BOXES = 1 << 24
 """Boxes of a grid that are told apart; of a finer one only the share of the whole is known."""
@@ -69,25 +70,26 @@ class StoredParts:
     share: npt.NDArray[np.float32]
     fill: Any
 
-    def along(self, place: int | None, picked: Mapping[int, int]) -> npt.NDArray[np.float64]:
+    def along(
+        self, place: int | None, chosen: Mapping[int, int | npt.NDArray[np.int64]]
+    ) -> npt.NDArray[np.float64]:
         """Share of the values stored at each index along a dimension, shape (its length,).
 
-        place: the dimension; None for all values together, shape (1,). picked: the only index that
-            counts along other dimensions.
+        place: the dimension; None for all values together, shape (1,). chosen: the indices that
+            count along some dimensions.
         """
-        place = None if place is None or place >= self.share.ndim else place
         share: Any = self.share.astype(np.float64)
         for number in reversed(range(share.ndim)):
             borders = self.edges[number]
+            indices = np.atleast_1d(chosen.get(number, np.arange(borders[-1])))
+            boxes = np.searchsorted(borders, indices, side="right") - 1
             if number == place:
-                continue
-            if number in picked:
-                box = int(np.searchsorted(borders, picked[number], side="right")) - 1
-                share = share.take(box, axis=number)
+                share = share.take(boxes, axis=number)
             else:
-                share = np.average(share, axis=number, weights=np.diff(borders))
+                weights = np.bincount(boxes, minlength=len(borders) - 1)
+                share = np.average(share, axis=number, weights=weights)
         each: npt.NDArray[np.float64] = np.reshape(share, -1)
-        return each if place is None else np.repeat(each, np.diff(self.edges[place]))
+        return each
 
 
 def whole(shape: Sequence[int], share: float, fill: Any) -> StoredParts:
@@ -486,6 +488,55 @@ def zarr_parts(array: zarr.Array[Any]) -> StoredParts | None:
         if indexed is not None:
             return _of_grid(array.shape, array.chunks, indexed, array.fill_value)
     return _of_grid(array.shape, outer, stored, array.fill_value)
+
+
+def labelled_parts(source: str, array: Any) -> tuple[StoredParts | None, dict[int, Any]]:
+    """The stored parts of the array behind a variable of xarray, and the indices taken of it.
+
+    xarray has no public way to it: nothing is known of what has another form. Of an array of dask
+    after operations the indices are not known: one warning (FhashWarning) says so.
+    """
+    data = getattr(array, "_data", None)
+    name, graph = getattr(data, "name", None), getattr(data, "__dask_graph__", None)
+    if graph is not None:
+        known = dict(graph())
+        data = known.get(f"original-{name}")
+        if data is None:
+            _warn_of_sources(source, known)
+    key: tuple[Any, ...] = ()
+    while hasattr(data, "array"):
+        key = getattr(getattr(data, "key", None), "tuple", key)
+        data = data.array
+    if hasattr(data, "_array") and hasattr(data._array, "metadata"):
+        return zarr_parts(data._array), dict(enumerate(key))
+    stored = getattr(getattr(data, "get_array", lambda: None)(), "_h5ds", None)
+    if stored is None:
+        return None, {}
+    with Hdf5Sources(source) as behind:
+        return behind.parts(stored.name, stored), dict(enumerate(key))
+
+
+def _warn_of_sources(source: str, graph: Mapping[Any, Any]) -> None:
+    """Warn of arrays behind a graph of dask that are not stored whole."""
+    for key, data in graph.items():
+        if not str(key).startswith("original-"):
+            continue
+        while hasattr(data, "array"):
+            data = data.array
+        array = getattr(data, "_array", None)
+        parts = zarr_parts(array) if hasattr(array, "metadata") else None
+        if parts is not None and not _is_nan(parts.fill):
+            share = 100 * (1 - parts.along(None, {})[0])
+            warnings.warn(
+                f"{source}: {share:.3g} % of the stored array behind it are not stored: read as"
+                f" {parts.fill}; which of them are taken is not known",
+                FhashWarning,
+                stacklevel=2,
+            )
+
+
+def _is_nan(value: Any) -> bool:
+    return bool(value != value)
 
 
 async def _stored_chunks(array: zarr.Array[Any], counts: tuple[int, ...]) -> set[tuple[int, ...]]:
