@@ -66,10 +66,7 @@ def describe_variable(series: Series) -> dict[str, Any]:
     elif series.dtype.kind == "f" and series.defaults:
         variable["fill"] = min(series.defaults)
     if series.not_stored is not None:
-        never = series.not_stored
-        variable[NOT_STORED] = {"share": round(never.share, 6), "steps": never.spans()}
-        if math.isfinite(never.fill):
-            variable[NOT_STORED]["fill"] = never.fill
+        variable[NOT_STORED] = series.not_stored.to_dict()
     return variable
 
 

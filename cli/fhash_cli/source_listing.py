@@ -99,6 +99,7 @@ def details(series: Series) -> dict[str, Any]:
         "dtype": (series.source_dtype or series.dtype).name,
         "units": series.units,
         "fill": series.fill,
+        "not_stored": None if series.not_stored is None else series.not_stored.to_dict(),
         "coordinates": coordinates,
         "attributes": json_attributes(series.attributes, without=frozenset()),
     }
@@ -110,10 +111,20 @@ def details_rows(series: Series) -> list[tuple[str, str]]:
 
     rows = [("t, z, y, x", extent(series.shape))]
     rows += [(f"  {axis}", positions(series.coords[axis], axis)) for axis in "tzyx"]
+    if series.not_stored is not None:
+        rows.append(("not stored", not_stored_text(series.not_stored.to_dict())))
     for name, value in json_attributes(series.attributes).items():
         text = " ".join(str(value).split())
         rows.append((name, text if len(text) <= MAX_TEXT else text[:MAX_TEXT] + "..."))
     return rows
+
+
+def not_stored_text(told: Mapping[str, Any]) -> str:
+    """Values that nobody wrote, as a header has them, in words."""
+    from fhash_formats.series import spans_text
+
+    fill = f", read as {told['fill']:.9g}" if "fill" in told else ""
+    return f"{100 * told['share']:.3g} % of the values ({spans_text(told['steps'])}){fill}"
 
 
 def positions(coordinate: Coordinate, axis: str) -> str:

@@ -158,7 +158,9 @@ class LabelledSeries(Series):
         stored = np.dtype(told.get("dtype", variable.dtype))
         fill = np.array([parts.fill])
         if stored.kind in "iuf":
-            packed = packing(self.source, stored, {key: told[key] for key in OF_FILE if key in told})
+            packed = packing(
+                self.source, stored, {key: told[key] for key in OF_FILE if key in told}
+            )
             fill = packed.unpack(fill.astype(stored))
         if not shares.any() or fill[0] != fill[0]:
             return None

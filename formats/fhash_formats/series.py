@@ -11,6 +11,7 @@ The contract of every reader:
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -79,6 +80,11 @@ class NotStored:
         if len(spans) > MAX_SPANS:
             spans[MAX_SPANS - 1 :] = [[spans[MAX_SPANS - 1][0], spans[-1][1]]]
         return spans
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values, as the header of a container has them."""
+        found: dict[str, Any] = {"share": round(self.share, 6), "steps": self.spans()}
+        return found | ({"fill": self.fill} if math.isfinite(self.fill) else {})
 
     def of_steps(self, steps: Sequence[int]) -> NotStored | None:
         """The same of some steps; None where everything of these was stored."""

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.support.plain_json import plain_text
+
 __all__ = [
     "COORDINATES",
     "NAMING",
@@ -212,7 +214,7 @@ def plain_form(name: str, taken: Collection[str] = (), *, default: str = "unname
 
     default: stands for a name of which nothing is left.
     """
-    safe = (c if c.isprintable() and c not in "/\\" else "_" for c in name)
+    safe = (c if c.isprintable() and c not in "/\\" else "_" for c in plain_text(name))
     text = "".join(safe).strip()
     while len(text.encode(errors="replace")) > MAX_FILE_NAME:
         text = text[:-1].strip()

@@ -24,9 +24,14 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_cli.source_listing import details, details_rows, listing, positions
+from fhash_cli.source_listing import (
+    details,
+    details_rows,
+    listing,
+    not_stored_text,
+    positions,
+)
 from fhash_cli.variables import info_table
-from fhash_formats.series import spans_text
 
 if TYPE_CHECKING:
     from fhash_codec import Dataset, Volume
@@ -124,7 +129,11 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             + (f", in {volume.units}" if volume.units not in ("", "1") else "")
             + _missing(volume),
         ),
-        *_not_stored(info["variable"]),
+        *(
+            [("not stored", not_stored_text(info["variable"]["not_stored"]))]
+            if "not_stored" in info["variable"]
+            else []
+        ),
         *_source(volume),
         ("t, z, y, x", extent(volume.shape)),
         *((f"  {axis}", positions(volume.coords[axis], axis)) for axis in "tzyx"),
@@ -161,20 +170,6 @@ def _missing(volume: Volume) -> str:
     """The number that stood for a missing value in the source, where it is known."""
     fill = volume.value_type.fill
     return "" if fill is None else f", missing where the source had {fill:.9g}"
-
-
-def _not_stored(variable: dict[str, Any]) -> list[tuple[str, str]]:
-    """The row of values that nobody wrote; none where all were written, or nothing is known."""
-    told = variable.get("not_stored")
-    if told is None:
-        return []
-    fill = f", read as {told['fill']:.9g}" if "fill" in told else ""
-    return [
-        (
-            "not stored",
-            f"{100 * told['share']:.3g} % of the values ({spans_text(told['steps'])}){fill}",
-        )
-    ]
 
 
 def _training(info: dict[str, Any]) -> str:
