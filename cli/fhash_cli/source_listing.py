@@ -51,7 +51,8 @@ def listing(
         words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
         lines += ["", "all in one file:", f"  {shlex.join(words)}"]
     rest = [variable for variable in variables if variable["problem"]]
-    others, small = [], []
+    others: list[Mapping[str, Any]] = []
+    small: list[Mapping[str, Any]] = []
     for variable in rest:
         known = len(variable["shape"]) < MIN_DIMENSIONS
         (small if known and not variable["problem"].startswith(UNOPENED) else others).append(

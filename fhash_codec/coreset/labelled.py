@@ -141,7 +141,7 @@ class LabelledSeries(Series):
         warn_not_stored(self)
 
     def _never_stored(self) -> NotStored | None:
-        """What nobody wrote of the file or store behind the array, as far as xarray shows it."""
+        """Values behind the array that nobody wrote, as far as xarray shows them."""
         variable = self._array.variable
         parts, key = labelled_parts(self.source, variable)
         if parts is None:

@@ -74,7 +74,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Tree:
-    """What is in a file, by full name without a leading slash.
+    """Objects of a file by full name without a leading slash.
 
     Attributes:
         datasets: each once, in the order of names.
@@ -126,7 +126,7 @@ def walk(root: Any) -> Tree:
 
 
 def _target(group: Any, name: bytes) -> str:
-    """Where a link points."""
+    """The place that a link points to."""
     import h5py
 
     kind = group.id.links.get_info(name).type

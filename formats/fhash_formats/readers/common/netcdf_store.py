@@ -111,11 +111,8 @@ def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dat
 
 def _is_misread(dataset: xr.Dataset) -> bool:
     """Whether a classic file has names that are no ASCII, or texts that are no UTF-8."""
-    texts = [
-        text
-        for each in (dataset, *dataset.variables.values())
-        for text in (*each.attrs.values(), *each.encoding.values())
-    ]
+    places: list[Any] = [dataset, *dataset.variables.values()]
+    texts = [text for each in places for text in (*each.attrs.values(), *each.encoding.values())]
     return any(not str(name).isascii() for name in (*dataset.variables, *dataset.sizes)) or any(
         isinstance(text, str) and "\ufffd" in text for text in texts
     )

@@ -101,7 +101,7 @@ def whole(shape: Sequence[int], share: float, fill: Any) -> StoredParts:
 def not_stored(
     parts: Sequence[StoredParts | None], layout: Layout, *, joined: bool
 ) -> NotStored | None:
-    """What was never stored of a series; None where everything was.
+    """Values of a series that were never stored; None where all were.
 
     parts: of its array, or where `joined` of each of its arrays, which the first dimension counts.
     """
@@ -165,7 +165,7 @@ def _of_boxes(
 
 
 class Hdf5Sources:
-    """Where the values of datasets of HDF5 files are, through all virtual datasets and raw files.
+    """Sources of the values of HDF5 datasets, through all virtual datasets and raw files.
 
     Attributes:
         files: files beside the dataset's own that hold its values.
@@ -496,7 +496,7 @@ def labelled_parts(source: str, array: Any) -> tuple[StoredParts | None, dict[in
     xarray has no public way to it: nothing is known of what has another form. Of an array of dask
     after operations the indices are not known: one warning (FhashWarning) says so.
     """
-    data = getattr(array, "_data", None)
+    data: Any = getattr(array, "_data", None)
     name, graph = getattr(data, "name", None), getattr(data, "__dask_graph__", None)
     if graph is not None:
         known = dict(graph())
@@ -523,7 +523,7 @@ def _warn_of_sources(source: str, graph: Mapping[Any, Any]) -> None:
             continue
         while hasattr(data, "array"):
             data = data.array
-        array = getattr(data, "_array", None)
+        array: Any = getattr(data, "_array", None)
         parts = zarr_parts(array) if hasattr(array, "metadata") else None
         if parts is not None and not _is_nan(parts.fill):
             share = 100 * (1 - parts.along(None, {})[0])

@@ -21,7 +21,7 @@ VALUES = np.arange(6 * 4 * 3 * 5, dtype=np.float32).reshape(6, 4, 3, 5) + 7
 
 
 def told(path: Path, **options: Any) -> NotStored | None:
-    """What a series says of values that nobody wrote; it warns of them, and of nothing else."""
+    """Values that nobody wrote, as a series tells; it warns of them, and of nothing else."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with open_series(path, **options) as series:
