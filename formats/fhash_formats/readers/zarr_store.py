@@ -24,7 +24,11 @@ from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.stored_parts import not_stored, zarr_parts
+from fhash_formats.readers.common.stored_parts import (
+    not_stored,
+    warn_of_column,
+    zarr_parts,
+)
 from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
 from fhash_formats.readers.common.zarr_nodes import (
     METADATA,
@@ -396,5 +400,8 @@ class _Values:
         return self.packing.unpack(stored) if self.packing else stored
 
     def whole(self) -> npt.NDArray[Any]:
-        """All values."""
+        """All values of a coordinate."""
+        parts = zarr_parts(self.array)
+        if parts is not None and parts.fill == parts.fill:
+            warn_of_column(self.array.name, parts)
         return self.read(())

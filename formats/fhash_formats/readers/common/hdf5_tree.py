@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import os
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +13,8 @@ import numpy as np
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.positions import Column, usable
-from fhash_formats.readers.common.request import inside_folder
 from fhash_formats.readers.common.roles import NAMES
+from fhash_formats.readers.common.stored_parts import Hdf5Sources, warn_of_column
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
@@ -212,6 +210,8 @@ def column(path: str, dataset: Any) -> Column:
     packed = packing_of(path, dataset) if dataset.dtype.kind in "iuf" else None
 
     def read() -> Any:
+        with Hdf5Sources(path) as behind:
+            warn_of_column(path, behind.parts(path, dataset))
         stored = dataset[()]
         return stored if packed is None else packed.unpack(np.array(stored))
 
@@ -275,71 +275,3 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
                 f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py"
                 " nor hdf5plugin has"
             )
-
-
-def candidates(dataset: Any, name: str, *, raw: bool = False) -> list[Path]:
-    """Places of a file that holds values of a dataset, in the order in which HDF5 looks there.
-
-    raw: whether it is a file of raw values, for which HDF5 does not look beside the file.
-    """
-    folder = Path(dataset.file.filename).parent
-    key = "HDF5_EXTFILE_PREFIX" if raw else "HDF5_VDS_PREFIX"
-    prefixes = os.environ.get(key, "").replace("${ORIGIN}", str(folder))
-    places = [Path(prefix) for prefix in prefixes.split(":") if prefix]
-    if os.path.isabs(name):
-        return (
-            [Path(name)] if raw else [Path(name), *(p / Path(name).name for p in [*places, folder])]
-        )
-    if raw:
-        return [(places or [Path()])[0] / name]
-    return [*(place / name for place in (*places, folder)), Path(name)]
-
-
-def require_inside(path: Path, seen: set[Path] | None = None) -> None:
-    """Raise InputError if a file refers to another one outside its folder, whatever the object is.
-
-    It looks at links, raw files and virtual datasets without following any, and at the files
-    inside the folder that they name.
-
-    seen: files that were looked at, and those that will be.
-    """
-    import h5py
-
-    seen = {path.resolve()} if seen is None else seen
-    named: dict[str, None] = {}
-    with h5py.File(path, "r") as file:
-        groups, known = [file["/"].id], set()
-        while groups:
-            group = groups.pop()
-            info = h5py.h5o.get_info(group)
-            if info.addr in known:
-                continue
-            known.add(info.addr)
-            for name in list(group):
-                kind = group.links.get_info(name).type
-                if kind == h5py.h5l.TYPE_EXTERNAL:
-                    named[text_of(group.links.get_val(name)[0])] = None
-                if kind != h5py.h5l.TYPE_HARD:
-                    continue
-                opened = h5py.h5o.open(group, name)
-                if isinstance(opened, h5py.h5g.GroupID):
-                    groups.append(opened)
-                elif isinstance(opened, h5py.h5d.DatasetID):
-                    dataset = h5py.Dataset(opened)
-                    named |= {text_of(each[0]): None for each in dataset.external or ()}
-                    if dataset.is_virtual:
-                        named |= {each.file_name: None for each in dataset.virtual_sources()}
-        named.pop(".", None)
-        places = {
-            each: candidates(file["/"], each) + candidates(file["/"], each, raw=True)
-            for each in named
-        }
-    for name, found in places.items():
-        inside_folder(path, path.parent / name)
-        for place in found:
-            if not place.exists():
-                continue
-            inside_folder(path, place)
-            if place.resolve() not in seen and place.is_file() and h5py.is_hdf5(place):
-                seen.add(place.resolve())
-                require_inside(place, seen)

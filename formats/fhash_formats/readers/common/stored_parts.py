@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import itertools
 import operator
-import re
+import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,14 +23,24 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.failures import condense
-from fhash_formats.readers.common.hdf5_tree import candidates
 from fhash_formats.readers.common.layout import Layout
+from fhash_formats.readers.common.request import inside_folder
 from fhash_formats.series import NotStored
+from fhash_formats.support.attributes import text_of
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["Hdf5Sources", "StoredParts", "hdf5_parts", "labelled_parts", "not_stored", "zarr_parts"]
+__all__ = [
+    "Hdf5Sources",
+    "StoredParts",
+    "hdf5_parts",
+    "labelled_parts",
+    "not_stored",
+    "require_inside",
+    "warn_of_column",
+    "zarr_parts",
+]
 
 MAX_BOXES = 1 << 24
 """Boxes of a grid that are told apart; of a finer one only the share of the whole is known."""
@@ -90,6 +100,21 @@ class StoredParts:
                 share = np.average(share, axis=number, weights=weights)
         each: npt.NDArray[np.float64] = np.reshape(share, -1)
         return each
+
+
+def warn_of_column(name: str, parts: StoredParts | None) -> None:
+    """Warn (FhashWarning) of positions that nobody wrote.
+
+    One alone may well be the fill value, as a first time of 0, which Zarr does not store then.
+    """
+    share = 0.0 if parts is None else float(1 - parts.along(None, {})[0])
+    if parts is not None and share * prod(int(borders[-1]) for borders in parts.edges) > 1.5:
+        warnings.warn(
+            f"coordinate {name}: {100 * share:.3g} % of its values are not stored: read as"
+            f" {parts.fill}",
+            FhashWarning,
+            stacklevel=2,
+        )
 
 
 def whole(shape: Sequence[int], share: float, fill: Any) -> StoredParts:
@@ -356,6 +381,74 @@ class Hdf5Sources:
             raise InputError(f"{draws} {last}, which ends after {there} of {needed} bytes")
 
 
+def candidates(dataset: Any, name: str, *, raw: bool = False) -> list[Path]:
+    """Places of a file that holds values of a dataset, in the order in which HDF5 looks there.
+
+    raw: whether it is a file of raw values, for which HDF5 does not look beside the file.
+    """
+    folder = Path(dataset.file.filename).parent
+    key = "HDF5_EXTFILE_PREFIX" if raw else "HDF5_VDS_PREFIX"
+    prefixes = os.environ.get(key, "").replace("${ORIGIN}", str(folder))
+    places = [Path(prefix) for prefix in prefixes.split(":") if prefix]
+    if os.path.isabs(name):
+        return (
+            [Path(name)] if raw else [Path(name), *(p / Path(name).name for p in [*places, folder])]
+        )
+    if raw:
+        return [(places or [Path()])[0] / name]
+    return [*(place / name for place in (*places, folder)), Path(name)]
+
+
+def require_inside(path: Path, seen: set[Path] | None = None) -> None:
+    """Raise InputError if a file refers to another one outside its folder, whatever the object is.
+
+    It looks at links, raw files and virtual datasets without following any, and at the files
+    inside the folder that they name.
+
+    seen: files that were looked at, and those that will be.
+    """
+    import h5py
+
+    seen = {path.resolve()} if seen is None else seen
+    named: dict[str, None] = {}
+    with h5py.File(path, "r") as file:
+        groups, known = [file["/"].id], set()
+        while groups:
+            group = groups.pop()
+            info = h5py.h5o.get_info(group)
+            if info.addr in known:
+                continue
+            known.add(info.addr)
+            for name in list(group):
+                kind = group.links.get_info(name).type
+                if kind == h5py.h5l.TYPE_EXTERNAL:
+                    named[text_of(group.links.get_val(name)[0])] = None
+                if kind != h5py.h5l.TYPE_HARD:
+                    continue
+                opened = h5py.h5o.open(group, name)
+                if isinstance(opened, h5py.h5g.GroupID):
+                    groups.append(opened)
+                elif isinstance(opened, h5py.h5d.DatasetID):
+                    dataset = h5py.Dataset(opened)
+                    named |= {text_of(each[0]): None for each in dataset.external or ()}
+                    if dataset.is_virtual:
+                        named |= {each.file_name: None for each in dataset.virtual_sources()}
+        named.pop(".", None)
+        places = {
+            each: candidates(file["/"], each) + candidates(file["/"], each, raw=True)
+            for each in named
+        }
+    for name, found in places.items():
+        inside_folder(path, path.parent / name)
+        for place in found:
+            if not place.exists():
+                continue
+            inside_folder(path, place)
+            if place.resolve() not in seen and place.is_file() and h5py.is_hdf5(place):
+                seen.add(place.resolve())
+                require_inside(place, seen)
+
+
 def hdf5_parts(
     source: str, path: Path, names: Sequence[str]
 ) -> tuple[list[StoredParts | None], list[Path]]:
@@ -499,10 +592,10 @@ def labelled_parts(source: str, array: Any) -> tuple[StoredParts | None, dict[in
     data: Any = getattr(array, "_data", None)
     name, graph = getattr(data, "name", None), getattr(data, "__dask_graph__", None)
     if graph is not None:
-        known = dict(graph())
-        data = known.get(f"original-{name}")
+        layers = getattr(graph(), "layers", {})
+        data = dict(layers.get(f"original-{name}", {})).get(f"original-{name}")
         if data is None:
-            _warn_of_sources(source, known)
+            _warn_of_sources(source, layers)
     key: tuple[Any, ...] = ()
     while hasattr(data, "array"):
         key = getattr(getattr(data, "key", None), "tuple", key)
@@ -516,11 +609,10 @@ def labelled_parts(source: str, array: Any) -> tuple[StoredParts | None, dict[in
         return behind.parts(stored.name, stored), dict(enumerate(key))
 
 
-def _warn_of_sources(source: str, graph: Mapping[Any, Any]) -> None:
+def _warn_of_sources(source: str, layers: Mapping[str, Mapping[Any, Any]]) -> None:
     """Warn of arrays behind a graph of dask that are not stored whole."""
-    for key, data in graph.items():
-        if not str(key).startswith("original-"):
-            continue
+    for key, layer in layers.items():
+        data = dict(layer).get(key) if key.startswith("original-") else None
         while hasattr(data, "array"):
             data = data.array
         array: Any = getattr(data, "_array", None)
@@ -545,14 +637,20 @@ async def _stored_chunks(array: zarr.Array[Any], counts: tuple[int, ...]) -> set
 
     store, path = array.store_path.store, array.store_path.path
     prefix = f"{path}/" if path else ""
+    keys: list[str] = []
+    if isinstance(store, LocalStore):  # its own listing makes a path of each key
+        folder = os.path.join(store.root, path)
+        for place, _, names in os.walk(folder):
+            inner = place[len(folder) :].strip(os.sep).replace(os.sep, "/")
+            keys += [f"{inner}/{name}".removeprefix("/") for name in names]
+    else:
+        with contextlib.suppress(Exception):  # what a server raises that cannot list
+            keys += [key.removeprefix(prefix) async for key in store.list_prefix(prefix)]
     found: set[tuple[int, ...]] = set()
-    with contextlib.suppress(Exception):  # what a server raises that cannot list
-        async for key in store.list_prefix(prefix):
-            words = re.split(
-                r"[./]", key.removeprefix(prefix).removeprefix("c/").removeprefix("c.")
-            )
-            if len(words) == len(counts) and all(map(str.isdecimal, words)):
-                found.add(tuple(map(int, words)))
+    for key in keys:
+        words = key.removeprefix("c/").removeprefix("c.").replace(".", "/").split("/")
+        if len(words) == len(counts) and all(map(str.isdecimal, words)):
+            found.add(tuple(map(int, words)))
     inside = {each for each in found if all(map(operator.lt, each, counts))}
     if len(inside) == prod(counts) or isinstance(store, LocalStore | ZipStore):
         return inside

@@ -307,6 +307,30 @@ def test_a_fill_value_of_nan_or_of_xarray_is_missing_as_it_is(tmp_path: Path) ->
     assert told(tmp_path / "b.zarr") is None
 
 
+@pytest.mark.parametrize("missing", [1, 2])
+def test_positions_that_nobody_wrote_are_told(tmp_path: Path, missing: int) -> None:
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
+    names = ["time", "z", "y", "x"]
+    made = group.create_array(
+        "u", shape=VALUES.shape, dtype="f4", chunks=VALUES.shape, dimension_names=names
+    )
+    made[...] = VALUES
+    time = group.create_array("time", shape=6, dtype="f8", chunks=1, dimension_names=["time"])
+    time[missing:] = np.arange(missing, 6)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["u"] = VALUES
+        file.create_dataset("time", 6, "f8", chunks=(1,))[missing:] = np.arange(missing, 6)
+        file["time"].make_scale("time")
+        file["u"].dims[0].attach_scale(file["time"])
+    for name in ("a.zarr", "a.h5"):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            open_series(tmp_path / name, var="u").close()
+        told = {str(each.message) for each in caught}  # positions may be read again
+        assert len(told) == missing - 1
+        assert all("time: 33.3 % of its values are not stored: read as 0" in text for text in told)
+
+
 def test_strips_that_a_tiff_lacks_are_told(tmp_path: Path) -> None:
     tifffile = pytest.importorskip("tifffile")
     path = tmp_path / "a.tif"
