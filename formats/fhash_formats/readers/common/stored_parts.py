@@ -203,6 +203,7 @@ class Hdf5Sources:
         self._source = source
         self._open: dict[Path, Any] = {}
         self._known: dict[tuple[str, str], StoredParts | None] = {}
+        self._begun: set[tuple[str, str]] = set()
 
     def __enter__(self) -> Hdf5Sources:
         return self
@@ -225,10 +226,12 @@ class Hdf5Sources:
         key = (dataset.file.filename, dataset.name)
         if key in self._known:
             return self._known[key]
-        if depth > MAX_DEPTH:
+        if key in self._begun or depth > MAX_DEPTH:
             raise InputError(
-                f"{self._source}: {name}: more than {MAX_DEPTH} virtual datasets draw on each other"
+                f"{self._source}: {name} is a virtual dataset that draws on itself, or through more"
+                f" than {MAX_DEPTH} others"
             )
+        self._begun.add(key)
         found = None
         if dataset.is_virtual:
             found = self._virtual(name, dataset, depth)

@@ -109,6 +109,16 @@ def test_a_source_that_is_gone_is_refused_by_name(
     assert str(path) in str(caught.value)
 
 
+def test_a_virtual_dataset_that_draws_on_itself_is_refused(tmp_path: Path) -> None:
+    for one, other in (("a.h5", "b.h5"), ("b.h5", "a.h5")):
+        layout = h5py.VirtualLayout(VALUES.shape, VALUES.dtype)
+        layout[...] = h5py.VirtualSource(other, "u", VALUES.shape)
+        with h5py.File(tmp_path / one, "w") as file:
+            file.create_virtual_dataset("u", layout)
+    with pytest.raises(InputError, match="draws on itself"):
+        open_series(tmp_path / "a.h5")
+
+
 def test_a_numbered_row_of_sources_that_breaks_off_is_refused(tmp_path: Path) -> None:
     parts(tmp_path)
     path = tmp_path / "a.h5"
