@@ -29,7 +29,7 @@ from fhash_formats.container import (
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import MISSING
+from fhash_formats.container.header import MISSING, NOT_STORED
 from fhash_formats.container.named import Names
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
@@ -63,6 +63,10 @@ def describe_variable(series: Series) -> dict[str, Any]:
     }
     if series.fill is not None and math.isfinite(series.fill):
         variable["fill"] = series.fill
+    elif series.dtype.kind == "f" and series.defaults:
+        variable["fill"] = min(series.defaults)
+    if series.not_stored is not None:
+        variable[NOT_STORED] = series.not_stored.to_dict()
     return variable
 
 

@@ -141,6 +141,7 @@ class SourceOptions:
     missing: tuple[float, ...] = ()
     raw_values: bool = False
     keep_extremes: bool = False
+    no_external: bool = False
 
     @property
     def part(self) -> bool:
@@ -201,6 +202,7 @@ class SourceOptions:
             "missing": self.missing,
             "raw_values": self.raw_values,
             "select": dict(self.select),
+            "no_external": self.no_external,
         }
 
 
@@ -234,6 +236,11 @@ def series_options(command: Command) -> Command:
         "--keep-extremes",
         is_flag=True,
         help="An extreme value that repeats, far away from all others, is data.",
+    )
+    @click.option(
+        "--no-external",
+        is_flag=True,
+        help="Read no file outside the folder of DATA, whatever a header or a link in it names.",
     )
     @click.option(
         "--axes",

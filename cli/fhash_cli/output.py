@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 import click
 
-from fhash_cli.progress_bar import Progress, say
+from fhash_cli.progress_bar import Progress, one_line, say
 from fhash_formats.errors import (
     DamagedFileError,
     FhashError,
@@ -29,8 +29,8 @@ from fhash_formats.support.plain_json import plain_json, plain_text
 
 __all__ = [
     "Progress", "apart", "compared", "describe_error", "duration", "emit", "error_object",
-    "extent", "factor", "listed", "loss_rows", "number", "print_json", "printed", "quality_rows",
-    "say", "size", "spans", "table", "warn",
+    "extent", "factor", "listed", "loss_rows", "number", "one_line", "print_json", "printed",
+    "quality_rows", "say", "size", "spans", "table", "warn",
 ]  # fmt: skip
 
 KINDS: dict[str, tuple[type[Exception], ...]] = {
@@ -84,7 +84,7 @@ def emit(
     if as_json:
         print_json({**result, **({} if missed is None else error_object(missed))})
     else:
-        click.echo(plain_text(text))
+        click.echo("\n".join(map(one_line, plain_text(text).split("\n"))))
     if missed is not None:
         raise missed
 
@@ -115,7 +115,9 @@ def table(rows: Sequence[Sequence[str]]) -> str:
     """Rows of equal length as aligned columns.
 
     The first column is aligned to the left; where there are more than two, the others to the right.
+    Each cell is one line, whatever a file has for a name.
     """
+    rows = [[one_line(cell) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
 
     def line(row: Sequence[str]) -> str:
@@ -299,7 +301,7 @@ def describe_error(error: Exception) -> tuple[str, int]:
             " (FHASH_DEBUG=1 shows where it came from)",
             1,
         )
-    return " ".join(line.split()), code
+    return one_line(" ".join(line.split())), code
 
 
 def _is_no_memory(error: Exception) -> bool:

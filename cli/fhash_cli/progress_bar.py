@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+import unicodedata
 from types import TracebackType
 
 import click
@@ -27,11 +28,26 @@ UNEVEN_STAGES = frozenset({"planning"})
 """Stages whose parts take different times, so that no time left is foretold."""
 
 
+def one_line(text: str) -> str:
+    """The text with an escape such as "\\n" for each character that a terminal would obey.
+
+    Names and texts of a file could otherwise forge lines, and clear or colour the screen.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        char
+        if char.isprintable() or unicodedata.category(char) == "Zs"
+        else char.encode("unicode_escape").decode("ascii")
+        for char in text
+    )
+
+
 def say(message: str) -> None:
     """One line on stderr, in place of a bar that is drawn there."""
     for bar in tuple(_drawn):
         bar.erase()
-    click.echo(f"fhash: {message}", err=True)
+    click.echo(f"fhash: {one_line(message)}", err=True)
 
 
 def clock(seconds: float) -> str:
@@ -159,7 +175,7 @@ class Progress:
         """The note, and the time left where the parts of the stage take equally long."""
         share = self._done / self._total
         passed = now - self._stage_begun
-        note = f", {self._note}" if self._note else ""
+        note = f", {one_line(self._note)}" if self._note else ""
         if not 0 < share < 1 or self._stage in UNEVEN_STAGES:
             return note
         # Reckoned to the last report, and less what passed since then: it counts down.

@@ -7,10 +7,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fhash_cli.output import apart, extent, listed
+from fhash_cli.output import apart, extent, listed, one_line
 
 MIN_DIMENSIONS = 3
 """Dimensions of an array that may be a variable; others are named in one line."""
+
+UNOPENED = "what cannot be opened"
+"""Beginning of the problem of an array of which nothing is known."""
+
+MAX_NAMES = 8
+"""Names of one line; of more `listed` leaves some out."""
 
 MAX_TEXT = 300
 """Characters of an attribute that are shown."""
@@ -37,23 +43,29 @@ def listing(
         marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
         missing = f", missing where {marks}" if marks else ""
         dtype = variable["dtype"] + stored
-        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
+        lines += ["", f"{variable['name']}: {dtype}, {shape}{units}{missing}"]
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
     if len(good) > 1 and all(len(variable["commands"]) == 1 for variable in good):
         words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
-        lines.append(f"\nall in one file:\n  {shlex.join(words)}")
+        lines += ["", "all in one file:", f"  {shlex.join(words)}"]
     rest = [variable for variable in variables if variable["problem"]]
-    others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
-    small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]
+    others: list[Mapping[str, Any]] = []
+    small: list[Mapping[str, Any]] = []
+    for variable in rest:
+        known = len(variable["shape"]) < MIN_DIMENSIONS
+        (small if known and not variable["problem"].startswith(UNOPENED) else others).append(
+            variable
+        )
     if others:
-        lines.append("\nnot to be encoded:")
+        lines += ["", "not to be encoded:"]
         lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
     if small:
         names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
-        lines.append(f"\nbelow {MIN_DIMENSIONS} dimensions: {listed(names)}")
-    return "\n".join(lines)
+        count = f"; {len(names)} in all" if len(names) > MAX_NAMES else ""
+        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}{count}"]
+    return "\n".join(map(one_line, lines))
 
 
 def _dimension(name: str, length: int, axis: str) -> str:
@@ -88,6 +100,7 @@ def details(series: Series) -> dict[str, Any]:
         "dtype": (series.source_dtype or series.dtype).name,
         "units": series.units,
         "fill": series.fill,
+        "not_stored": None if series.not_stored is None else series.not_stored.to_dict(),
         "coordinates": coordinates,
         "attributes": json_attributes(series.attributes, without=frozenset()),
     }
@@ -99,10 +112,20 @@ def details_rows(series: Series) -> list[tuple[str, str]]:
 
     rows = [("t, z, y, x", extent(series.shape))]
     rows += [(f"  {axis}", positions(series.coords[axis], axis)) for axis in "tzyx"]
+    if series.not_stored is not None:
+        rows.append(("not stored", not_stored_text(series.not_stored.to_dict())))
     for name, value in json_attributes(series.attributes).items():
         text = " ".join(str(value).split())
         rows.append((name, text if len(text) <= MAX_TEXT else text[:MAX_TEXT] + "..."))
     return rows
+
+
+def not_stored_text(told: Mapping[str, Any]) -> str:
+    """Values that nobody wrote, as a header has them, in words."""
+    from fhash_formats.series import spans_text
+
+    fill = f", read as {told['fill']:.9g}" if "fill" in told else ""
+    return f"{100 * told['share']:.3g} % of the values ({spans_text(told['steps'])}){fill}"
 
 
 def positions(coordinate: Coordinate, axis: str) -> str:

@@ -19,12 +19,13 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.lazy import DaskSeries, LazyFrames, is_lazy
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.cf_packing import note_packing
+from fhash_formats.readers.common.cf_packing import note_packing, packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
 from fhash_formats.readers.common.netcdf_store import declared
 from fhash_formats.readers.common.netcdf_surroundings import stored_variable
 from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.stored_parts import labelled_parts
 from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
@@ -37,12 +38,20 @@ from fhash_formats.readers.netcdf import NetcdfFile
 from fhash_formats.series import (
     AXES,
     ArraySeries,
+    NotStored,
     Series,
     check_coords,
     check_values,
     index_coordinate,
+    warn_not_stored,
 )
-from fhash_formats.source_metadata import COORDINATES, NAMING, SourceMetadata, references
+from fhash_formats.source_metadata import (
+    COORDINATES,
+    NAMING,
+    SourceMetadata,
+    plain_form,
+    references,
+)
 from fhash_formats.support.attributes import PACKING, STORED, json_attributes
 from fhash_formats.support.dates import clock
 
@@ -143,7 +152,10 @@ class LabelledSeries(Series):
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | found.coordinates(variable, layout)
+        } | {
+            axis: replace(each, name=plain_form(each.name))
+            for axis, each in found.coordinates(variable, layout).items()
+        }
         self.coords["t"], self.remark = settled(self.coords["t"])
         if self.remark:
             warnings.warn(f"{found.source}: {self.remark}", FhashWarning, stacklevel=4)
@@ -156,6 +168,34 @@ class LabelledSeries(Series):
             note_packing(self, self._packing)
         self.metadata = lambda: self._metadata_of(array, beside, request)
         self.lazy = LazyFrames(self._in_order(array)) if is_lazy(array) else None
+        self.not_stored = self._never_stored()
+        warn_not_stored(self)
+
+    def _never_stored(self) -> NotStored | None:
+        """Values behind the array that nobody wrote, as far as xarray shows them."""
+        variable = self._array.variable
+        parts, key = labelled_parts(self.source, variable)
+        if parts is None:
+            return None
+        lengths = [int(borders[-1]) for borders in parts.edges]
+        chosen = {place: np.arange(lengths[place])[each] for place, each in key.items()}
+        # an index that is a number takes its dimension away
+        left = [n for n in range(len(lengths)) if not isinstance(key.get(n), int | np.integer)]
+        if len(left) != len(self._axes):
+            return None
+        time = left[self._axes.index("t")] if "t" in self._axes else None
+        shares = 1 - parts.along(time, chosen)
+        told = variable.encoding
+        stored = np.dtype(told.get("dtype", variable.dtype))
+        fill = np.array([parts.fill])
+        if stored.kind in "iuf":
+            packed = packing(
+                self.source, stored, {key: told[key] for key in OF_FILE if key in told}
+            )
+            fill = packed.unpack(fill.astype(stored))
+        if not shares.any() or fill[0] != fill[0]:
+            return None
+        return NotStored(shares=shares, fill=fill[0].item())
 
     def _in_order(self, array: Any) -> Any:
         """The dask array of a labelled one, as (t, z, y, x)."""

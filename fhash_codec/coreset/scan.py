@@ -16,7 +16,7 @@ from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
-from fhash_formats.series import Series
+from fhash_formats.series import Series, warn_defaults
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +85,7 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
             "there is nothing to encode"
         )
     extremes.refuse(series)
+    warn_defaults(series)
     return _scan_of(low, high, mean, missing)
 
 

@@ -11,6 +11,8 @@ The contract of every reader:
 
 from __future__ import annotations
 
+import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -22,10 +24,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, RegionError
-from fhash_formats.source_metadata import SourceMetadata
+from fhash_formats.errors import FhashWarning, InputError, RegionError
+from fhash_formats.source_metadata import SourceMetadata, with_plain_names
 
 AXES = ("t", "z", "y", "x")
+MAX_SPANS = 64
+"""Runs of steps that are told one by one."""
 AXIS_NAMES = {"t": "time", "z": "z", "y": "y", "x": "x"}
 """Name of each axis in a container, and of a coordinate that the source does not name."""
 
@@ -50,6 +54,44 @@ def index_coordinate(axis: str, length: int) -> Coordinate:
     return Coordinate(name=AXIS_NAMES[axis], values=np.arange(length, dtype=np.float64))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NotStored:
+    """Values of a series that nobody wrote: one number stands in their place.
+
+    Attributes:
+        shares: of the values of each step, 0 to 1, float64 (t,).
+        fill: that number, as it is read.
+    """
+
+    shares: npt.NDArray[np.float64]
+    fill: float | int
+
+    @property
+    def share(self) -> float:
+        """Share of all values."""
+        return float(self.shares.mean())
+
+    def spans(self) -> list[list[int]]:
+        """Steps of which something was not stored, as [first, last + 1]; the last may be longer."""
+        steps = np.flatnonzero(self.shares)
+        ends = np.flatnonzero(np.diff(steps) > 1)
+        firsts, lasts = steps[np.r_[0, ends + 1]], steps[np.r_[ends, len(steps) - 1]]
+        spans = [[int(first), int(last) + 1] for first, last in zip(firsts, lasts, strict=True)]
+        if len(spans) > MAX_SPANS:
+            spans[MAX_SPANS - 1 :] = [[spans[MAX_SPANS - 1][0], spans[-1][1]]]
+        return spans
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values, as the header of a container has them."""
+        found: dict[str, Any] = {"share": round(self.share, 6), "steps": self.spans()}
+        return found | ({"fill": self.fill} if math.isfinite(self.fill) else {})
+
+    def of_steps(self, steps: Sequence[int]) -> NotStored | None:
+        """The same of some steps; None where everything of these was stored."""
+        shares = self.shares[list(steps)]
+        return replace(self, shares=shares) if shares.any() else None
+
+
 class Series(ABC):
     """A time-varying volume (t, z, y, x), read frame by frame.
 
@@ -72,6 +114,9 @@ class Series(ABC):
         unlikely: values that stand for the lowest integers of the stored type, where counts are
             unpacked; they are hardly ever data.
         remark: what is to be said of the times, "" for nothing.
+        not_stored: what of the values nobody wrote; None where nothing is known of such.
+        defaults: default fill values of the format that were met in the frames read so far, of an
+            array that declares no other. Among floats they are missing.
     """
 
     source: str
@@ -88,16 +133,29 @@ class Series(ABC):
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
     remark: str = ""
+    not_stored: NotStored | None = None
+    defaults: AbstractSet[float] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
     @property
     def metadata(self) -> SourceMetadata | None:
         """All that belongs to the variable in its source; None where nothing is known.
 
-        It is read at the first use. Warns (FhashWarning) of what is left out.
+        It is read at the first use. Warns (FhashWarning) of what is left out, and of names that
+        other files could not have and that were changed.
         """
         if callable(self._metadata):
-            self._metadata = self._metadata()
+            found = self._metadata()
+            self._metadata = found
+            if found is not None:
+                self._metadata, names = with_plain_names(found)
+                if names:
+                    told = ", ".join(f"{old[:40]!r} to {new!r}" for old, new in names.items())
+                    warnings.warn(
+                        f"{self.source}: names that other files cannot have were changed: {told}",
+                        FhashWarning,
+                        stacklevel=2,
+                    )
         return self._metadata
 
     @metadata.setter
@@ -133,6 +191,7 @@ class Series(ABC):
         self.source_dtype, self.fill = series.source_dtype, series.fill
         self.occurring = series.occurring
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
+        self.not_stored, self.defaults = series.not_stored, series.defaults
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
@@ -149,6 +208,41 @@ class Series(ABC):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def spans_text(spans: Sequence[Sequence[int]]) -> str:
+    """Runs of steps for people: "step 3", "steps 0 to 4, 7"."""
+    words = [str(a) if b == a + 1 else f"{a} to {b - 1}" for a, b in spans]
+    shown = [*words[:8], "..."] if len(words) > 8 else words
+    one = len(words) == 1 and spans[0][1] == spans[0][0] + 1
+    return f"step{'' if one else 's'} {', '.join(shown)}"
+
+
+def warn_not_stored(series: Series) -> None:
+    """Warn (FhashWarning) of values that nobody wrote, in one line."""
+    found = series.not_stored
+    if found is None:
+        return
+    fill = f"{found.fill:.9g}" if isinstance(found.fill, float) else str(found.fill)
+    warnings.warn(
+        f"{series.source}: {100 * found.share:.3g} % of the values of '{series.name}' are not"
+        f" stored ({spans_text(found.spans())}): read as {fill}; --missing {fill} takes that number"
+        " for a missing value",
+        FhashWarning,
+        stacklevel=3,
+    )
+
+
+def warn_defaults(series: Series) -> None:
+    """Warn (FhashWarning) of default fill values that were met, in one line."""
+    for value in series.defaults:
+        what = f"{series.source}: '{series.name}' declares no fill value and has the default one of"
+        what += f" NetCDF, {value:.9g}, which stands for values that nobody wrote: "
+        if series.dtype.kind == "f":
+            what += "it is missing, by NetCDF's convention; --keep-extremes keeps the number"
+        else:
+            what += f"it is kept as a number; --missing {value} takes it for a missing value"
+        warnings.warn(what, FhashWarning, stacklevel=3)
 
 
 def empty_selection(steps: int) -> str:
@@ -172,6 +266,8 @@ class StepsSeries(Series):
         self.source, self.name, self.units = series.source, series.name, series.units
         self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
         self.inherit(series)
+        if series.not_stored is not None:
+            self.not_stored = series.not_stored.of_steps(self.steps)
         self.metadata = self._metadata_of_steps
         self.shape = (len(self.steps), *series.shape[1:])
         time = series.coords["t"]

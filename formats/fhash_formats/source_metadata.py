@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.support.plain_json import plain_text
+
 __all__ = [
     "COORDINATES",
     "NAMING",
@@ -24,10 +26,12 @@ __all__ = [
     "SourceVariable",
     "is_plain_name",
     "meant",
+    "plain_form",
     "references",
     "renamed",
     "shown_name",
     "with_history",
+    "with_plain_names",
     "without_names",
 ]
 
@@ -38,6 +42,8 @@ COORDINATES = "coordinates"
 
 MAX_NAME = 256
 """Letters of a name."""
+MAX_FILE_NAME = 240
+"""Bytes of a name that may become that of a file or folder."""
 
 NAMING = (
     "grid_mapping",
@@ -237,3 +243,54 @@ def is_plain_name(name: object) -> bool:
         and bool(name.strip("._"))
         and not name.startswith("__")
     )
+
+
+def plain_form(name: str, taken: Collection[str] = (), *, default: str = "unnamed") -> str:
+    """The name as files and folders of every format take it, and as none of `taken` is.
+
+    It is the name itself where that is so.
+
+    default: stands for a name of which nothing is left.
+    """
+    safe = (c if c.isprintable() and c not in "/\\" else "_" for c in plain_text(name))
+    text = "".join(safe).strip()
+    while len(text.encode(errors="replace")) > MAX_FILE_NAME:
+        text = text[:-1].strip()
+    if text.startswith("__"):
+        text = f"_{text.lstrip('_')}"
+    if text == "zarr.json" or text.startswith(".z"):  # files of Zarr
+        text = text.replace(".", "_")
+    text = text if text.strip("._") else default
+    number, found = 2, text
+    while found in taken:
+        found, number = f"{text}_{number}", number + 1
+    return found
+
+
+def with_plain_names(metadata: SourceMetadata) -> tuple[SourceMetadata, dict[str, str]]:
+    """The metadata with names that every format takes, and the new names by the old ones."""
+    every = dict.fromkeys(metadata.dimensions)
+    for variable in metadata.variables:
+        every |= dict.fromkeys([variable.name, *variable.dimensions])
+    names: dict[str, str] = {}
+    taken = {name for name in every if plain_form(name) == name}
+    for name in every:
+        if name not in taken:
+            names[name] = plain_form(name, taken | set(names.values()))
+    if not names:
+        return metadata, {}
+    variables = tuple(
+        replace(
+            variable,
+            name=names.get(variable.name, variable.name),
+            dimensions=tuple(names.get(each, each) for each in variable.dimensions),
+            attributes=renamed(variable.attributes, names),
+        )
+        for variable in metadata.variables
+    )
+    return replace(
+        metadata,
+        dimensions={names.get(name, name): axis for name, axis in metadata.dimensions.items()},
+        variable_attributes=renamed(metadata.variable_attributes, names),
+        variables=variables,
+    ), names

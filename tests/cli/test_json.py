@@ -141,6 +141,7 @@ def test_serve(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None
     check("serve", parsed(fhash("serve", run, "--port", 0, "--json")))
 
 
+@pytest.mark.filterwarnings("default::fhash_formats.errors.FhashWarning")
 def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.fhz"
     outputs: dict[str, list[Any]] = {"encode": [], "diff": [], "info": [], "info DATA": []}
@@ -162,6 +163,15 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         more = [] if words[0] == "decode" else ["-o", other, "--effort", "1"]
         parsed(fhash(*words, *more, "--json", "-q"))
     outputs["info"].append(parsed(fhash("info", other, "--json")))
+    partly = tmp_path / "partly.h5"
+    with h5py.File(partly, "w") as file, h5py.File(data) as whole:
+        shape = whole["density"].shape
+        file.create_dataset("density", shape, "f4", chunks=(1, *shape[1:]))[1:] = whole["density"][
+            1:
+        ]
+    parsed(fhash("encode", partly, "-o", other, "--effort", "1", "--force", "--json", "-q"))
+    outputs["info"].append(parsed(fhash("info", other, "--json")))
+    outputs["info DATA"].append(parsed(fhash("info", partly, "--var", "density", "--json")))
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     outputs["encode --explain"] = explained
     words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]

@@ -1,4 +1,4 @@
-"""Goldens on the vector units of other machines: numpy's loops and BLAS kernels differ in last bits."""
+"""Goldens on other machines, whose vector units and BLAS kernels give other last bits."""
 
 from __future__ import annotations
 

@@ -33,6 +33,7 @@ from fhash_cli.output import (
     emit,
     extent,
     loss_rows,
+    one_line,
     quality_rows,
     say,
     size,
@@ -247,7 +248,7 @@ def _emit_several(
     ]
     text = f"{table(rows)}\n\n{table(report_table(variables))}"
     for name, figures in variables.items():
-        text += _explained(figures, explain, f"{name}\n")
+        text += _explained(figures, explain, f"{one_line(name)}\n")
     emit(report, text, as_json, missed)
 
 

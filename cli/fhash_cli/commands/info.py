@@ -18,12 +18,19 @@ from fhash_cli.output import (
     listed,
     loss_rows,
     number,
+    one_line,
     quality_rows,
     size,
     spans,
     table,
 )
-from fhash_cli.source_listing import details, details_rows, listing, positions
+from fhash_cli.source_listing import (
+    details,
+    details_rows,
+    listing,
+    not_stored_text,
+    positions,
+)
 from fhash_cli.variables import info_table
 
 if TYPE_CHECKING:
@@ -92,7 +99,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
         ("file", f"{dataset.path}, format {'.'.join(map(str, version))}"),
         ("size", compared(result)),
     ]
-    more = f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one"
+    more = one_line(f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one")
     emit(result, f"{table(rows)}\n\n{table(info_table(infos))}\n\n{more}", as_json)
 
 
@@ -121,6 +128,11 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             f"{volume.name}, {dtype}"
             + (f", in {volume.units}" if volume.units not in ("", "1") else "")
             + _missing(volume),
+        ),
+        *(
+            [("not stored", not_stored_text(info["variable"]["not_stored"]))]
+            if "not_stored" in info["variable"]
+            else []
         ),
         *_source(volume),
         ("t, z, y, x", extent(volume.shape)),

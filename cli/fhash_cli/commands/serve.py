@@ -8,7 +8,7 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import json_option, run_argument
-from fhash_cli.output import emit, say
+from fhash_cli.output import emit, one_line, say
 
 PORT = 8642
 """Port unless another is asked for."""
@@ -55,7 +55,7 @@ def command(run: str, port: int, host: str, origins: tuple[str, ...], as_json: b
         arrays = list(view.names.values())
         emit(
             {"path": run, "url": server.url, "arrays": arrays},
-            f"{run}: {', '.join(arrays)} at {server.url}\n"
+            f"{one_line(run)}: {one_line(', '.join(arrays))} at {server.url}\n"
             f'  xarray.open_zarr("{server.url}")\nCtrl-C ends it.',
             as_json,
         )

@@ -6,7 +6,7 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import json_option, quiet_option, run_argument, variable_option
-from fhash_cli.output import Progress, emit
+from fhash_cli.output import Progress, emit, one_line
 
 
 @click.command("verify", cls=BaseCommand)
@@ -22,6 +22,6 @@ def command(run: str, variable: str | None, as_json: bool, quiet: bool) -> None:
         arrays = volume.verify(progress=progress)
     emit(
         {"path": run, "sound": True, "arrays": arrays},
-        f"{run}: sound, {arrays} arrays checked",
+        f"{one_line(run)}: sound, {arrays} arrays checked",
         as_json,
     )

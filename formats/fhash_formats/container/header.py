@@ -66,6 +66,8 @@ QUALITY = (
 """Figures in `quality`, each a number or null."""
 MISSING = ("outside",)
 """Values of `missing`: the vertices outside the coreset are those without a value."""
+NOT_STORED = "not_stored"
+"""Key of `variable`: what nobody wrote of the values."""
 HISTORY = ("seconds", "epoch", "psnr")
 """Figures of an entry of `history`, each a number or null."""
 CODED = "transform"
@@ -179,9 +181,28 @@ def _check_source(top: Record) -> np.dtype[Any]:
     variable.record("attributes")
     if variable.has("fill"):
         variable.number("fill")
+    if variable.has(NOT_STORED):
+        _check_not_stored(variable.record(NOT_STORED))
     if top.has("missing"):
         top.choice("missing", MISSING)
     return dtype
+
+
+def _check_not_stored(told: Record) -> None:
+    """Check `variable.not_stored`."""
+    told.need(0 <= told.number("share") <= 1, "share", "a number from 0 to 1")
+    spans = told.get("steps")
+    pairs = isinstance(spans, list) and all(
+        isinstance(span, list) and len(span) == 2 and all(type(n) is int for n in span)
+        for span in spans
+    )
+    told.need(
+        pairs and all(0 <= first < end <= MAX_LENGTH for first, end in spans),
+        "steps",
+        "pairs of a step and the end of the run that it begins",
+    )
+    if told.has("fill"):
+        told.number("fill")
 
 
 def _check_values(top: Record, dtype: np.dtype[Any]) -> None:

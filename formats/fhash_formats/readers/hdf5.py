@@ -5,7 +5,7 @@ NetCDF files are HDF5 too, but have rules of their own (netcdf.py).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -19,15 +19,13 @@ from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import (
     column,
     columns,
-    datasets,
-    files_beside,
     own_name,
     packing_of,
     require_filters,
-    require_sources,
     texts_of,
     units_of,
     variables,
+    walk,
 )
 from fhash_formats.readers.common.layout import (
     Dimension,
@@ -41,6 +39,7 @@ from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.stored_parts import Hdf5Sources, not_stored
 from fhash_formats.readers.common.times import counts_steps, written_times
 from fhash_formats.readers.common.variables import (
     Variable,
@@ -96,8 +95,9 @@ class Hdf5File:
 
     def __init__(self, source: str, path: Path, file: Any, request: Request) -> None:
         self.source, self.path, self.file, self.request = source, path, file, request
-        self.tree = dict(datasets(file))
-        self.variables = step_groups.join(expand(variables(self.tree)), self._attributes)
+        found = walk(file)
+        self.tree, self.groups = found.datasets, found.groups
+        self.variables = step_groups.join(expand(variables(found)), self._attributes)
 
     def dimensions(self, variable: Variable) -> list[Dimension]:
         """The dimensions of a variable, with what the file says about each."""
@@ -127,7 +127,6 @@ class Hdf5File:
         """Raise an error that says what is missing, if the values cannot be read here."""
         for member in variable.members or (variable,):
             require_filters(self.source, member.name, member.handle)
-            require_sources(self.source, self.path, member.name, member.handle)
 
     def packing(self, variable: Variable) -> Packing | None:
         """The packing of the values, None where the user wants them as stored."""
@@ -186,7 +185,7 @@ class Hdf5File:
         return coords
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
-        attributes: Mapping[str, Any] = self.file[path or "/"].attrs
+        attributes: Mapping[str, Any] = (self.groups.get(path) or self.tree[path]).attrs
         return attributes
 
     def _scalar(self, path: str) -> tuple[float, str] | None:
@@ -220,6 +219,10 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     trailing = first.shape[first.handle.ndim :]
     coords = found.coordinates(variable, layout)
     names = {*AXIS_NAMES.values()} | {each.name for each in coords.values()}
+    with Hdf5Sources(source) as behind:
+        parts = [
+            behind.parts(member.name, member.handle) for member in variable.members or (variable,)
+        ]
     return FileSeries(
         source=source,
         name=plain_name(shown_name(variable.name, names)),
@@ -237,13 +240,16 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         | layout.attributes(),
         chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
         close=file.close,
-        beside=[
-            file
-            for member in variable.members or (variable,)
-            for file in files_beside(path, member.handle)
-        ],
+        beside=_beside(path, variable, behind.files),
         packing=packed,
+        not_stored=not_stored(parts, layout, joined=bool(variable.members)),
     )
+
+
+def _beside(path: Path, variable: Variable, files: Iterable[Path]) -> list[Path]:
+    """The other files that hold values: those of external links, and those behind datasets."""
+    linked = [Path(member.handle.file.filename) for member in variable.members or (variable,)]
+    return [file for file in dict.fromkeys([*linked, *files]) if file != path]
 
 
 def list_hdf5(path: Path, request: Request) -> list[Listed]:

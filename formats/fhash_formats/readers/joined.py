@@ -8,7 +8,7 @@ import re
 import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.errors import FhashWarning, InputError, MissingInputError
 from fhash_formats.readers.common.failures import FolderStamp, Stamp
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.joined_surroundings import joined_metadata
 from fhash_formats.readers.common.times import is_numbered, join_times
-from fhash_formats.series import Coordinate, Series, index_coordinate
+from fhash_formats.series import Coordinate, NotStored, Series, index_coordinate
 from fhash_formats.source_metadata import SourceMetadata
 
 
@@ -47,6 +47,36 @@ def files_of(pattern: str) -> list[Path]:
     if not files:
         raise MissingInputError(f"no file matches {pattern}")
     return [Path(name) for name in files]
+
+
+def warn_of_gaps(pattern: str, paths: Sequence[Path]) -> None:
+    """Warn (FhashWarning) of numbers that the names of files leave out.
+
+    They go up by one step as a rule, and somewhere by several. Dates are no such numbers.
+    """
+    words = [re.split(r"([0-9]+)", str(path)) for path in paths]
+    if len({len(each) for each in words}) > 1:
+        return
+    places = [n for n in range(len(words[0])) if len({each[n] for each in words}) > 1]
+    if len(places) != 1 or re.match(r"(19|20)[0-9]{4}", words[0][places[0]]):
+        return
+    texts = [each[places[0]] for each in words]
+    if not all(text.isdecimal() and len(text) < 18 for text in texts):
+        return
+    gaps = np.diff(np.array(texts, dtype=np.int64))
+    usual = gaps.min(initial=1 << 62)
+    if usual < 1 or (gaps == usual).sum() * 2 < len(gaps) or (gaps % usual).any():
+        return
+    (wide,) = np.nonzero(gaps > usual)
+    if wide.size and len(gaps) > 1:
+        first = int(wide[0])
+        missing = int((gaps[wide] // usual - 1).sum())
+        warnings.warn(
+            f"{pattern}: {missing} numbers are left out, the first between {paths[first].name} and"
+            f" {paths[first + 1].name}; the steps are taken as they are there",
+            FhashWarning,
+            stacklevel=2,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +119,8 @@ class JoinedSeries(Series):
         names: list[str] = []
         counted = True
         files: list[Path] = []
+        shares: list[npt.NDArray[np.float64]] = []
+        never: NotStored | None = None
         first: Series | None = None
         for path in paths:
             with open_part(path) as part:
@@ -98,6 +130,9 @@ class JoinedSeries(Series):
                 self._parts.append(
                     _Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time)
                 )
+                never = never or part.not_stored
+                told = part.not_stored
+                shares.append(np.zeros(part.shape[0]) if told is None else told.shares)
                 names.append(part.name)
                 self.remark = self.remark or part.remark
                 counted = counted and not is_numbered(part.remark)
@@ -106,8 +141,12 @@ class JoinedSeries(Series):
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self.inherit(first)
+        if never is not None:
+            self.not_stored = replace(never, shares=np.concatenate(shares))
         self._met = set(first.occurring)
         self.occurring = self._met
+        self._defaults = set(first.defaults)
+        self.defaults = self._defaults
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times(counted)}
@@ -122,6 +161,7 @@ class JoinedSeries(Series):
         part = self._current[1]
         frame = part.read(step - (self._ends[number] - self._parts[number].steps))
         self._met.update(part.occurring)
+        self._defaults.update(part.defaults)
         return frame
 
     def check(self) -> None:
@@ -162,6 +202,8 @@ class JoinedSeries(Series):
     def _times(self, counted: bool) -> Coordinate:
         """The times of all files; the numbers of the steps unless all files count theirs."""
         times = [(part.path, part.time) for part in self._parts if part.time is not None]
+        if not times and all(part.steps == 1 for part in self._parts):
+            warn_of_gaps(self.source, [part.path for part in self._parts])
         if not times or not counted:
             return index_coordinate("t", self.shape[0])
         for part in self._parts:

@@ -33,9 +33,11 @@ from fhash_formats.readers.common.stored_bytes import (
     StoredArray,
     StoredBytes,
     in_files,
+    numbered_files,
 )
 from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import Coordinate
+from fhash_formats.support.plain_json import decoded_text
 
 SUFFIXES = (".mha", ".mhd")
 
@@ -89,7 +91,7 @@ def open_metaimage(path: Path, request: Request) -> FileSeries:
         _, component = variable.handle
         hints = ["t", "z", "y", "x"][-len(shape) :]
         axes = assign_axes(source, shape, hints, hints, request.axes)
-        stored, files = _stored(path, fields, lines, end, sizes, channels, dtype)
+        stored, files = _stored(path, fields, lines, end, sizes, channels, dtype, request)
         coords = _coordinates(fields, sizes) if request.axes is None else {}
     array = StoredArray(path, (*shape, channels), dtype, stored)
 
@@ -115,7 +117,7 @@ def _header(path: Path) -> tuple[dict[str, str], list[str], int]:
     fields: dict[str, str] = {}
     with path.open("rb") as file:
         while line := file.readline(MAX_HEADER):
-            text = line.decode("utf-8", errors="replace").strip()
+            text = decoded_text(line).strip()
             if file.tell() > MAX_HEADER:
                 raise InputError(f"its header is longer than {MAX_HEADER} bytes")
             if not text:
@@ -127,7 +129,7 @@ def _header(path: Path) -> tuple[dict[str, str], list[str], int]:
             if key.strip() == "ElementDataFile":
                 names = []
                 if value.split()[:1] == ["LIST"]:
-                    rest = file.read(MAX_HEADER).decode("utf-8", errors="replace")
+                    rest = decoded_text(file.read(MAX_HEADER))
                     names = [name.strip() for name in rest.splitlines() if name.strip()]
                 return fields, names, file.tell()
     raise InputError("its header has no ElementDataFile; the file is cut or no MetaImage")
@@ -138,7 +140,7 @@ def _sizes(fields: Fields) -> tuple[int, ...]:
     if fields.get("ObjectType", "Image") != "Image":
         raise InputError(f"its ObjectType is {fields['ObjectType']!r}; Image can be read")
     words = fields.get("DimSize", "").split()
-    if not all(word.isascii() and word.isdigit() and int(word) > 0 for word in words):
+    if not all(re.fullmatch("0{0,9}[1-9][0-9]{0,17}", word) for word in words):
         raise InputError(f"its DimSize is {fields['DimSize']!r}; whole numbers above 0 are needed")
     if len(words) not in (2, 3, 4) or fields.get("NDims") != str(len(words)):
         raise InputError(
@@ -176,6 +178,7 @@ def _stored(
     sizes: Sequence[int],
     channels: int,
     dtype: np.dtype[Any],
+    request: Request,
 ) -> tuple[StoredBytes, list[Path]]:
     """The bytes of the values, and the other files that hold them."""
     size = prod(sizes) * channels * dtype.itemsize
@@ -183,31 +186,15 @@ def _stored(
     if data.upper() == "LOCAL":
         return _one_file(path, fields, end, size, dtype), []
     words = data.split()
-    if words[:1] == ["LIST"]:
-        names = list(listed)
-        if not names:
-            raise InputError("its list of files is empty")
-    elif len(words) >= 4 and "%" in words[0]:
-        names = _numbered(words, prod(sizes))
+    if words[:1] == ["LIST"] and not listed:
+        raise InputError("its list of files is empty")
+    if len(words) >= 4 and "%" in words[0]:
+        files = numbered_files(path.parent, words[0], words[1:4], prod(sizes))
     else:
-        names = [data]
-    files = [path.parent / name for name in names]
+        files = [path.parent / name for name in (listed if words[:1] == ["LIST"] else [data])]
+    request.require_inside(path, *files)
     stored = in_files(files, size, lambda file, part: _one_file(file, fields, 0, part, dtype))
     return stored, list(dict.fromkeys(files))
-
-
-def _numbered(words: Sequence[str], most: int) -> list[str]:
-    """Names of a C pattern such as `slice_%03d.raw 1 64 1`."""
-    form, *numbers = words
-    if not re.fullmatch(r"[^%]*%0?\d*[du][^%]*", form) or not all(
-        re.fullmatch(r"-?\d{1,9}", number) for number in numbers[:3]
-    ):
-        raise InputError(f"its pattern of files is {' '.join(words)!r}")
-    first, last, stride = map(int, numbers[:3])
-    if stride < 1 or not 0 <= (last - first) // stride < most:
-        raise InputError(f"its pattern of files is {' '.join(words)!r}")
-    form = re.sub(r"(%0?\d*)u", r"\1d", form)
-    return [form % number for number in range(first, last + 1, stride)]
 
 
 def _one_file(

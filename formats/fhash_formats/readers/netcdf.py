@@ -35,6 +35,7 @@ from fhash_formats.readers.common.netcdf_store import (
     check_filters,
     close_groups,
     declared,
+    default_fill,
     exactly_filled,
     magic_of,
     open_groups,
@@ -44,6 +45,7 @@ from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.stored_parts import hdf5_parts, not_stored
 from fhash_formats.readers.common.times import (
     MAX_LETTERS,
     only_counts,
@@ -274,6 +276,8 @@ def _series(
             close_groups(each)
 
     try:
+        members = [each.name for each in variable.members or (variable,)]
+        parts, beside = hdf5_parts(source, path, members)
         chunks = array.encoding.get("chunksizes")
         # without names, dimensions have those of the axes
         names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
@@ -290,6 +294,9 @@ def _series(
             chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
             close=close,
             packing=packed,
+            beside=beside,
+            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+            default_fill=None if request.raw_values else default_fill(array, packed),
         )
     except BaseException:
         close()

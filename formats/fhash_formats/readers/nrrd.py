@@ -43,12 +43,14 @@ from fhash_formats.readers.common.nrrd_header import (
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_name
 from fhash_formats.readers.common.stored_bytes import (
+    MAX_FILES,
     CompressedFile,
     NumbersInText,
     PlainFile,
     StoredArray,
     StoredBytes,
     in_files,
+    numbered_files,
 )
 from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
@@ -91,7 +93,7 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
         var = component_by_number(request.var, values)
         variable = choose(source, values, var, booleans=request.booleans)
         _, component = variable.handle
-        stored, files = _stored(path, fields, end, sizes, dtype)
+        stored, files = _stored(path, fields, end, sizes, dtype, request)
         array = StoredArray(path, tuple(reversed(sizes)), dtype, stored)
         coords = _coordinates(fields, pairs, sizes, axes)
     slow = tuple(axis for axis in reversed(axes) if axis)
@@ -173,13 +175,19 @@ def _content(fields: Fields, path: Path) -> str:
 
 
 def _stored(
-    path: Path, fields: Fields, end: int, sizes: Sequence[int], dtype: np.dtype[Any]
+    path: Path,
+    fields: Fields,
+    end: int,
+    sizes: Sequence[int],
+    dtype: np.dtype[Any],
+    request: Request,
 ) -> tuple[StoredBytes, list[Path]]:
     """The bytes of the values, and the other files that hold them."""
     size = prod(sizes) * dtype.itemsize
     if "data file" not in fields:
         return _one_file(path, fields, end, size, dtype), []
     files = _data_files(path, fields, sizes)
+    request.require_inside(path, *files)
     stored = in_files(files, size, lambda file, part: _one_file(file, fields, 0, part, dtype))
     return stored, list(dict.fromkeys(files))
 
@@ -187,21 +195,18 @@ def _stored(
 def _data_files(path: Path, fields: Fields, sizes: Sequence[int]) -> list[Path]:
     """The files of values: one, a list, or a pattern with its first and last number and stride."""
     text = fields["data file"]
-    words = text.split()
+    words = text.split() or [""]
     if words[:1] == ["LIST"]:
-        names = [line.strip() for line in fields.get("list", "").splitlines() if line.strip()]
+        listed = fields.get("list", "")
+        if listed.count("\n") > MAX_FILES:
+            raise InputError(f"its list is longer than {MAX_FILES} files")
+        names = [line.strip() for line in listed.splitlines() if line.strip()]
         if not names:
             raise InputError("its list of files is empty")
         return [path.parent / name for name in names]
-    match = re.fullmatch(r"(\S*%0?\d*[du]\S*)\s+(-?\d+)\s+(-?\d+)\s+(-?\d+)(?:\s+\d+)?", text)
-    if match is None:
-        return [path.parent / text]
-    first, last, stride = (int(match[i]) for i in (2, 3, 4))
-    if stride == 0 or not 0 <= (last - first) // stride < prod(sizes):
-        raise InputError(f"its pattern of files is {text!r}")
-    numbers = range(first, last + (1 if stride > 0 else -1), stride)
-    form = match[1].replace("u", "d") if "%" in match[1] and "d" not in match[1] else match[1]
-    return [path.parent / (form % number) for number in numbers]
+    if "%" in words[0] and len(words) in (4, 5):
+        return numbered_files(path.parent, words[0], words[1:4], prod(sizes))
+    return [path.parent / text]
 
 
 def _one_file(

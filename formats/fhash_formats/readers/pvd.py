@@ -69,6 +69,7 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
         entries = _listed_json(path) if path.suffix.lower() == ".series" else _listed_xml(path)
         if not entries:
             raise InputError("it lists no file")
+        request.require_inside(path, *(file for _, file in entries))
         entries.sort(key=lambda entry: entry[0])
         times = np.array([time for time, _ in entries])
         if not np.isfinite(times).all():

@@ -25,9 +25,10 @@ from fhash_formats.readers.common.failures import condense, refusing
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.listing import Listed, listed_series
 from fhash_formats.readers.common.request import RawLayout, Request, parse_axes, selection
+from fhash_formats.readers.common.stored_parts import require_inside
 from fhash_formats.readers.common.variables import SeveralVariablesError
-from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
-from fhash_formats.series import Series, StepsSeries
+from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern, warn_of_gaps
+from fhash_formats.series import Series, StepsSeries, warn_not_stored
 
 HEAD_BYTES = 4096
 """Bytes that `matches` gets; HDF5 may begin at byte 2048."""
@@ -146,6 +147,7 @@ def open_series(
     raw_values: bool = False,
     select: Mapping[str, int | str] | None = None,
     keep_extremes: bool = False,
+    no_external: bool = False,
 ) -> Series:
     """Open a time-varying volume in any supported format; its frames are read later, one by one.
 
@@ -163,9 +165,13 @@ def open_series(
             "3" where it has none: {"member": 2}.
         keep_extremes: whether extreme values that repeat far away from all others are data;
             encoding refuses them otherwise.
+        no_external: whether no file outside the folder of the one that is read may be read for it:
+            data behind a header, external links, sources of virtual datasets, pieces of a grid,
+            links of the file system. For a service that encodes what others upload.
 
-    Raises MissingInputError, InputError for an unsuitable input, and MissingDependencyError that
-    names what to install.
+    Warns (FhashWarning) of values that nobody wrote, such as chunks that are not there. Raises
+    MissingInputError, InputError for an unsuitable input, and MissingDependencyError that names
+    what to install.
     """
     request = Request(
         var=var,
@@ -175,15 +181,17 @@ def open_series(
         raw_values=raw_values,
         select=selection(select),
         keep_extremes=keep_extremes,
+        no_external=no_external,
     )
     series = open_whole(path, request)
     if series.remark:
         warnings.warn(f"{path}: {series.remark}", FhashWarning, stacklevel=2)
-    if steps is None:
-        return series
     try:
-        _check_stride(path, steps)
-        return StepsSeries(series, range(*steps.indices(series.shape[0])))
+        if steps is not None:
+            _check_stride(path, steps)
+            series = StepsSeries(series, range(*steps.indices(series.shape[0])))
+        warn_not_stored(series)
+        return series
     except BaseException:
         series.close()
         raise
@@ -199,6 +207,7 @@ def list_variables(
     missing: Sequence[float] = (),
     raw_values: bool = False,
     select: Mapping[str, int | str] | None = None,
+    no_external: bool = False,
 ) -> list[Listed]:
     """The variables of anything that `open_series` reads, whether or not they can be encoded.
 
@@ -215,6 +224,7 @@ def list_variables(
         missing=tuple(missing),
         raw_values=raw_values,
         select=selection(select),
+        no_external=no_external,
     )
     place = files_of(text)[0] if is_pattern(text) else Path(path)
     found = find_reader(place, request)
@@ -268,6 +278,7 @@ def open_whole(path: str | Path, request: Request) -> Series:
         find_reader(files[0], request).refuse_unused(files[0], request)
         pages = tiff.open_pages(text, files, request)
         if pages is not None:
+            warn_of_gaps(text, files)
             return pages.as_asked(request)
     return JoinedSeries(text, files, lambda file: _open_part(file, request))
 
@@ -307,10 +318,16 @@ def find_reader(path: Path, request: Request) -> Reader:
             raise InputError(
                 f"{path} is a zarr folder; shape, type and byte order are given for raw files only"
             )
+        if request.no_external:
+            request.require_inside(path, path, *path.rglob("*"))
         return ZARR
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; write its data to a file first")
+    request.require_inside(path, path)
     head = _head(path)
+    if request.no_external and hdf5.is_hdf5(head):
+        with refusing(f"{path} cannot be read as HDF5"):
+            require_inside(path)
     suffix = path.suffix.lower()
     if request.raw is not None:
         other = next(

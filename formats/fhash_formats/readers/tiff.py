@@ -25,7 +25,7 @@ from fhash_formats.readers.common.grid import component_by_number, component_var
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.stored_bytes import PlainFile
 from fhash_formats.readers.common.variables import choose
-from fhash_formats.series import Coordinate
+from fhash_formats.series import Coordinate, NotStored
 
 SUFFIXES = (".tif", ".tiff")
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -89,7 +89,8 @@ def open_tiff(path: Path, request: Request) -> FileSeries:
     source, stamp = str(path), Stamp.of(path)
     tifffile = _tifffile(source)
     with naming(source), _strictly():
-        file = tifffile.TiffFile(path)
+        # the metadata of OME name further files
+        file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
     try:
         with naming(source), _strictly():
             return _series(source, path, stamp, file, request)
@@ -120,6 +121,14 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     var = component_by_number(request.var, variables)
     variable = choose(source, variables, var, booleans=request.booleans)
     _check_size(path, series)
+    shares = _not_stored(series)
+    never = None
+    if shares is not None:
+        t = axes.index("t") if "t" in axes[: shares.ndim] else None
+        each = shares.mean(axis=tuple(n for n in range(shares.ndim) if n != t)).reshape(-1)
+        never = NotStored(
+            shares=each, fill=np.dtype(series.dtype).type(series.keyframe.nodata).item()
+        )
 
     def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
         steps = ranges[kept.index("t")] if "t" in kept else slice(None)
@@ -137,7 +146,21 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         stamp=stamp,
         coords=_coordinates(file, dict(zip(kept, lengths, strict=True))),
         close=file.close,
+        not_stored=never,
     )
+
+
+def _not_stored(series: Any) -> npt.NDArray[np.float64] | None:
+    """Share of each page whose strips or tiles are not in the file; None where all are."""
+    shares = [
+        1 - sum(map(bool, page.databytecounts)) / max(1, prod(page.chunked))
+        for page in series.pages
+        if page is not None
+    ]
+    outer = series.shape[: len(series.shape) - len(series.keyframe.shape)]
+    if not any(share > 0 for share in shares) or prod(outer) != len(shares):
+        return None
+    return np.clip(np.reshape(shares, outer), 0, 1)
 
 
 def _length(part: slice, full: int) -> int:

@@ -104,7 +104,7 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
     """
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
-        grid = _grid(path)
+        grid = _grid(path, request)
         variables = list(_variables(grid))
         var = component_by_number(request.var, variables)
         variable = choose(source, variables, var, booleans=request.booleans)
@@ -114,6 +114,11 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
         for piece, element in zip(grid.pieces, elements, strict=True):
             count = prod(_shape(piece.extent, array.place)) * array.components
             piece.arrays.check(element, count)
+        there = sum(prod(_shape(piece.extent, array.place)) for piece in grid.pieces)
+        if there < prod(variable.shape):
+            raise InputError(
+                f"its pieces leave at least {prod(variable.shape) - there} values of the grid open"
+            )
         coords = _positions(grid, array.place)
 
     def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
@@ -134,7 +139,9 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
     )
 
 
-def _grid(path: Path, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)) -> _Grid:
+def _grid(
+    path: Path, request: Request, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)
+) -> _Grid:
     """The grid of a file, which must be of one of some kinds."""
     document = parse(path)
     root = document.root
@@ -156,8 +163,11 @@ def _grid(path: Path, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)) -> _Gr
             pieces.append(_Piece(extent=own, element=piece, arrays=arrays))
             continue
         files.append(_file(path, piece))
+        if files[-1] in files[:-1]:
+            raise InputError(f"it lists {files[-1].name} twice")
+        request.require_inside(path, files[-1])
         with naming(str(files[-1])):
-            listed = _grid(files[-1], (kind[1:],))
+            listed = _grid(files[-1], request, (kind[1:],))
         pieces += listed.pieces
         holders += listed.holders
     for part in pieces:

@@ -24,13 +24,14 @@ from fhash_formats.readers.common.grid import (
     component_variables,
     lattice,
 )
-from fhash_formats.readers.common.hdf5_tree import files_beside, require_filters, require_sources
+from fhash_formats.readers.common.hdf5_tree import require_filters
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import assign_axes
+from fhash_formats.readers.common.stored_parts import Hdf5Sources
 from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.readers.vtk_xml import GHOSTS, PLACES, SPACE
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, NotStored
 from fhash_formats.support.attributes import PLUMBING, json_attributes, text_of
 
 SUFFIXES = (".vtkhdf",)
@@ -92,12 +93,18 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     variable = choose(source, variables, var, booleans=request.booleans)
     array, component = variable.handle
     require_filters(source, variable.name, array.dataset)
-    require_sources(source, path, variable.name, array.dataset)
+    with Hdf5Sources(source) as behind:
+        parts = behind.parts(variable.name, array.dataset)
     own = (AXES if array.steps else SPACE)[: len(variable.shape)]
     axes = assign_axes(source, variable.shape, list(own), list(own), request.axes)
     entries = _entries(root, array, variable.name, times)
     vector = array.dataset.ndim > len(variable.shape)
     chunks = array.dataset.chunks
+    never = None
+    if parts is not None:
+        shares = parts.along(0 if array.steps else None, {})
+        shares = 1 - (shares if entries is None else shares[entries])
+        never = NotStored(shares=shares, fill=parts.fill.item()) if shares.any() else None
 
     def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
         space = ranges[-3:]
@@ -122,7 +129,8 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         attributes=json_attributes(array.dataset.attrs, without=PLUMBING),
         chunks=None if chunks is None else chunks[: len(variable.shape)],
         close=file.close,
-        beside=files_beside(path, array.dataset),
+        beside=list(behind.files),
+        not_stored=never,
     )
 
 

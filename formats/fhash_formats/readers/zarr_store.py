@@ -31,6 +31,11 @@ from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.stored_parts import (
+    not_stored,
+    warn_of_column,
+    zarr_parts,
+)
 from fhash_formats.readers.common.times import (
     MAX_LETTERS,
     only_counts,
@@ -299,6 +304,11 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         chunks=layout.chunks((*chunks, *trailing)),
         close=store.close,
         packing=packed,
+        not_stored=not_stored(
+            [zarr_parts(member.handle[1]) for member in variable.members or (variable,)],
+            layout,
+            joined=bool(variable.members),
+        ),
     )
     if not variable.members and not variable.field:
         series.metadata = zarr_metadata(
@@ -436,5 +446,8 @@ class _Values:
         return self.packing.unpack(stored) if self.packing else stored
 
     def whole(self) -> npt.NDArray[Any]:
-        """All values."""
+        """All values of a coordinate."""
+        parts = zarr_parts(self.array)
+        if parts is not None and parts.fill == parts.fill:
+            warn_of_column(self.array.name, parts)
         return self.read(())

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from fhash_formats.support.plain_json import UnknownValueError, attribute_json, plain_text
+from fhash_formats.support.plain_json import (
+    UnknownValueError,
+    attribute_json,
+    decoded_text,
+    plain_text,
+)
 
 __all__ = [
     "PACKING",
@@ -47,9 +52,9 @@ def json_attributes(
 ) -> dict[str, Any]:
     """The attributes as JSON values: numbers, text, lists, objects.
 
-    Bytes are read as UTF-8. Not-a-number, infinities and numbers beyond float64 become text, as in
-    zarr. References, compound values and others that JSON cannot hold are dropped, and so are the
-    names in `without`.
+    Bytes are read as UTF-8, else as Latin-1. Not-a-number, infinities and numbers beyond float64
+    become text, as in zarr. References, compound values and others that JSON cannot hold are
+    dropped, and so are the names in `without`.
     """
     result: dict[str, Any] = {}
     for name in attributes:
@@ -63,5 +68,5 @@ def json_attributes(
 
 
 def text_of(value: Any) -> str:
-    """An attribute as text; bytes are read as UTF-8, and invalid ones become U+FFFD."""
-    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
+    """An attribute as text; see `decoded_text` for bytes."""
+    return decoded_text(value) if isinstance(value, bytes) else str(value)

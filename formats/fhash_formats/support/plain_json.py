@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["UnknownValueError", "attribute_json", "plain_json", "plain_text"]
+__all__ = ["UnknownValueError", "attribute_json", "decoded_text", "plain_json", "plain_text"]
 
 MAX_DEPTH = 24
 """Objects and lists within each other; what lies deeper cannot be held."""
@@ -43,12 +43,23 @@ def attribute_json(value: Any) -> Any:
     return _converted(value, 0, is_figure=False)
 
 
-def plain_text(text: str) -> str:
-    """The text with "?" for each lone surrogate, which no file can hold.
+def decoded_text(data: bytes) -> str:
+    """Bytes as text: UTF-8, else Latin-1, in which older programs wrote units such as "\u00b0C"."""
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
-    Python makes lone surrogates of the bytes of file names that are no UTF-8.
+
+def plain_text(text: str) -> str:
+    """The text without lone surrogates, which no file can hold.
+
+    Python makes those of bytes that are no UTF-8: they are read as Latin-1. "?" stands for others.
     """
-    return text.encode("utf-8", errors="replace").decode("utf-8")
+    if not any("\udc80" <= letter <= "\udcff" for letter in text):
+        return text.encode("utf-8", errors="replace").decode("utf-8")
+    letters = (chr(ord(c) - 0xDC00) if "\udc80" <= c <= "\udcff" else c for c in text)
+    return plain_text("".join(letters))
 
 
 def _converted(value: Any, depth: int, *, is_figure: bool) -> Any:
@@ -60,7 +71,7 @@ def _converted(value: Any, depth: int, *, is_figure: bool) -> Any:
     if isinstance(value, int | float | np.number) and not isinstance(value, np.complexfloating):
         return _number(value, is_figure=is_figure)
     if isinstance(value, bytes):
-        return value.decode("utf-8", errors="replace")
+        return decoded_text(value)
     if depth < MAX_DEPTH:
         if isinstance(value, np.ndarray | np.generic):
             if value.dtype.kind in "Mm":

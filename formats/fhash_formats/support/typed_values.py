@@ -17,7 +17,12 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.support.number_types import DTYPES
-from fhash_formats.support.plain_json import UnknownValueError, attribute_json
+from fhash_formats.support.plain_json import (
+    UnknownValueError,
+    attribute_json,
+    decoded_text,
+    plain_text,
+)
 
 __all__ = [
     "MAX_BYTES",
@@ -112,13 +117,13 @@ def typed_attribute(value: Any) -> Any:
     Raises UnknownValueError for a value that no container holds.
     """
     if isinstance(value, str):
-        if not _has_form(value):
+        if any("\ud800" <= letter < "\udc80" for letter in value):
             raise UnknownValueError
-        return str(value)
+        return plain_text(value)
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, bytes):
-        return typed_attribute(value.decode("utf-8", errors="replace"))
+        return typed_attribute(decoded_text(value))
     if isinstance(value, list) and value and all(isinstance(each, str) for each in value):
         return [typed_attribute(each) for each in value]
     if isinstance(value, Mapping | list | tuple) or value is None:

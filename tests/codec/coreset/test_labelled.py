@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
+import threading
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from fhash_codec.coreset.labelled import array_series, labelled_series
 from fhash_formats import open_series
@@ -149,3 +154,56 @@ def test_a_dimension_has_one_role_in_all_variables(tmp_path: Path, kind: str) ->
         ):
             assert series.shape == shape
             assert series.coords["t"].values.tolist() == data["frtime"].values.tolist()
+
+
+@pytest.mark.parametrize("chunks", [None, {}])
+@pytest.mark.parametrize("lists", [True, False])
+def test_chunks_that_a_store_elsewhere_lacks_are_told(
+    tmp_path: Path, chunks: dict[str, int] | None, lists: bool
+) -> None:
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w")
+    made = group.create_array(
+        "u", shape=(4, 3, 5, 6), dtype="f4", chunks=(1, 3, 5, 6), dimension_names=list("tzyx")
+    )
+    made[...] = np.arange(360.0).reshape(4, 3, 5, 6) + 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(tmp_path / "a.zarr")
+    (tmp_path / "a.zarr" / "u" / "c" / "2" / "0" / "0" / "0").unlink()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *words: Any) -> None:
+            pass
+
+        def list_directory(self, path: Any) -> Any:
+            return super().list_directory(path) if lists else self.send_error(404)
+
+    handler = functools.partial(Handler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/a.zarr"
+        dataset = xr.open_zarr(url, chunks=chunks)
+        with pytest.warns(FhashWarning, match=r"25 % of the values of 'u' .*\(step 2\).* as 0;"):
+            series = array_series(dataset["u"])
+        assert series.not_stored is not None
+        assert series.not_stored.shares.tolist() == [0, 0, 1, 0]
+        if chunks is None:
+            some = "50 % of the values of 'u' .*step 0"
+            with pytest.warns(FhashWarning, match=some):
+                array_series(dataset["u"].isel(t=slice(2, 4)))
+            assert array_series(dataset["u"].isel(t=slice(0, 2))).not_stored is None
+        else:
+            with pytest.warns(FhashWarning, match="25 % of the stored array behind it"):
+                array_series(dataset["u"].isel(t=slice(2, 4)))
+        server.shutdown()
+
+
+def test_a_fill_value_that_xarray_masks_is_missing_already(tmp_path: Path) -> None:
+    values = np.arange(360.0).reshape(4, 3, 5, 6)
+    dataset = xr.Dataset({"u": (list("tzyx"), values)})
+    options: dict[str, Any] = {"encoding": {"u": {"chunks": (1, 3, 5, 6)}}, "consolidated": False}
+    dataset.to_zarr(tmp_path / "a.zarr", **options)
+    (tmp_path / "a.zarr" / "u" / "c" / "2" / "0" / "0" / "0").unlink()
+    assert (
+        array_series(xr.open_zarr(tmp_path / "a.zarr", consolidated=False)["u"]).not_stored is None
+    )

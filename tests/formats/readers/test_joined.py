@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -226,3 +227,27 @@ def test_joined_times_must_increase_as_dates(tmp_path: Path) -> None:
     dated(tmp_path / "f1.h5", VALUES[1], 6, "days since 2001-02-20")
     with pytest.raises(InputError, match=r"times do not increase .*: 0 in .*f1.h5 after 5 in"):
         open_series(tmp_path / "f*.h5")
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["a1", "a2", "a4", "a5"], "1 numbers are left out, the first between a2.npy and a4.npy"),
+        (["a00", "a10", "a20", "a50"], "2 numbers are left out"),
+        (["a1", "a2", "a3"], ""),
+        (["a1", "a4"], ""),
+        (["a1", "a10", "a25", "a37"], ""),
+        (["a20200130", "a20200131", "a20200201"], ""),
+        (["a202011", "a202012", "a202101"], ""),
+        (["a", "b", "d"], ""),
+        (["a1_1", "a2_2", "a4_3"], ""),
+    ],
+)
+def test_numbers_that_names_leave_out_are_told(tmp_path: Path, names: list[str], told: str) -> None:
+    for step, name in enumerate(names):
+        np.save(tmp_path / f"{name}.npy", VALUES[step])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with open_series(tmp_path / "*.npy") as series:
+            assert series.shape[0] == len(names)
+    assert [told in str(each.message) for each in caught] == ([True] if told else [])

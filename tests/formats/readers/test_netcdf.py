@@ -324,3 +324,57 @@ def test_one_group_a_step(tmp_path: Path) -> None:
     assert_frames(path, VALUES)
     with open_series(path) as series:
         assert series.coords["t"].values.tolist() == [0, 0.5, 1, 1.5]
+
+
+DEFAULT = np.float32(9.969209968386869e36)
+
+
+@pytest.mark.parametrize("engine", ["scipy", "h5netcdf"])
+def test_the_default_fill_value_of_floats_is_missing(tmp_path: Path, engine: str) -> None:
+    path = tmp_path / "a.nc"
+    values = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5)
+    values[1, 2] = DEFAULT
+    dataset = xr.Dataset({"u": (list("tzyx"), values)})
+    dataset.to_netcdf(path, engine=engine, encoding={"u": {"_FillValue": None}})
+    with open_series(path) as series:
+        assert not series.defaults
+        frames = np.stack(list(series.frames()))
+        assert series.defaults == {float(DEFAULT)}
+        assert series.dtype == np.float32
+    assert np.isnan(frames[1, 2]).all()
+    np.testing.assert_array_equal(frames[0], values[0])
+    for options in ({"keep_extremes": True}, {"raw_values": True}):
+        with open_series(path, **options) as series:
+            np.testing.assert_array_equal(series.read(1), values[1])
+            assert not series.defaults
+    with open_series(path, missing=[float(DEFAULT)]) as series:
+        assert np.isnan(series.read(1)[2]).all()
+        assert (series.occurring, series.defaults) == ({float(DEFAULT)}, set())
+    dataset.to_netcdf(path, engine=engine, encoding={"u": {"_FillValue": -1.0}})
+    with open_series(path) as series:
+        np.testing.assert_array_equal(series.read(1), values[1])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "fill"), [("i1", -127), ("i2", -32767), ("i4", -2147483647), ("u1", 255)]
+)
+def test_the_default_fill_value_of_integers_is_told(tmp_path: Path, dtype: str, fill: int) -> None:
+    path = tmp_path / "a.nc"
+    values = np.arange(2 * 3 * 4 * 5).astype(dtype).reshape(2, 3, 4, 5)
+    values[1, 2] = fill
+    xr.Dataset({"u": (list("tzyx"), values)}).to_netcdf(path, engine="h5netcdf")
+    with open_series(path) as series:
+        np.testing.assert_array_equal(np.stack(list(series.frames())), values)
+        assert series.defaults == (set() if dtype.endswith("1") else {fill})
+
+
+def test_packed_default_fill_value_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "a.nc"
+    values = np.arange(2 * 3 * 4 * 5, dtype="i2").reshape(2, 3, 4, 5)
+    values[1, 2] = -32767
+    attributes = {"scale_factor": 0.5, "add_offset": 10.0}
+    xr.Dataset({"u": (list("tzyx"), values, attributes)}).to_netcdf(path, engine="h5netcdf")
+    with open_series(path) as series:
+        frames = np.stack(list(series.frames()))
+    assert np.isnan(frames[1, 2]).all()
+    np.testing.assert_array_equal(frames[0], values[0] * 0.5 + 10)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -214,3 +215,49 @@ def test_files_of_pynrrd(tmp_path: Path, suffix: str, encoding: str) -> None:
     header = {"encoding": encoding, "kinds": ["domain"] * 3 + ["time"]}
     nrrd.write(str(path), values.transpose(3, 2, 1, 0), header, detached_header=suffix == ".nhdr")
     np.testing.assert_array_equal(frames(path), values)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "pattern"),
+    [
+        ("4 4 4", "f%0999999999d.raw 1 4 1"),
+        ("4 4 4", "f%999d.raw 1 4 1"),
+        ("4 4 4", "f%d%d.raw 1 4 1"),
+        ("4 4 4", "f%s%d.raw 1 4 1"),
+        ("1000000 1000000 1000000", "f%d.raw 1 999999999 1"),
+        ("4 4 4", f"f%d.raw 1 {'9' * 5000} 1"),
+        ("4 4 4", "f%d.raw 1 5000 1"),
+    ],
+)
+def test_patterns_are_bounded(tmp_path: Path, sizes: str, pattern: str) -> None:
+    header = "NRRD0004\ntype: float\ndimension: 3\nencoding: raw\nendian: little\n"
+    (tmp_path / "a.nhdr").write_text(f"{header}sizes: {sizes}\ndata file: {pattern}\n\n")
+    (tmp_path / "a.mhd").write_text(
+        f"NDims = 3\nDimSize = {sizes}\nElementType = MET_FLOAT\nElementDataFile = {pattern}\n"
+    )
+    for name in ("a.nhdr", "a.mhd"):
+        tracemalloc.start()
+        with pytest.raises(InputError, match="its pattern of files is"):
+            open_series(tmp_path / name)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+        tracemalloc.stop()
+
+
+def test_a_list_of_numbered_files_ends_at_the_first_that_is_not_there(tmp_path: Path) -> None:
+    header = "NRRD0004\ntype: float\ndimension: 3\nencoding: raw\nendian: little\n"
+    (tmp_path / "a.nhdr").write_text(
+        f"{header}sizes: 1000 1000 1000\ndata file: f%d.raw 1 1000000 1\n\n"
+    )
+    (tmp_path / "f1.raw").write_bytes(b"1")
+    with pytest.raises(MissingInputError, match=r"f2\.raw, which is not there"):
+        open_series(tmp_path / "a.nhdr")
+
+
+def test_sizes_are_bounded(tmp_path: Path) -> None:
+    header = "NRRD0004\ntype: float\nencoding: bzip2\nendian: little\n"
+    (tmp_path / "a.nrrd").write_text(f"{header}dimension: 20\nsizes: {'2 ' * 20}\n\n")
+    with pytest.raises(InputError, match="20 sizes"):
+        open_series(tmp_path / "a.nrrd")
+    (tmp_path / "b.nrrd").write_text(f"{header}dimension: 3\nsizes: 4000000 4000000 4000\n\nBZh9")
+    with pytest.raises(InputError, match="cannot hold"):
+        open_series(tmp_path / "b.nrrd")

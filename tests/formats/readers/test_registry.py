@@ -230,7 +230,7 @@ def test_what_may_not_be_looked_into(
     "name", ["a\udcff.npy", "a\udcff_6x5x3_float32.raw", "a\udcff_*.npy", "a\udcff.zarr"]
 )
 def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -> None:
-    frame = np.zeros((3, 5, 6), np.float32)
+    frame = np.ones((3, 5, 6), np.float32)
     for part in (
         [tmp_path / name.replace("*", str(step)) for step in range(2)]
         if "*" in name
@@ -246,7 +246,7 @@ def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -
             zarr.create_array(tmp_path / "a.zarr", data=frame)
             (tmp_path / "a.zarr").rename(part)
     with open_series(tmp_path / name) as series:
-        assert series.name.encode()[:2] == b"a?"
+        assert series.name[:2] == "a\u00ff"
         np.testing.assert_array_equal(series.read(0), frame)
 
 

@@ -128,6 +128,9 @@ def test_pieces_are_put_together(tmp_path: Path) -> None:
     with open_series(path) as series:
         assert series.read(0).tolist() == [[[0, 1, 2, 3]], [[4, 5, 6, 7]]]
     path.write_text(text.format(piece.format(0, 1, "0 1 4 5")))
+    with pytest.raises(InputError, match="leave at least 4 values"):
+        open_series(path)
+    path.write_text(text.format(piece.format(0, 1, "0 1 4 5") * 2))
     with open_series(path) as series, pytest.raises(InputError, match="leave 4 values"):
         series.read(0)
 

@@ -53,6 +53,7 @@ def test_names_that_only_tie_datasets_together_are_dropped() -> None:
 
 
 def test_text_without_lone_surrogates() -> None:
-    assert plain_text("a\udcffb\u00e9") == "a?b\u00e9"
+    assert plain_text("a\udcffb\u00e9") == "a\u00ffb\u00e9"
     assert json_attributes({"a": "\ud800"}) == {"a": "?"}
+    assert text_of(b"\xb0C") == "\u00b0C"
     assert (text_of(b"\xc3\xa9"), text_of("x"), text_of(5)) == ("\u00e9", "x", "5")

@@ -77,4 +77,4 @@ def test_digits_that_python_refuses_to_write() -> None:
 
 
 def test_text_without_lone_surrogates() -> None:
-    assert plain_text("a\udcffb\u00e9") == "a?b\u00e9"
+    assert plain_text("a\udcffb\u00e9") == "a\u00ffb\u00e9"

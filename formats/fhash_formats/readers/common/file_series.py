@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any, Self
@@ -15,7 +16,8 @@ from fhash_formats.readers.common.cf_packing import Packing, missing_values, not
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.times import settled
-from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
+from fhash_formats.series import AXES, Coordinate, NotStored, Series, check_values, index_coordinate
+from fhash_formats.source_metadata import plain_form
 from fhash_formats.support.attributes import plain_text
 
 SLAB_BYTES = 64 * 2**20
@@ -49,6 +51,9 @@ class FileSeries(Series):
         beside: further files that hold values, checked likewise.
         folder: stamp of all files, which `check` alone looks at.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
+        not_stored: what nobody wrote, with the number that stands there as it is stored.
+        default_fill: value as it is read that stands for one that nobody wrote, see
+            `Series.defaults`.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -74,6 +79,8 @@ class FileSeries(Series):
         beside: Sequence[Path] = (),
         folder: FolderStamp | None = None,
         packing: Packing | None = None,
+        not_stored: NotStored | None = None,
+        default_fill: float | None = None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
@@ -88,7 +95,7 @@ class FileSeries(Series):
         self.coords = {
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
-        } | coords
+        } | {axis: replace(each, name=plain_form(each.name)) for axis, each in coords.items()}
         self._axes, self._fetch, self._close = tuple(axes), fetch, close
         self._quick = (stamp, *map(Stamp.of, beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (
@@ -103,8 +110,12 @@ class FileSeries(Series):
         self._sought: dict[float, Any] = {}
         self._met: set[float] = set()
         self.occurring = self._met
+        self.not_stored = not_stored
+        self._default, self._defaults = default_fill, set[float]()
+        self.defaults = self._defaults
         if packing is not None:
             note_packing(self, packing)
+        self._unpack_fill(packing)
 
     def hide(self, missing: Sequence[float]) -> None:
         """Make some values missing: they become NaN, and integers become floats.
@@ -116,13 +127,29 @@ class FileSeries(Series):
             for value in missing:
                 for fill in missing_values(self.source, self.dtype, [value]).fills:
                     self._sought[value] = fill
+                    self._default = None if fill == self._default else self._default
             note_packing(self, self._missing)
             self.dtype = self._missing.dtype
+            self._unpack_fill(self._missing)
+
+    def _unpack_fill(self, packing: Packing | None) -> None:
+        """Make the number that stands for what nobody wrote a value; a missing one tells itself."""
+        found = self.not_stored
+        if found is None:
+            return
+        stored = np.array([found.fill], self.dtype if packing is None else packing.stored)
+        fill = stored[0] if packing is None else packing.unpack(stored)[0]
+        self.not_stored = None if fill != fill else replace(found, fill=fill.item())
 
     def as_asked(self, request: Request) -> Self:
         """Return this series with the values missing, or kept, that the user named."""
         self.hide(request.missing)
         self.keep_extremes = request.keep_extremes
+        if self.keep_extremes:
+            self._default = None
+        told = self.not_stored
+        if told is not None and told.fill == self._default and self.dtype.kind == "f":
+            self.not_stored = None  # missing, as the frames will show
         return self
 
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -169,6 +196,10 @@ class FileSeries(Series):
                 f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed"
                 " while it was being read"
             )
+        if self._default is not None and (unwritten := values == self._default).any():
+            self._defaults.add(self._default)
+            if values.dtype.kind == "f":
+                values = np.where(unwritten, values.dtype.type(np.nan), values)
         if self._missing is not None:
             self._met.update(
                 value

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+from collections import deque
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,12 @@ from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.positions import Column, usable
 from fhash_formats.readers.common.roles import NAMES
+from fhash_formats.readers.common.stored_parts import Hdf5Sources, warn_of_column
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
+
+CONVENTIONAL = frozenset(name for names in NAMES.values() for name in names.split())
+"""Names of coordinates, in lower case."""
 
 FILTER_NAMES = {
     305: "LZO",
@@ -35,52 +40,113 @@ FILTER_NAMES = {
 """Names of registered HDF5 filters, for messages; the name in the file is often empty."""
 
 
-def datasets(root: Any) -> Iterator[tuple[str, Any]]:
-    """Every dataset under a group with its full name (no leading slash), once, in the order of
-    names.
+class Scalar:
+    """A dataset of one number or text, which is opened again when more of it is asked for.
+
+    HDF5 is slow at many thousands of open objects.
+
+    Attributes:
+        dtype, units: of the dataset.
+    """
+
+    shape: tuple[int, ...] = ()
+    ndim, size, is_scale = 0, 1, False
+
+    def __init__(self, group: Any, name: bytes, opened: Any) -> None:
+        import h5py
+
+        self._group, self._name, self.dtype = group, name, opened.dtype
+        self.units = units_of(h5py.Dataset(opened)) if h5py.h5a.exists(opened, b"units") else ""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._opened(), name)
+
+    def __getitem__(self, places: Any) -> Any:
+        return self._opened()[places]
+
+    def _opened(self) -> Any:
+        import h5py
+
+        return h5py.Dataset(h5py.h5o.open(self._group.id, self._name))
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Objects of a file by full name without a leading slash.
+
+    Attributes:
+        datasets: each once, in the order of names.
+        groups: each once.
+        broken: links that lead nowhere, and where they point.
+    """
+
+    datasets: dict[str, Any] = field(default_factory=dict)
+    groups: dict[str, Any] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
+
+
+def walk(root: Any) -> Tree:
+    """All that is under a group.
 
     Soft and external links are followed where they lead somewhere (visititems would skip them). An
     object reached a second time, by a hard link or by a cycle of groups, is skipped.
     """
     import h5py
 
+    tree = Tree()
     seen: set[tuple[int, int]] = set()
-    waiting = [("", root)]
-    while waiting:
-        path, node = waiting.pop()
-        info = h5py.h5o.get_info(node.id)
+    # what a link leads to comes last, so that an object goes by its own name and not by the link's
+    waiting: list[tuple[str, Any, bytes]] = [("", root, b".")]
+    linked: deque[tuple[str, Any, bytes]] = deque()
+    while waiting or linked:
+        path, group, name = waiting.pop() if waiting else linked.popleft()
+        try:
+            opened = h5py.h5o.open(group.id, name, lapl=group._lapl)
+        except (KeyError, OSError, RuntimeError):
+            tree.broken[path] = _target(group, name)
+            continue
+        info = h5py.h5o.get_info(opened)
         if (info.fileno, info.addr) in seen:
             continue
         seen.add((info.fileno, info.addr))
-        if isinstance(node, h5py.Dataset):
-            yield path, node
-        elif isinstance(node, h5py.Group):
-            for name in sorted(node, reverse=True):
-                child = _follow(node, name)
-                # what a link leads to comes last, so that an object goes by its own name and not by
-                # the link's
-                place = (
-                    len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
-                )
-                if child is not None:
-                    waiting.insert(place, (f"{path}/{name}".lstrip("/"), child))
+        if isinstance(opened, h5py.h5d.DatasetID):
+            if opened.get_space().get_simple_extent_type() == h5py.h5s.SCALAR:
+                tree.datasets[path] = Scalar(group, name, opened)
+            else:
+                tree.datasets[path] = h5py.Dataset(opened)
+        elif isinstance(opened, h5py.h5g.GroupID):
+            node = tree.groups[path] = h5py.Group(opened)
+            for child in sorted(opened, reverse=True):
+                entry = (f"{path}/{text_of(child)}".lstrip("/"), node, child)
+                hard = opened.links.get_info(child).type == h5py.h5l.TYPE_HARD
+                waiting.append(entry) if hard else linked.append(entry)
+    return tree
 
 
-def _follow(group: Any, name: str) -> Any:
-    try:
-        return group[name]
-    except (KeyError, OSError):
-        return None  # a link to nowhere: there is no dataset behind it to offer
+def _target(group: Any, name: bytes) -> str:
+    """The place that a link points to."""
+    import h5py
+
+    kind = group.id.links.get_info(name).type
+    if kind == h5py.h5l.TYPE_HARD:
+        return "an object that cannot be opened"
+    value = group.id.links.get_val(name)
+    if kind == h5py.h5l.TYPE_SOFT:
+        return text_of(value)
+    return f"{text_of(value[1])} of {text_of(value[0])}"
 
 
 def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
-    """The name under which `datasets` lists an object that the user called by another of its names.
+    """The name under which `walk` lists an object that the user called by another of its names.
 
     It is the given name where there is none.
     """
     import h5py
 
-    other = _follow(file, name)
+    try:
+        other = None if name in tree else file.get(name)
+    except (KeyError, OSError, RuntimeError):  # a link to nowhere
+        other = None
     return (
         next((listed for listed, dataset in tree.items() if dataset == other), name)
         if isinstance(other, h5py.Dataset)
@@ -88,11 +154,14 @@ def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
     )
 
 
-def variables(tree: Mapping[str, Any]) -> list[Variable]:
-    """Datasets that hold values, as Variables; dimension scales and bounds are auxiliary."""
+def variables(tree: Tree) -> list[Variable]:
+    """Datasets that hold values, and links to nowhere, as Variables.
+
+    Dimension scales and bounds are auxiliary.
+    """
     bounds = set()
-    for name, dataset in tree.items():
-        if isinstance(dataset.attrs.get("bounds"), str | bytes):
+    for name, dataset in tree.datasets.items():
+        if dataset.shape and isinstance(dataset.attrs.get("bounds"), str | bytes):
             bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
     return [
         Variable(
@@ -101,15 +170,23 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
             dtype=dataset.dtype,
             auxiliary=dataset.is_scale or name in bounds,
             handle=dataset,
-            units=units_of(dataset),
+            units=dataset.units if isinstance(dataset, Scalar) else units_of(dataset),
         )
-        for name, dataset in tree.items()
+        for name, dataset in tree.datasets.items()
         if dataset.shape is not None
+    ] + [
+        Variable(
+            name=name,
+            shape=(),
+            dtype=np.dtype(object),
+            error=f"a link to {target}, which is not there",
+        )
+        for name, target in tree.broken.items()
     ]
 
 
 def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
-    """Datasets directly in a group that may be coordinates, by lower-case name.
+    """Datasets directly in a group that may be coordinates, by lower-case conventional name.
 
     They are 1-D numbers, or one number alone.
     """
@@ -118,6 +195,7 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
         place, _, name = path.rpartition("/")
         if (
             place == group
+            and name.lower() in CONVENTIONAL
             and dataset.shape is not None
             and len(dataset.shape) < 2
             and usable(dataset.dtype)
@@ -146,6 +224,8 @@ def column(path: str, dataset: Any) -> Column:
     packed = packing_of(path, dataset) if dataset.dtype.kind in "iuf" else None
 
     def read() -> Any:
+        with Hdf5Sources(path) as behind:
+            warn_of_column(path, behind.parts(path, dataset))
         stored = dataset[()]
         return stored if packed is None else packed.unpack(np.array(stored))
 
@@ -209,42 +289,3 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
                 f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py"
                 " nor hdf5plugin has"
             )
-
-
-def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
-    """Raise InputError if a virtual dataset refers to a file that is missing.
-
-    HDF5 would silently give fill values for it.
-    """
-    if not dataset.is_virtual:
-        return
-    for mapped in dataset.virtual_sources():
-        file = mapped.file_name
-        if (
-            file != "."
-            and "%b" not in file
-            and not (path.parent / file).exists()
-            and not Path(file).exists()
-        ):
-            raise InputError(
-                f"{source}: {name} is a virtual dataset that draws on {file}, which is not there"
-            )
-
-
-def files_beside(path: Path, dataset: Any) -> list[Path]:
-    """The other files that hold values of a dataset.
-
-    They are those of an external link, raw files, and those behind a virtual dataset.
-    """
-    names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
-    names += [name for name, _, _ in dataset.external or ()]
-    if dataset.is_virtual:
-        names += [
-            mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."
-        ]
-    # HDF5 looks for a relative name beside the file, then in the current folder
-    return list(
-        dict.fromkeys(
-            files for name in names for files in (path.parent / name, Path(name)) if files.exists()
-        )
-    )

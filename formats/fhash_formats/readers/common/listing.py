@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -116,7 +117,7 @@ def listing(
     good = [variable for variable in shown if not variable.problem(request.booleans)]
     several = len(good) > 1
     found = []
-    plain = [plain_name(variable.name) for variable in shown]
+    plain = Counter(plain_name(variable.name) for variable in shown)
     if request.var is not None:
         shown = [named(source, variables, good or shown, request.var)]
     for variable in shown:
@@ -127,7 +128,7 @@ def listing(
             dtype=kind_of(variable.dtype),
             units=plain_text(variable.units),
             problem=problem,
-            output=_output(variable.name, plain.count(plain_name(variable.name)) > 1),
+            output=_output(variable.name, plain[plain_name(variable.name)] > 1),
         )
         if not problem:
             said = ("--var", name) if several or request.var else ()
@@ -147,7 +148,7 @@ def listing(
 def _output(name: str, whole: bool) -> str:
     """A name of a container for a variable, with its groups where the last part is not enough."""
     text = name.replace("/", "_") if whole else plain_name(name)
-    return re.sub(r"[*#\s]+", "", text).strip("._") + ".fhz"
+    return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
 
 
 def _unpacked(entry: Listed, packed: Packing | None) -> Listed:

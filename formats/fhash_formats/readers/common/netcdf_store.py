@@ -20,12 +20,25 @@ from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.hdf5_tree import require_filters
 from fhash_formats.support.number_types import is_wide_integer
+from fhash_formats.support.plain_json import decoded_text
 
 if TYPE_CHECKING:
     import xarray as xr
 
 Values = npt.NDArray[Any]
 Exact = Callable[[Values, tuple[slice, ...]], Values]
+
+DEFAULT_FILLS = {
+    "i2": -32767,
+    "u2": 65535,
+    "i4": -2147483647,
+    "u4": 4294967295,
+    "i8": -9223372036854775806,
+    "u8": 18446744073709551614,
+    "f4": 9.969209968386869e36,
+    "f8": 9.969209968386869e36,
+}
+"""NC_FILL_SHORT and so on of netcdf.h; bytes have none that counts."""
 
 CLASSIC = (b"CDF\x01", b"CDF\x02")
 CLASSIC_64 = b"CDF\x05"
@@ -83,7 +96,8 @@ def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dat
     import xarray as xr
 
     try:
-        return xr.open_dataset(path, engine="scipy", **options)
+        dataset = xr.open_dataset(path, engine="scipy", **options)
+        return _read_again(path, dataset, options) if _is_misread(dataset) else dataset
     except Exception as error:
         message = condense(error)
     # the error is not chained: its traceback holds scipy's half-open file, which warns when it is
@@ -93,6 +107,47 @@ def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dat
         f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert"
         " it"
     )
+
+
+def _is_misread(dataset: xr.Dataset) -> bool:
+    """Whether a classic file has names that are no ASCII, or texts that are no UTF-8."""
+    places: list[Any] = [dataset, *dataset.variables.values()]
+    texts = [text for each in places for text in (*each.attrs.values(), *each.encoding.values())]
+    return any(not str(name).isascii() for name in (*dataset.variables, *dataset.sizes)) or any(
+        isinstance(text, str) and "\ufffd" in text for text in texts
+    )
+
+
+def _read_again(path: Path, dataset: xr.Dataset, options: Mapping[str, Any]) -> xr.Dataset:
+    """The dataset of a classic file with all names and texts as UTF-8, else as Latin-1.
+
+    scipy takes names for Latin-1, and xarray drops the letters of texts that are no UTF-8.
+    """
+    import xarray as xr
+    from scipy.io import netcdf_file
+
+    dataset.close()
+    stored = xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False, chunks=None)
+    with netcdf_file(path) as file:
+        texts = {None: dict(file._attributes)} | {
+            name: dict(variable._attributes) for name, variable in file.variables.items()
+        }
+    for name, attributes in texts.items():
+        target = stored.attrs if name is None else stored.variables[name].attrs
+        target.update(
+            {key: decoded_text(v) for key, v in attributes.items() if isinstance(v, bytes)}
+        )
+    names = {name: decoded_text(str(name).encode("latin-1")) for name in texts if name is not None}
+    names |= {name: decoded_text(str(name).encode("latin-1")) for name in stored.sizes}
+    renamed = stored.rename({old: new for old, new in names.items() if old != new})
+    renamed.set_close(stored.close)
+    keys = ("decode_times", "decode_timedelta", "decode_coords", "mask_and_scale")
+    decoded: xr.Dataset = xr.decode_cf(
+        renamed,
+        concat_characters=options.get("concat_characters", True),
+        **{key: options[key] for key in keys},
+    )
+    return decoded
 
 
 def close_groups(groups: Mapping[str, xr.Dataset]) -> None:
@@ -106,6 +161,20 @@ def declared(source: str, array: xr.Variable) -> Packing | None:
     """The packing of a variable that xarray unpacks; None for types that cannot be packed."""
     stored = np.dtype(array.encoding.get("dtype", array.dtype))
     return packing(source, stored, array.encoding) if stored.kind in "iuf" else None
+
+
+def default_fill(array: xr.Variable, packed: Packing | None) -> float | int | None:
+    """The number that NetCDF puts where nobody wrote, as it is read.
+
+    None for bytes, and where the variable declares a fill value of its own.
+    """
+    if packed is None or {"_FillValue", "missing_value"} & {*array.encoding, *array.attrs}:
+        return None
+    stored = DEFAULT_FILLS.get(packed.stored.str[1:])
+    if stored is None:
+        return None
+    value: float | int = packed.unpack(np.array([stored], packed.stored))[0].item()
+    return value
 
 
 def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.plain_json import decoded_text
 
 TYPE_NAMES = {
     "i1": "signed char|int8|int8_t",
@@ -32,6 +33,9 @@ TYPES = {name: short for short, names in TYPE_NAMES.items() for name in names.sp
 
 MAX_HEADER = 64 * 2**20
 """Bytes of the longest header; own ones list every coordinate."""
+
+MAX_DIMENSIONS = 16
+"""Dimensions of NRRD."""
 
 ALIASES = {
     "datafile": "data file",
@@ -60,7 +64,7 @@ def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         if not re.fullmatch(rb"NRRD000[1-5]\r?\n", lines[0]):
             raise InputError(f"it begins with {lines[0][:20]!r}; NRRD0001 to NRRD0005 can be read")
         while line := file.readline(MAX_HEADER):
-            text = line.decode("utf-8", errors="replace").rstrip("\r\n")
+            text = decoded_text(line).rstrip("\r\n")
             if file.tell() > MAX_HEADER:
                 raise InputError(f"its header is longer than {MAX_HEADER} bytes")
             if not text:
@@ -78,7 +82,7 @@ def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
             key = ALIASES.get(key, key)
             fields[key] = value.strip()
             if key == "data file" and value.split()[:1] == ["LIST"]:
-                rest = file.read(MAX_HEADER).decode("utf-8", errors="replace")
+                rest = decoded_text(file.read(MAX_HEADER))
                 fields["list"] = rest
                 break
         return fields, pairs, file.tell()
@@ -88,11 +92,11 @@ def sizes_of(fields: Fields) -> tuple[int, ...]:
     """Lengths of the dimensions, the fastest first."""
     words = fields.get("sizes", "").split()
     dimension = fields.get("dimension", "")
-    if not words or not all(word.isascii() and word.isdigit() and int(word) > 0 for word in words):
+    if not words or not all(re.fullmatch("0{0,9}[1-9][0-9]{0,17}", word) for word in words):
         raise InputError(
             f"its sizes are {fields.get('sizes', '')!r}; whole numbers above 0 are needed"
         )
-    if dimension != str(len(words)):
+    if dimension != str(len(words)) or len(words) > MAX_DIMENSIONS:
         raise InputError(f"it has {len(words)} sizes and the dimension {dimension!r}")
     return tuple(map(int, words))
 

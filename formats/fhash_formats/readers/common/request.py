@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -78,6 +79,18 @@ def selection(select: Mapping[str, int | str] | None) -> tuple[tuple[str, str], 
     return tuple((str(name), str(index)) for name, index in (select or {}).items())
 
 
+def inside_folder(path: Path, file: Path) -> None:
+    """Raise InputError if a file that another one refers to is outside the folder of that.
+
+    Links of the file system are followed.
+    """
+    if not file.resolve().is_relative_to(path.parent.resolve()):
+        raise InputError(
+            f"{path} refers to {file}, which is outside its folder; without --no-external"
+            " (no_external=True) it is read"
+        )
+
+
 @dataclass(frozen=True)
 class RawLayout:
     """Layout of a headerless file; the file's name replaces what is None.
@@ -125,6 +138,7 @@ class Request:
         select: for dimensions that are no axis, (name, index) as texts; see layout.py.
         keep_extremes: extreme values that repeat are data, see `Series`.
         digested: the digest of the file is taken where its metadata are asked for.
+        no_external: no file outside the folder of the one that is read may be read for it.
         asked: a last dimension that may hold components is asked about; else it is x.
     """
 
@@ -138,6 +152,13 @@ class Request:
     keep_extremes: bool = False
     asked: bool = True
     digested: bool = True
+    no_external: bool = False
+
+    def require_inside(self, path: Path, *files: Path) -> None:
+        """Raise InputError if a file refers to others that may not be read; see `no_external`."""
+        if self.no_external:
+            for file in files:
+                inside_folder(path, file)
 
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""

@@ -83,6 +83,7 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
         place = None if variable.error or len(variable.shape) < 2 else _place(variable.name)
         if place is not None and not variable.auxiliary:
             kinds.setdefault(place.template, []).append((place, variable))
+    broken = _broken(variables)
     joined, inside = [], set()
     for template, members in kinds.items():
         members.sort(key=lambda member: member[0].number)
@@ -102,6 +103,7 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
                 first,
                 name=template,
                 shape=shape,
+                error=next((why for key, why in broken if template.startswith(key)), ""),
                 members=tuple(member for _, member in members),
             )
         )
@@ -111,6 +113,20 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
         for variable in variables
     ]
     return [*joined, *rest]
+
+
+def _broken(variables: Sequence[Variable]) -> list[tuple[str, str]]:
+    """Names, or beginnings of names, of joined variables one step of which cannot be opened."""
+    found = []
+    for variable in variables if any(each.error for each in variables) else ():
+        if not variable.error:
+            continue
+        own, group = _place(variable.name), _place(f"{variable.name}/")
+        if own is not None:
+            found.append((own.template, f"{variable.name} is {variable.error}"))
+        elif group is not None:
+            found.append((group.template, f"{variable.name} is {variable.error}"))
+    return found
 
 
 def group_time(attributes: Mapping[str, Any]) -> tuple[float, str] | None:

@@ -7,6 +7,7 @@ One object serves many reads, so that the frames of a series in order decompress
 from __future__ import annotations
 
 import bz2
+import re
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,6 +27,15 @@ STORED_BYTES = 2**18
 
 DEFLATE_RATIO = 1032
 """Largest factor by which zlib and gzip can shrink data."""
+
+BZIP2_RATIO = 2_000_000
+"""Factor above the largest by which bzip2 can shrink data: 46 MB of zeros to 40 bytes."""
+
+MAX_FILES = 1 << 20
+"""Files of one array."""
+
+NUMBERED = re.compile(r"([^%\s]*%0?[0-9]{0,2})[du]([^%\s]*)")
+"""A pattern of C for the names of files; a wider number would be a name of gigabytes."""
 
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip member; zlib begins with others."""
@@ -154,6 +164,32 @@ def in_files(
     return parts[0] if len(parts) == 1 else ManyFiles(parts)
 
 
+def numbered_files(folder: Path, form: str, words: Sequence[str], most: int) -> list[Path]:
+    """Files of a pattern of C such as `slice_%03d.raw`, numbered from, to and by three words.
+
+    most: files that there can be. Raises InputError for other patterns, and MissingInputError for
+    the first file that is not there.
+    """
+    match = NUMBERED.fullmatch(form)
+    if match is None or not all(re.fullmatch(r"-?[0-9]{1,9}", word) for word in words):
+        raise InputError(
+            f"its pattern of files is {' '.join([form, *words])[:80]!r}; a name with one %d or %03d"
+            " (two digits at most), the first number, the last and the stride are needed"
+        )
+    first, last, stride = map(int, words)
+    if stride == 0 or not 0 <= (last - first) // stride < min(most, MAX_FILES):
+        raise InputError(
+            f"its pattern of files is {' '.join([form, *words])!r}; 1 to {min(most, MAX_FILES)}"
+            " numbers are possible here"
+        )
+    files = []
+    for number in range(first, last + (1 if stride > 0 else -1), stride):
+        files.append(folder / (f"{match[1]}d{match[2]}" % number))
+        if not files[-1].is_file():
+            raise MissingInputError(f"its values are in {files[-1]}, which is not there")
+    return files
+
+
 class StoredArray(FlatArray):
     """An array of `shape` (slowest dimension first) and `dtype` in stored bytes."""
 
@@ -236,7 +272,7 @@ class CompressedFile:
     def __init__(self, path: Path, kind: str, *, start: int, size: int) -> None:
         self.path, self.kind, self.start, self.size = path, kind, start, size
         stored = path.stat().st_size - start
-        if kind == "deflate" and size > DEFLATE_RATIO * stored:
+        if size > (DEFLATE_RATIO if kind == "deflate" else BZIP2_RATIO) * stored:
             raise InputError(
                 f"{path} promises {size} bytes, which its {stored} compressed ones cannot hold; it"
                 " is cut or damaged"

@@ -308,8 +308,8 @@ class _Collected:
         names = [each for each, _ in kept]
         shape = tuple(length for _, length in kept)
         size = _size(shape, stored.dtype)
-        if not all(map(is_plain_name, [name, *names])) or len(set(names)) < len(names):
-            return "its name or dimensions have no form in all formats"
+        if len(set(names)) < len(names):
+            return "its dimensions have no form in all formats"
         if len(self.variables) == MAX_ARRAYS:
             return f"more than {MAX_ARRAYS} arrays"
         if 0 in shape or any(self._lengths.get(each, length) != length for each, length in kept):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.series import AXES, Coordinate
+from fhash_formats.source_metadata import plain_form
 from fhash_formats.support.attributes import PACKING, PLUMBING, REFERENCES, json_attributes
 from fhash_formats.writers.common.region import Region
 
@@ -31,14 +32,8 @@ def printable(text: str, instead: str = "_") -> str:
 
 
 def safe_name(name: str) -> str:
-    """A name that HDF5, NetCDF and Zarr take as one name.
-
-    It has no slash, no control character, more than dots, and no leading "__".
-    """
-    safe = printable(name).replace("/", "_").replace("\\", "_").strip()
-    if safe.startswith("__"):
-        safe = "_" + safe.lstrip("_")
-    return safe if safe.strip("._") else "values"
+    """A name that HDF5, NetCDF and Zarr take as one name; see `plain_form`."""
+    return plain_form(name, default="values")
 
 
 def safe_names(region: Region) -> tuple[str, dict[str, str]]:
@@ -53,11 +48,7 @@ def safe_names(region: Region) -> tuple[str, dict[str, str]]:
 
 def unused_name(name: str, used: set[str]) -> str:
     """A safe name that is not in use; it is put among those that are."""
-    safe = unique = safe_name(name)
-    number = 2
-    while unique in used:
-        unique = f"{safe}_{number}"
-        number += 1
+    unique = plain_form(name, used, default="values")
     used.add(unique)
     return unique
 

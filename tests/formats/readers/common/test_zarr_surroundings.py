@@ -69,6 +69,6 @@ def test_a_store_gives_what_was_written(tmp_path: Path, zarr_format: int, group:
 
 def test_an_array_without_names_has_no_source(tmp_path: Path) -> None:
     root = zarr.open_group(tmp_path / "a.zarr", mode="w")
-    root.create_array("u", data=np.zeros((2, 3, 4, 5)))
+    root.create_array("u", data=np.ones((2, 3, 4, 5)))
     with open_series(tmp_path / "a.zarr") as series:
         assert series.metadata is None
