@@ -51,7 +51,7 @@ class NameType(click.ParamType[str]):
     "--scale",
     type=NameType("scale", "sets", "SCALES"),
     metavar="NAME",
-    help="Of the scenes: full, half or quarter of the paper's lengths. Default: full.",
+    help="Of the scenes: full, half, quarter or eighth of the paper's lengths. Default: full.",
 )
 @click.option(
     "--protocol",
@@ -59,7 +59,7 @@ class NameType(click.ParamType[str]):
     type=NameType("protocol", "protocols", "PROTOCOLS"),
     metavar="NAME",
     multiple=True,
-    help="published, equal or best; repeat. Default: all.",
+    help="published, released, equal or best; repeat. Default: all.",
 )
 @click.option(
     "--data-set",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from fhash_codec.bench.paper.cell import Cell, Point
 from fhash_codec.bench.paper.printed import ENCODINGS, FEATURES, SETS
+from fhash_codec.bench.paper.protocols import PROTOCOLS
 from fhash_codec.bench.paper.table import Spread
 
 __all__ = ["Group", "by_data", "groups", "within"]
@@ -56,7 +57,7 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
         key = cell.protocol, cell.data_set, cell.feature, cell.encoding
         found.setdefault(key, []).append(cell)
     orders: list[Sequence[str]] = [
-        ("published", "equal", "best"), tuple(SETS), FEATURES, tuple(ENCODINGS),
+        PROTOCOLS, tuple(SETS), FEATURES, tuple(ENCODINGS),
     ]  # fmt: skip
 
     def rank(key: tuple[str, ...]) -> list[tuple[int, str]]:

@@ -9,7 +9,14 @@ from typing import Any
 from fhash_codec.bench.paper.data import KINDS, feature_text, simulated
 from fhash_codec.bench.paper.latency import VIEWS
 from fhash_codec.bench.paper.pictures import SIZE
-from fhash_codec.bench.paper.protocols import CANDIDATES, ENCODINGS, PROTOCOLS, RATE
+from fhash_codec.bench.paper.protocols import (
+    CANDIDATES,
+    ENCODINGS,
+    PROTOCOLS,
+    RATE,
+    RELEASED_EPOCHS,
+    encodings_of,
+)
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request
 from fhash_codec.training.devices import choose_device
@@ -26,11 +33,11 @@ class BenchPlan:
     """Cells that are to be measured.
 
     Attributes:
-        scale: full, half or quarter of the paper's lengths; of the scenes alone.
+        scale: full, half, quarter or eighth of the paper's lengths; of the scenes alone.
         data_sets: names of scenes; not used with data of one's own.
         protocols, encodings: names.
         features: kinds, or features as the codec takes them.
-        epochs: of every training.
+        epochs: of every training; the protocol released takes RELEASED_EPOCHS times as many.
         seeds: seeds 1, 2, ... of every cell.
         key_frames: as `fhash encode --key-frames` takes it; None for as many as the paper has.
         device: auto, cpu or cuda.
@@ -88,15 +95,19 @@ def requests_of(
             for seed in range(1, plan.seeds + 1):
                 for protocol in plan.protocols:
                     timed = plan.latency and protocol == "published" and seed == 1
-                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
-                    for encoding in encodings:
+                    own: dict[str, Any] = {"latency": timed and plan.views}
+                    if protocol == "best":
+                        own["candidates"] = list(CANDIDATES)
+                    if protocol == "released":
+                        own["epochs"] = plan.epochs * RELEASED_EPOCHS
+                    for encoding in encodings_of(protocol, encodings):
                         yield Request(
                             encoding=encoding,
                             protocol=protocol,
                             data_set=data_set,
                             feature=feature,
                             seed=seed,
-                            settings=settings | {"latency": timed and plan.views} | tried,
+                            settings=settings | own,
                         )
 
 

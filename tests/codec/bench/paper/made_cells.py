@@ -38,9 +38,6 @@ def cell(encoding: str = "fhash", protocol: str = "equal", **others: Any) -> Cel
             epoch=epoch,
             seconds=0.5 * epoch,
             coreset_psnr=10 + rise * epoch,
-            coreset_ssim=0.9,
-            domain_psnr=9 + rise * epoch,
-            domain_ssim=0.8,
             picture_psnr=12 + rise * epoch,
             picture_ssim=0.95,
         )

@@ -58,7 +58,7 @@ def test_the_rate_of_the_protocol_best_falls_to_zero(data: Data) -> None:
 
 
 def test_key_frames_start_apart(data: Data) -> None:
-    arranged = Arrangement(joint=False, whole=True, steps=(1,), engine="gather")
+    arranged = Arrangement(joint=False, samples="everything", steps=(1,), engine="gather")
     encoding = build("dense", data, arranged, steps=1, epochs=1, seed=1, device=torch.device("cpu"))
     assert [part.plan.seed for part in encoding.parts] == [3, 4, 5]
     first, second, _ = (part.model for part in encoding.parts)
