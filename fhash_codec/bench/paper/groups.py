@@ -10,7 +10,7 @@ from fhash_codec.bench.paper.printed import ENCODINGS, FEATURES, SETS
 from fhash_codec.bench.paper.protocols import PROTOCOLS
 from fhash_codec.bench.paper.table import Spread
 
-__all__ = ["Group", "by_data", "groups", "within"]
+__all__ = ["Group", "by_data", "groups", "of_protocol", "within"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,16 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
     return [
         Group(*key, tuple(sorted(found[key], key=lambda cell: cell.seed)))
         for key in sorted(found, key=rank)
+    ]
+
+
+def of_protocol(grouped: Sequence[Group], protocol: str) -> list[Group]:
+    """Groups of a protocol; beside released F-Hash stand the other encodings as published."""
+    return [
+        group
+        for group in grouped
+        if group.protocol == protocol
+        or ((protocol, group.protocol) == ("released", "published") and group.encoding != "fhash")
     ]
 
 
