@@ -45,7 +45,7 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--quick",
     is_flag=True,
-    help="A quarter of the paper's lengths, 4 key frames, segmentation, 20 epochs, one seed.",
+    help="An eighth of the paper's lengths, segmentation, one seed.",
 )
 @click.option(
     "--scale",
