@@ -45,13 +45,13 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--quick",
     is_flag=True,
-    help="A quarter of the paper's lengths, 4 key frames, segmentation, 20 epochs, one seed.",
+    help="An eighth of the paper's lengths, segmentation, one seed.",
 )
 @click.option(
     "--scale",
     type=NameType("scale", "sets", "SCALES"),
     metavar="NAME",
-    help="Of the scenes: full, half or quarter of the paper's lengths. Default: full.",
+    help="Of the scenes: full, half, quarter or eighth of the paper's lengths. Default: full.",
 )
 @click.option(
     "--protocol",
@@ -59,7 +59,7 @@ class NameType(click.ParamType[str]):
     type=NameType("protocol", "protocols", "PROTOCOLS"),
     metavar="NAME",
     multiple=True,
-    help="published, equal or best; repeat. Default: all.",
+    help="published, released, equal or best; repeat. Default: all.",
 )
 @click.option(
     "--data-set",

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-__all__ = ["CONFIRMED", "NOT_TESTABLE", "REFUTED", "Answer", "spread", "verdict"]
+__all__ = ["CONFIRMED", "NOT_REACHED", "NOT_TESTABLE", "REFUTED", "Answer", "spread", "verdict"]
 
 CONFIRMED = "confirmed"
 """Verdict where the figures bear a claim out."""
 REFUTED = "refuted"
 """Verdict where the figures contradict a claim."""
+NOT_REACHED = "not reached here"
+"""Verdict where the figures neither bear a claim out nor contradict it."""
 NOT_TESTABLE = "not testable here"
 """Verdict where the cells hold no figure about a claim."""
 
@@ -26,11 +28,18 @@ class Answer:
     figures: str
 
 
-def verdict(values: Sequence[float], holds: Callable[[Sequence[float]], bool]) -> str:
-    """The verdict of a test on values; not testable without any."""
+def verdict(values: Sequence[float], claimed: float, opposite: float) -> str:
+    """The verdict on values of which a claim says that they are large; not testable without any.
+
+    Args:
+        values: what was measured.
+        claimed: the median that confirms the claim, or any larger one.
+        opposite: a median below it refutes the claim.
+    """
     if not values:
         return NOT_TESTABLE
-    return CONFIRMED if holds(values) else REFUTED
+    middle = median(values)
+    return CONFIRMED if middle >= claimed else REFUTED if middle < opposite else NOT_REACHED
 
 
 def spread(values: Sequence[float], unit: str) -> str:

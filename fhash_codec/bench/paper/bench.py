@@ -97,7 +97,7 @@ def bench_paper(
                 text = f"{request}: {stage} {done}/{total} {note}"  # noqa: B023
                 progress("cells", number, len(requests), text.rstrip())  # noqa: B023
 
-            cell = _run(plan, request, held, device, told)
+            cell = _run(request, held, device, told)
             save(folder, request, cell)
         cells.append(cell)
         progress("cells", number + 1, len(requests), str(request))
@@ -150,11 +150,10 @@ class _Held:
         return (self.data_set, self.feature) == (request.data_set, request.feature)
 
 
-def _run(
-    plan: BenchPlan, request: Request, held: _Held, device: torch.device, progress: Progress
-) -> Cell:
+def _run(request: Request, held: _Held, device: torch.device, progress: Progress) -> Cell:
     """Train one cell and measure it."""
     data, arranged = held.data, arrangement(request.protocol, request.encoding, held.data)
+    epochs = request.settings["epochs"]
 
     def make(steps: int) -> TrainedEncoding:
         return build(
@@ -162,7 +161,7 @@ def _run(
             data,
             arranged,
             steps=steps,
-            epochs=plan.epochs,
+            epochs=epochs,
             seed=request.seed,
             device=device,
         )
@@ -174,13 +173,11 @@ def _run(
     with threads_for(threads_of) as threads:
         warm.train_epoch(0)
         del warm
-        steps, trial = _best_steps(arranged, make, data, plan.epochs, device, progress)
+        steps, trial = _best_steps(arranged, make, data, epochs, device, progress)
         encoding = make(steps)
-        result = train(
-            encoding, data, plan.epochs, device=device, picture=pictures, progress=progress
-        )
+        result = train(encoding, data, epochs, device=device, picture=pictures, progress=progress)
         latency = _latency(request, held, encoding, device, progress)
-    samples = encoding.samples_an_epoch * plan.epochs
+    samples = encoding.samples_an_epoch * epochs
     return Cell(
         encoding=request.encoding,
         protocol=request.protocol,
@@ -230,7 +227,7 @@ def _best_steps(
         encoding = make(candidate)
         if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
             continue
-        course = train(encoding, data, epochs, device=device, brief=True, progress=progress)
+        course = train(encoding, data, epochs, device=device, progress=progress)
         trial.append(_tried(encoding, course))
         ranked = rank(course.curve), candidate
         best = ranked if best is None else max(best, ranked)

@@ -25,7 +25,8 @@ class Places:
     """Random vertices of a step in the coreset of a neighbouring key frame.
 
     Attributes:
-        key: time of the step in key frames; a whole number at a key frame.
+        key: time of the step in key frames.
+        between: whether the step is no key frame.
         vertices: int64 (n, 3), z, y, x of the domain.
         truth: normalised values (n,).
         linear: the source's key frames, interpolated to the step, (n,).
@@ -35,6 +36,7 @@ class Places:
     """
 
     key: float
+    between: bool
     vertices: npt.NDArray[np.int64]
     truth: npt.NDArray[np.float32]
     linear: npt.NDArray[np.float32]
@@ -52,28 +54,28 @@ def _places(data: Data) -> Iterator[Places]:
     """Yield the places of one step after the other."""
     times = time_axis(data.series.coords["t"].values)
     keys = np.interp(times, *_ascending(times[list(data.key_frames)]))
-    quota = max(1, MAX_PLACES // len(times))
+    around = [(int(np.floor(key)), int(np.ceil(key))) for key in keys]
+    # All steps give the same share of their vertices, so that no step counts for more than it has.
+    vertices = sum(int((data.masks[low] | data.masks[high]).sum()) for low, high in around)
+    taken = min(1.0, MAX_PLACES / max(vertices, 1))
     random = np.random.default_rng(0)
-    for step, key in enumerate(keys):
-        before = min(int(key), len(data.key_frames) - 1)
-        after, share = min(before + 1, len(data.key_frames) - 1), key - before
-        if share == 0:
-            after = before
+    for step, (key, (before, after)) in enumerate(zip(keys, around, strict=True)):
         mask, fringe = (
             data.masks[before] | data.masks[after],
             data.masks[before] ^ data.masks[after],
         )
         flat = np.flatnonzero(mask)
-        if len(flat) > quota:
-            flat = np.sort(random.choice(flat, quota, replace=False))
+        if taken < 1:
+            flat = np.sort(random.choice(flat, math.ceil(taken * len(flat)), replace=False))
         frame = data.series.read(step)
         feature = np.logical_or.reduce([each.select(frame, step) for each in data.features])
         truth = data.scanned.value_range.to_unit(frame.reshape(-1)[flat])
         low, high = (data.frames[number].reshape(-1)[flat] for number in (before, after))
-        linear = low + np.float32(share) * (high - low)
+        linear = low + np.float32(key - before) * (high - low)
         finite = np.isfinite(truth) & np.isfinite(linear)
         yield Places(
             key=float(key),
+            between=step not in data.key_frames,
             vertices=np.stack(np.unravel_index(flat[finite], mask.shape), axis=1),
             truth=truth[finite],
             linear=linear[finite],
@@ -100,6 +102,8 @@ def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str
         "psnr_key_frames": [],
         "psnr_between": [],
         "psnr_linear": [],
+        "psnr_inner": [],
+        "psnr_inner_linear": [],
         "psnr_fringe": [],
         "psnr_fringe_linear": [],
     }
@@ -107,15 +111,17 @@ def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str
         decoded = encoding.sample(step.key, torch.from_numpy(step.vertices)).cpu().numpy()
         error = decoded.astype(np.float64) - step.truth
         errors["psnr"].append(error)
-        if step.key.is_integer():
+        if not step.between:
             errors["psnr_key_frames"].append(error)
             continue
         linear = step.linear.astype(np.float64) - step.truth
         errors["psnr_between"].append(error)
         errors["psnr_linear"].append(linear)
+        errors["psnr_inner"].append(error[~step.fringe])
+        errors["psnr_inner_linear"].append(linear[~step.fringe])
         errors["psnr_fringe"].append(error[step.fringe])
         errors["psnr_fringe_linear"].append(linear[step.fringe])
-    between = [step for step in places if not step.key.is_integer()]
+    between = [step for step in places if step.between]
     return {
         **{name: _psnr(parts) for name, parts in errors.items()},
         "fringe_share": _share(

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from fhash_formats.errors import InputError
 
-CELL_VERSION = 1
+CELL_VERSION = 2
 """Version of the cells and of what they measure; a cell of another version is run again."""
 
 
@@ -22,12 +22,9 @@ class Point:
     Attributes:
         step: Adam steps of each model.
         epoch: passes over all samples.
-        seconds: training alone, of all models together.
+        seconds: training alone, of all models together: those of the processor, of all threads; on
+            a GPU those of the clock.
         coreset_psnr: dB of normalised values over the coreset at the key frames (peak 1).
-        coreset_ssim: mean SSIM over the coreset at the key frames.
-        domain_psnr: as `coreset_psnr`, over every vertex of the domain; what was not trained holds
-            the background.
-        domain_ssim: mean SSIM over the domain at the key frames.
         picture_psnr: dB of pictures, mean over the key frames.
         picture_ssim: SSIM of pictures, mean over the key frames.
     """
@@ -36,9 +33,6 @@ class Point:
     epoch: int
     seconds: float
     coreset_psnr: float | None = None
-    coreset_ssim: float | None = None
-    domain_psnr: float | None = None
-    domain_ssim: float | None = None
     picture_psnr: float | None = None
     picture_ssim: float | None = None
 
@@ -49,7 +43,7 @@ class Cell:
 
     Attributes:
         encoding: name of the encoding.
-        protocol: published, equal or best.
+        protocol: published, released, equal or best.
         data_set: flame, bubble, shell, or the name of the user's data.
         shape: (t, z, y, x) of the series.
         feature: kind of the feature: interval, isosurface, segmentation, or as the user wrote it.
@@ -75,7 +69,8 @@ class Cell:
             "psnr_between" of those that are key frames and of the others; "psnr_linear" of the
             others where the source's key frames are interpolated. "psnr_fringe" and
             "psnr_fringe_linear" at vertices in the coreset of one of the two key frames, whose
-            share is "fringe_share"; "missed_share" of the steps' own features is in neither.
+            share is "fringe_share", "psnr_inner" and "psnr_inner_linear" at the others;
+            "missed_share" of the steps' own features is in neither.
         collisions: share of the corners of hashed levels that share their bucket; 0 for others.
         trial: {steps, seconds, psnr, reached} of each number of steps that the protocol best
             tried; `reached` has the seconds to 20, 30 and 40 dB, or None.

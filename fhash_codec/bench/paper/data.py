@@ -12,9 +12,9 @@ import numpy.typing as npt
 from fhash_codec.bench.paper.sets import SCALES, paper_set, scaled
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset import occupancy
-from fhash_codec.coreset.boxes import Sizes
+from fhash_codec.coreset.boxes import Sizes, bounding_box
 from fhash_codec.coreset.bricks import Coreset, build_coreset
-from fhash_codec.coreset.features import Everything, Feature
+from fhash_codec.coreset.features import Everything, Feature, Mask
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import resolve_selection
 from fhash_codec.progress import Progress, silent
@@ -45,8 +45,8 @@ class Data:
         scanned: range and missing values of the series.
         features: the features, resolved.
         kind: interval, isosurface, segmentation, or the feature as the user wrote it.
-        coreset: the samples of the feature at the key frames.
-        everything: every finite vertex of the key frames, in a box that is the domain.
+        coreset: the samples of the feature at the key frames and their fringe, in the product's
+            bricks.
         frames: normalised frames (z, y, x) of the key frames, float32; NaN where values are
             missing.
         background: normalised background outside the coreset.
@@ -58,7 +58,6 @@ class Data:
     features: tuple[Feature, ...]
     kind: str
     coreset: Coreset
-    everything: Coreset
     frames: tuple[npt.NDArray[np.float32], ...]
     background: float
 
@@ -78,6 +77,44 @@ class Data:
         """Bytes of the values of all steps in the source's number type."""
         return prod(self.series.shape) * self.series.dtype.itemsize
 
+    @property
+    def key_range(self) -> tuple[float, float]:
+        """Least and largest normalised value of the key frames."""
+        low = min(float(np.nanmin(frame)) for frame in self.frames)
+        high = max(float(np.nanmax(frame)) for frame in self.frames)
+        return (low, high) if low < high else (0.0, 1.0)
+
+    @cached_property
+    def everything(self) -> Coreset:
+        """Every finite vertex of the key frames, in a box that is the domain."""
+        return self._single((Everything(),), 0)
+
+    @cached_property
+    def unfringed(self) -> Coreset:
+        """The samples of `coreset` without its fringe."""
+        return self._single(self.features, DILATION)
+
+    @cached_property
+    def boxes(self) -> Coreset:
+        """Every finite vertex of the bounding box of the coreset at each key frame."""
+        number = {step: key for key, step in enumerate(self.key_frames)}
+
+        def inside(step: int) -> npt.NDArray[np.bool_]:
+            mask = self.masks[number[step]]
+            filled = np.zeros_like(mask)
+            box = bounding_box(mask)
+            if box is not None:
+                filled[box.slices()] = True
+            return filled
+
+        return self._single((Mask("boxes", read=inside),), 0)
+
+    def _single(self, features: tuple[Feature, ...], dilation: int) -> Coreset:
+        """Samples in bricks of one vertex, so that batches are of shuffled vertices."""
+        return build_coreset(
+            self.series, self.scanned, self.key_frames, features, dilation, silent, brick=(1, 1, 1)
+        )
+
     @cached_property
     def masks(self) -> tuple[npt.NDArray[np.bool_], ...]:
         """The coreset of each key frame as a mask (z, y, x) of the domain."""
@@ -94,7 +131,7 @@ def simulated(name: str, scale: str, seed: int = 0) -> Series:
 
     Args:
         name: flame, bubble or shell.
-        scale: full, half or quarter.
+        scale: full, half, quarter or eighth.
         seed: seed of the scene.
 
     Raises:
@@ -131,8 +168,7 @@ def gather_data(
         profile="paper", features=(feature_text(name, kind),), key_frames=key_frames
     )
     scanned, keys, features = resolve_selection(series, config, progress, None)
-    coreset = build_coreset(series, scanned, keys, features, DILATION, progress)
-    everything = build_coreset(series, scanned, keys, (Everything(),), 0, progress)
+    coreset = build_coreset(series, scanned, keys, features, DILATION, progress, fringe=True)
     frames = tuple(scanned.value_range.to_unit(series.read(step)) for step in keys)
     return Data(
         name=name,
@@ -141,7 +177,6 @@ def gather_data(
         features=features,
         kind=kind,
         coreset=coreset,
-        everything=everything,
         frames=frames,
         background=float(scanned.value_range.to_unit(coreset.background)),
     )

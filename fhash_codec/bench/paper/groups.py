@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from fhash_codec.bench.paper.cell import Cell, Point
 from fhash_codec.bench.paper.printed import ENCODINGS, FEATURES, SETS
+from fhash_codec.bench.paper.protocols import PROTOCOLS
 from fhash_codec.bench.paper.table import Spread
 
-__all__ = ["Group", "by_data", "groups", "within"]
+__all__ = ["Group", "by_data", "groups", "of_protocol", "within"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
         key = cell.protocol, cell.data_set, cell.feature, cell.encoding
         found.setdefault(key, []).append(cell)
     orders: list[Sequence[str]] = [
-        ("published", "equal", "best"), tuple(SETS), FEATURES, tuple(ENCODINGS),
+        PROTOCOLS, tuple(SETS), FEATURES, tuple(ENCODINGS),
     ]  # fmt: skip
 
     def rank(key: tuple[str, ...]) -> list[tuple[int, str]]:
@@ -69,6 +70,16 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
     return [
         Group(*key, tuple(sorted(found[key], key=lambda cell: cell.seed)))
         for key in sorted(found, key=rank)
+    ]
+
+
+def of_protocol(grouped: Sequence[Group], protocol: str) -> list[Group]:
+    """Groups of a protocol; beside released F-Hash stand the other encodings as published."""
+    return [
+        group
+        for group in grouped
+        if group.protocol == protocol
+        or ((protocol, group.protocol) == ("released", "published") and group.encoding != "fhash")
     ]
 
 

@@ -9,14 +9,19 @@ from typing import Any
 from fhash_codec.bench.paper.data import KINDS, feature_text, simulated
 from fhash_codec.bench.paper.latency import VIEWS
 from fhash_codec.bench.paper.pictures import SIZE
-from fhash_codec.bench.paper.protocols import CANDIDATES, ENCODINGS, PROTOCOLS, RATE
+from fhash_codec.bench.paper.protocols import (
+    CANDIDATES,
+    ENCODINGS,
+    PROTOCOLS,
+    RATE,
+    RELEASED_EPOCHS,
+    encodings_of,
+)
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request
 from fhash_codec.training.devices import choose_device
 from fhash_formats.series import Series
 
-QUICK_KEY_FRAMES = 4
-"""Key frames of the quick bench."""
 USUAL_KEY_FRAMES = 10
 """Key frames of data that are not the paper's."""
 
@@ -26,11 +31,11 @@ class BenchPlan:
     """Cells that are to be measured.
 
     Attributes:
-        scale: full, half or quarter of the paper's lengths; of the scenes alone.
+        scale: full, half, quarter or eighth of the paper's lengths; of the scenes alone.
         data_sets: names of scenes; not used with data of one's own.
         protocols, encodings: names.
         features: kinds, or features as the codec takes them.
-        epochs: of every training.
+        epochs: of every training; the protocol released takes RELEASED_EPOCHS times as many.
         seeds: seeds 1, 2, ... of every cell.
         key_frames: as `fhash encode --key-frames` takes it; None for as many as the paper has.
         device: auto, cpu or cuda.
@@ -55,13 +60,14 @@ class BenchPlan:
 
     @classmethod
     def quick(cls, **changes: Any) -> BenchPlan:
-        """The plan that takes minutes: a quarter of the lengths, one feature, one seed."""
+        """The plan that takes minutes: an eighth of the lengths, one feature, one seed.
+
+        Key frames and epochs are the paper's, and so are the steps in an epoch.
+        """
         settings: dict[str, Any] = {
-            "scale": "quarter",
+            "scale": "eighth",
             "features": ("segmentation",),
-            "epochs": 20,
             "seeds": 1,
-            "key_frames": f"auto:{QUICK_KEY_FRAMES}",
             "views": 1,
         }
         return cls(**(settings | changes))
@@ -88,15 +94,19 @@ def requests_of(
             for seed in range(1, plan.seeds + 1):
                 for protocol in plan.protocols:
                     timed = plan.latency and protocol == "published" and seed == 1
-                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
-                    for encoding in encodings:
+                    own: dict[str, Any] = {"latency": timed and plan.views}
+                    if protocol == "best":
+                        own["candidates"] = list(CANDIDATES)
+                    if protocol == "released":
+                        own["epochs"] = plan.epochs * RELEASED_EPOCHS
+                    for encoding in encodings_of(protocol, encodings):
                         yield Request(
                             encoding=encoding,
                             protocol=protocol,
                             data_set=data_set,
                             feature=feature,
                             seed=seed,
-                            settings=settings | {"latency": timed and plan.views} | tried,
+                            settings=settings | own,
                         )
 
 

@@ -73,7 +73,7 @@ SETS: dict[str, PaperSet] = {
 }
 """The paper's data sets, by the scene of the simulator that resembles them."""
 
-SCALES = {"full": 1, "half": 2, "quarter": 4}
+SCALES = {"full": 1, "half": 2, "quarter": 4, "eighth": 8}
 """Divisors of the paper's lengths, by name."""
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 
 from fhash_codec.bench.paper.cell import Cell
-from fhash_codec.bench.paper.groups import Group, by_data, groups, within
+from fhash_codec.bench.paper.groups import Group, by_data, groups, of_protocol, within
 from fhash_codec.bench.paper.printed import (
     DECIBELS,
     ENCODINGS,
@@ -50,8 +50,9 @@ def paper_tables(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
     tables = [_trainings(grouped), _folds(), _configurations()]
     for protocol in dict.fromkeys(group.protocol for group in grouped):
         mine = [group for group in grouped if group.protocol == protocol]
-        tables += [_convergence(protocol, mine, quality) for quality in QUALITIES]
-        tables += [_accuracy(protocol, mine), _ratios(protocol, mine)]
+        beside = of_protocol(grouped, protocol)
+        tables += [_convergence(protocol, beside, quality) for quality in QUALITIES]
+        tables += [_accuracy(protocol, beside), _ratios(protocol, mine)]
         if any(cell.latency for group in mine for cell in group.cells):
             tables.append(_latency(protocol, mine))
         if any(cell.between for group in mine for cell in group.cells):
@@ -306,7 +307,8 @@ def _between(protocol: str, grouped: Sequence[Group]) -> PaperTable:
         "psnr_key_frames": "key frames, dB",
         "psnr_between": "between, dB",
         "psnr_linear": "true key frames, interpolated, dB",
-        "psnr_fringe": "fringe, dB",
+        "psnr_inner": "without the fringe, dB",
+        "psnr_inner_linear": "interpolated, dB",
         "psnr": "all steps, dB",
     }
     rows: list[tuple[Value, ...]] = []

@@ -69,7 +69,7 @@ def test_files_are_asked_for_by_data_set(
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--protocol", "fair"], "'fair' is no protocol; allowed: published, equal, best"),
+        (["--protocol", "fair"], "'fair' is no protocol; allowed: published, released,"),
         (["--encoding", "mhe"], "'mhe' is no encoding; allowed: dense,"),
         (["--data-set", "argon"], "'argon' is no data set; allowed: flame,"),
         (["--var", "x"], "--var is for DATA"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from fhash_codec.bench.paper.sets import (
 )
 from fhash_codec.coreset.boxes import Sizes
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.levels import level_resolutions
+from fhash_codec.paper.levels import ceil_log, level_resolutions
 from fhash_codec.paper.training.train import TrainingPlan
 
 
@@ -52,7 +53,11 @@ def build(
     Raises:
         MissingDependencyError: tcnn, where tiny-cuda-nn or a CUDA device is missing.
     """
-    samples = data.everything if arranged.whole else data.coreset
+    samples: Coreset = getattr(data, arranged.samples)
+    unit = data.key_range if arranged.released else (0.0, 1.0)
+    if arranged.released:
+        values = (samples.values - unit[0]) / (unit[1] - unit[0])
+        samples = replace(samples, values=values.astype(np.float32))
     keys = tuple(range(len(data.key_frames)))
     pieces = (
         [(keys, samples)]
@@ -78,6 +83,7 @@ def build(
         parts,
         data,
         in_time=name == "fhash",
+        unit=unit,
         collisions=collided / sum(corners) if corners else 0.0,
     )
 
@@ -91,11 +97,14 @@ def levels_of(name: str, data: Data, coreset: Coreset, arranged: Arrangement) ->
     box, count = coreset.box.shape, len(coreset.key_frames)
     sizes = (count, *box)
     if name == "fhash":
-        return [GridLevel(level, sizes, False) for level in level_resolutions(box, count, 2)]
+        resolutions = level_resolutions(box, count, 2)
+        if arranged.released:
+            resolutions = resolutions[: max(1, ceil_log(min(box), 2))]
+        return [GridLevel(resolution, sizes, False) for resolution in resolutions]
     if name == "hash":
         coarsest = SETS[data.name].coarsest if data.name in SETS else USUAL_COARSEST
-        resolutions = hash_resolutions(box, coarsest)
-        return [HashLevel(corners, hash_table(box), sizes) for corners in resolutions]
+        table = hash_table(box)
+        return [HashLevel(n, table, sizes) for n in hash_resolutions(box, coarsest)]
     grid = paper_grid(data) if arranged.whole else box
     grids = dense_levels(grid) if name == "dense-multi" else [grid]
     return [GridLevel((count, *level), sizes, True) for level in grids]

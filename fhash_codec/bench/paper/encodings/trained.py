@@ -73,7 +73,14 @@ class TrainedEncoding:
     """An `Encoding` made of parts that together hold every key frame once."""
 
     def __init__(
-        self, name: str, parts: Sequence[Part], data: Data, *, in_time: bool, collisions: float
+        self,
+        name: str,
+        parts: Sequence[Part],
+        data: Data,
+        *,
+        in_time: bool,
+        collisions: float,
+        unit: tuple[float, float] = (0.0, 1.0),
     ) -> None:
         """Join parts.
 
@@ -83,9 +90,11 @@ class TrainedEncoding:
             data: what they are trained on.
             in_time: whether a model interpolates in time by itself.
             collisions: share of the corners of the tables that share their bucket.
+            unit: normalised values that are 0 and 1 for the models.
         """
         self.name, self.parts, self.data = name, tuple(parts), data
         self.in_time, self.collisions = in_time, collisions
+        self._low, self._span = unit[0], unit[1] - unit[0]
         self._part = {key: part for part in parts for key in part.keys}
         # Flat places in a frame of the samples of each key frame, and their first and last number.
         self._places: dict[int, npt.NDArray[np.int32]] = {}
@@ -141,11 +150,14 @@ class TrainedEncoding:
         frame = np.full(self.data.frame_shape, self.data.background, np.float32)
         if key in self._part:
             numbers = np.arange(*self._numbers[key])
-            frame.reshape(-1)[self._places[key]] = self._part[key].model.infer(numbers)
+            values = self._part[key].model.infer(numbers)
+            frame.reshape(-1)[self._places[key]] = self._low + self._span * values
         return frame
 
     def sample(self, key: float, places: Tensor) -> Tensor:
-        """Values (n,) at places (n, 3) of a time in key frames, the background outside the box.
+        """Values (n,) at places (n, 3), of integers or floats, of a time in key frames.
+
+        Those outside the box are the background.
 
         Between key frames F-Hash interpolates its embeddings, and the values of the others are
         interpolated.
@@ -161,10 +173,11 @@ class TrainedEncoding:
         first = torch.tensor(box.first, dtype=torch.float64, device=places.device)
         last = first + torch.tensor(box.shape, dtype=torch.float64, device=places.device) - 1
         inside = ((places >= first) & (places <= last)).all(1)
-        time = torch.full_like(places[:, :1], part.keys.index(before) + share)
-        points = torch.cat([time, places - first], 1).double()
+        # A tensor like `places` would cut the share of an integer's time to 0.
+        time = torch.full((len(places), 1), part.keys.index(before) + share, dtype=torch.float64)
+        points = torch.cat([time.to(places.device), places - first], 1)
         values = part.model.sample(points).to(places.device)
-        return torch.where(inside, values, self.data.background)
+        return torch.where(inside, self._low + self._span * values, self.data.background)
 
     def arrays(self) -> list[npt.NDArray[np.float32]]:
         """The trained numbers of all models."""

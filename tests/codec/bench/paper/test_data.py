@@ -6,15 +6,29 @@ import numpy as np
 import pytest
 
 from fhash_codec.bench.paper.data import FEATURES, KINDS, Data, feature_text, simulated
+from fhash_codec.bench.paper.encodings.places import sample_places
 from fhash_codec.coreset.features import parse_feature
 from fhash_formats.errors import InputError
 
 
 def test_masks_hold_the_samples(data: Data) -> None:
-    assert sum(int(mask.sum()) for mask in data.masks) == len(data.coreset.values)
     every = np.concatenate([f[m] for f, m in zip(data.frames, data.masks, strict=True)])
-    np.testing.assert_array_equal(np.sort(every), np.sort(data.coreset.values))
+    np.testing.assert_array_equal(np.sort(every), np.sort(data.unfringed.values))
+    assert data.coreset.fringe is not None
+    of_key_frames = data.coreset.values[~data.coreset.fringe]
+    np.testing.assert_array_equal(np.sort(every), np.sort(of_key_frames))
+    assert data.coreset.fringe.any()
     assert 0.1 < data.coreset.fraction < 0.8
+
+
+def test_boxes_hold_the_bounding_box_of_each_key_frame(data: Data) -> None:
+    places = sample_places(data.boxes)
+    for key, mask in enumerate(data.masks):
+        at = np.argwhere(mask)
+        expected = np.prod(at.max(axis=0) - at.min(axis=0) + 1)
+        assert (places[:, 0] == key).sum() == expected > mask.sum()
+    assert data.boxes.box == data.coreset.box
+    assert data.boxes.brick_shape == (1, 1, 1)
 
 
 def test_everything_is_the_domain(data: Data) -> None:

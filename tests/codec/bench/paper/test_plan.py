@@ -14,22 +14,25 @@ QUICK = BenchPlan.quick(device="cpu")
 
 def test_the_quick_plan_of_the_scenes() -> None:
     requests = list(requests_of(QUICK, QUICK.encodings, None, "data"))
-    assert len(requests) == 3 * 3 * 5
+    assert len(requests) == 3 * (3 * 5 + 1)  # the protocol released has one encoding
     assert len({request.filename for request in requests}) == len(requests)
     shapes = {request.data_set: request.settings["shape"] for request in requests}
     assert shapes == {
-        "flame": [34, 14, 43, 50],
-        "bubble": [61, 64, 32, 32],
-        "shell": [34, 54, 54, 54],
+        "flame": [17, 7, 22, 25],
+        "bubble": [31, 32, 16, 16],
+        "shell": [17, 27, 27, 27],
     }
-    assert {request.settings["key_frames"] for request in requests} == {"auto:4"}
+    keys = {request.data_set: request.settings["key_frames"] for request in requests}
+    assert keys == {"flame": "auto:10", "bubble": "auto:9", "shell": "auto:10"}
     assert {request.feature for request in requests} == {"segmentation"}
 
 
 def test_the_full_plan_has_the_papers_key_frames() -> None:
     plan = BenchPlan(device="cpu")
     requests = list(requests_of(plan, ("fhash",), None, "data"))
-    assert len(requests) == 3 * 3 * 3 * 3
+    assert len(requests) == 3 * 3 * 4 * 3
+    epochs = {request.protocol: request.settings["epochs"] for request in requests}
+    assert epochs == {"published": 60, "released": 120, "equal": 60, "best": 60}
     keys = {request.data_set: request.settings["key_frames"] for request in requests}
     assert keys == {"flame": "auto:10", "bubble": "auto:9", "shell": "auto:10"}
 
@@ -41,7 +44,7 @@ def test_latency_is_timed_once_for_each_published_encoding() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed", [{"epochs": 5}, {"key_frames": "all"}, {"picture_size": 64}, {"views": 2}]
+    "changed", [{"epochs": 5}, {"key_frames": "0,2,4"}, {"picture_size": 64}, {"views": 2}]
 )
 def test_a_changed_setting_is_another_cell(series: ArraySeries, changed: dict) -> None:
     names = [
@@ -49,4 +52,4 @@ def test_a_changed_setting_is_another_cell(series: ArraySeries, changed: dict) -
         for plan in (QUICK, replace(QUICK, **changed))
     ]
     assert names[0] != names[1]
-    assert len(names[0]) == 3
+    assert len(names[0]) == 4

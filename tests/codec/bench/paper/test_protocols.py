@@ -36,6 +36,17 @@ def test_published_fhash_is_joint_on_the_coreset(data: Data) -> None:
     assert arranged.steps == (1,)  # 2^21 samples are more than there are
 
 
+def test_released_is_the_authors_code(data: Data) -> None:
+    arranged = arrangement("released", "fhash", data)
+    batch = round(published_batch("blob", data.frame_shape) * 2_000_000 / 2**21)
+    assert batch == 2_000_000
+    assert (arranged.joint, arranged.samples, arranged.steps) == (True, "boxes", (1,))
+    assert (arranged.engine, arranged.schedule) == ("gather", "constant")
+    assert arrangement("published", "fhash", data).samples == "unfringed"
+    with pytest.raises(InputError, match="released with fhash alone"):
+        arrangement("released", "hash", data)
+
+
 def test_equal_differs_by_the_encoding_alone(data: Data) -> None:
     arranged = {name: arrangement("equal", name, data) for name in ENCODINGS if name != "tcnn"}
     assert len(set(arranged.values())) == 1
@@ -55,5 +66,5 @@ def test_best_takes_the_fastest_engine(data: Data) -> None:
 
 
 def test_unknown_names_are_refused(data: Data) -> None:
-    with pytest.raises(InputError, match="published, equal, best"):
+    with pytest.raises(InputError, match="published, released, equal, best"):
         arrangement("fair", "hash", data)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
-from fhash_codec.bench.paper.data import Data
+from fhash_codec.bench.paper.data import Data, gather_data
 from fhash_codec.bench.paper.encodings.build import build, levels_of, paper_grid
 from fhash_codec.bench.paper.encodings.corners import GridLevel, HashLevel
 from fhash_codec.bench.paper.encodings.gather import GatherModel
@@ -57,8 +58,35 @@ def test_the_rate_of_the_protocol_best_falls_to_zero(data: Data) -> None:
     assert abs(rates["best"][-1]) < 1e-12
 
 
+def test_released_has_the_levels_of_the_shortest_axis(data: Data) -> None:
+    arranged = arrangement("released", "fhash", data)
+    found = levels_of("fhash", data, data.boxes, arranged)
+    assert [level.resolution for level in found if isinstance(level, GridLevel)] == [
+        (3, 7, 9, 12),
+        (2, 4, 5, 6),
+        (2, 2, 3, 3),
+    ]
+    published = levels_of("fhash", data, data.boxes, arrangement("published", "fhash", data))
+    assert len(published) == 4
+
+
+def test_released_values_are_from_0_to_1_over_the_key_frames(series: ArraySeries) -> None:
+    values = np.stack([series.read(step) for step in range(5)])
+    values[1] *= 2  # no key frame
+    data = gather_data("blob", ArraySeries(values), "interval:0.2:2", "0,2,4")
+    arranged = arrangement("released", "fhash", data)
+    encoding = build("fhash", data, arranged, steps=1, epochs=1, seed=1, device=torch.device("cpu"))
+    (part,) = encoding.parts
+    assert float(part.coreset.values.max()) == 1
+    assert data.boxes.values.max() == pytest.approx(0.5, abs=0.01)
+    at = torch.from_numpy(np.argwhere(data.masks[0]))
+    inner = part.model.sample(torch.cat([torch.zeros(len(at), 1), at], 1).double())
+    low, high = data.key_range
+    torch.testing.assert_close(encoding.sample(0, at), low + (high - low) * inner)
+
+
 def test_key_frames_start_apart(data: Data) -> None:
-    arranged = Arrangement(joint=False, whole=True, steps=(1,), engine="gather")
+    arranged = Arrangement(joint=False, samples="everything", steps=(1,), engine="gather")
     encoding = build("dense", data, arranged, steps=1, epochs=1, seed=1, device=torch.device("cpu"))
     assert [part.plan.seed for part in encoding.parts] == [3, 4, 5]
     first, second, _ = (part.model for part in encoding.parts)
@@ -79,7 +107,5 @@ def test_key_frames_start_apart(data: Data) -> None:
 def test_the_papers_grid_at_a_scale(
     name: str, frame: tuple[int, int, int], grid: tuple[int, int, int], data: Data
 ) -> None:
-    import numpy as np
-
     empty = ArraySeries(np.zeros((1, *frame), np.float32))
     assert paper_grid(dataclasses.replace(data, name=name, series=empty)) == grid
