@@ -15,6 +15,7 @@ from fhash_codec.appending.figures import Figures, StepErrors
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, code
 from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.support.number_types import exact_number
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.support.threads import map_ahead, usable_threads
 from fhash_formats.transform.tile.decoding import decode_tile
@@ -82,7 +83,7 @@ class LayerCoder:
             streams.append(tile.data)
             nonzero += tile.nonzero
         errors = [figures.measure(*pair) for pair in zip(values, decoded, strict=True)]
-        value_range = ValueRange(float(values.min()), float(values.max()))
+        value_range = ValueRange(*_ends(values))
         return CodedLayer(streams=streams, errors=errors, nonzero=nonzero, value_range=value_range)
 
     def _tile(self, values: npt.NDArray[Any], index: Index) -> Tile:
@@ -119,8 +120,8 @@ class LayerCoder:
 
     def _wider(self, tile: Tile) -> Iterator[TileSettings]:
         """Yield settings with a wider range for a tile whose values leave that of the file."""
-        low, high = float(tile.values.min()), float(tile.values.max())
         shared = self.settings
+        low, high = ValueRange(*_ends(tile.values)).moved(-shared.origin).ends
         if self.coding.exact or (shared.low <= low and high <= shared.high):
             return
         yield replace(
@@ -131,3 +132,8 @@ class LayerCoder:
             predictor=None,
             clip=False,
         )
+
+
+def _ends(values: npt.NDArray[Any]) -> tuple[float, float]:
+    """The least and the greatest of finite values, exactly."""
+    return exact_number(values.min().item()), exact_number(values.max().item())

@@ -100,7 +100,7 @@ def encode_compact(
         own = table_header(selection, table, config, seconds)
         own["required_features"] = list(parts.features)
         own["required_features"] += coordinate_features(described["coordinates"])
-        header = complete(source | described | own, table.decoded)
+        header = complete(source | described | own, table.in_source)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
             break

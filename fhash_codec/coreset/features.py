@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from fhash_codec.measure.value_range import ValueRange, pieces
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
+from fhash_formats.support.number_types import exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
 """Values (z, y, x) of one step."""
@@ -37,6 +39,9 @@ KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], change:D, onset:V, mask
 FramesAround = Callable[[int], Iterator[Frame]]
 """Step -> the frames from the key frame before it to the one after it, in their order."""
 
+_BEYOND = 1 << 65
+"""Number beyond all integers of 64 bits."""
+
 BINS = 1024
 """Bins of the histogram for Otsu's threshold."""
 
@@ -46,7 +51,7 @@ class Feature(ABC):
 
     Thresholds are rounded to the number type of a floating-point frame before the comparison, as
     numpy does: in a float32 frame `interval:0.1:0.3` includes the value 0.3. Integers are compared
-    as float64. NaN and infinite vertices are never selected.
+    exactly. NaN and infinite vertices are never selected.
     """
 
     @abstractmethod
@@ -78,8 +83,8 @@ class Interval(Feature):
 
     def select(self, frame: Frame, step: int) -> FrameMask:
         selected: FrameMask = np.isfinite(frame)
-        selected &= frame >= _as_frame_type(self.low, frame)
-        selected &= frame <= _as_frame_type(self.high, frame)
+        selected &= frame >= _least_from(self.low, frame)
+        selected &= frame <= _greatest_to(self.high, frame)
         return selected
 
     def __str__(self) -> str:
@@ -97,11 +102,14 @@ class Isosurface(Feature):
     value: float
 
     def select(self, frame: Frame, step: int) -> FrameMask:
-        value, finite = _as_frame_type(self.value, frame), np.isfinite(frame)
-        selected: FrameMask = frame == value
-        selected &= finite
-        above: FrameMask = (frame > value) & finite
-        below: FrameMask = (frame < value) & finite
+        to, since, finite = (
+            _greatest_to(self.value, frame),
+            _least_from(self.value, frame),
+            np.isfinite(frame),
+        )
+        above: FrameMask = (frame > to) & finite
+        below: FrameMask = (frame < since) & finite
+        selected: FrameMask = ~(above | below) & finite
         for axis in range(3):
             high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
             crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
@@ -129,7 +137,7 @@ class Segmentation(Feature):
                 "resolve_features finds Otsu's from the data"
             )
         selected: FrameMask = np.isfinite(frame)
-        selected &= frame > _as_frame_type(self.threshold, frame)
+        selected &= frame > _greatest_to(self.threshold, frame)
         return selected
 
     def __str__(self) -> str:
@@ -197,7 +205,11 @@ class Change(InTime):
     """Vertices whose value changes by more than a threshold from one step to the next."""
 
     def happens(self, before: Frame, after: Frame) -> FrameMask:
-        """Mask (z, y, x) of larger changes; they are computed in float64."""
+        """Mask (z, y, x) of larger changes; they are computed in float64, of integers exactly."""
+        if is_wide_integer(before.dtype):
+            rises = after > before
+            change = np.where(rises, after - before, before - after).view(np.uint64)
+            return np.asarray(change > _greatest_to(self.threshold, change))
         with np.errstate(invalid="ignore", over="ignore"):
             change = np.abs(np.subtract(after, before, dtype=np.float64))
         return np.isfinite(before) & np.isfinite(after) & (change > self.threshold)
@@ -211,7 +223,7 @@ class Onset(InTime):
 
     def happens(self, before: Frame, after: Frame) -> FrameMask:
         """Mask (z, y, x) of values at or below the threshold before, and above it after."""
-        threshold = _as_frame_type(self.threshold, before)
+        threshold = _greatest_to(self.threshold, before)
         rises: FrameMask = (before <= threshold) & (after > threshold)
         return rises & np.isfinite(before) & np.isfinite(after)
 
@@ -349,13 +361,22 @@ def dilate(mask: FrameMask, vertices: int) -> FrameMask:
     return mask
 
 
-def _as_frame_type(value: float, frame: Frame) -> np.generic:
-    """A threshold as a scalar of the frame's floating-point type, or of float64 for integers.
+def _greatest_to(value: float, frame: Frame) -> Any:
+    """The greatest number that a frame can hold up to a threshold.
 
-    numpy then compares without converting the frame.
+    It is a scalar of the frame's floating-point type, to which the threshold is rounded, of float64
+    for integers of up to 32 bits, and an integer for those of 64. numpy then compares without
+    converting the frame.
     """
+    if is_wide_integer(frame.dtype):
+        return math.floor(max(min(value, _BEYOND), -_BEYOND))
     with np.errstate(over="ignore"):
         return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
+
+
+def _least_from(value: float, frame: Frame) -> Any:
+    """The least number that a frame can hold from a threshold on; see `_greatest_to`."""
+    return -_greatest_to(-value, frame)
 
 
 def _histogram(
@@ -379,7 +400,7 @@ def _numbers(
     """The numbers of a feature's text; raises InputError, with the form that is allowed."""
     parts = [] if values is None else values.split(":")
     try:
-        numbers = [float(part) for part in parts]
+        numbers = [_number(part) for part in parts]
     except ValueError:
         numbers = []
     if len(numbers) != count or any(
@@ -389,5 +410,12 @@ def _numbers(
     return numbers
 
 
+def _number(text: str) -> float:
+    """The number in a text; integers beyond 2^53 stay integers."""
+    return exact_number(
+        int(text) if re.fullmatch(r"\s*[+-]?[0-9]{1,300}\s*", text) else float(text)
+    )
+
+
 def _text(value: float) -> str:
-    return repr(float(value)).removesuffix(".0")
+    return str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")

@@ -23,7 +23,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["AIM", "find_step", "psnr_search", "require_reach", "with_step"]
+__all__ = ["AIM", "FINEST_PSNR", "find_step", "psnr_search", "require_reach", "with_step"]
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.number_types import exact_number, integer_origin
 from fhash_formats.transform.axes.candidates import NO_TRANSFORM, candidates
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.decoding import decode_tile, transform_for
@@ -178,8 +179,9 @@ class _Task:
     Attributes:
         tile: the values (t, z, y, x).
         finite: where they are finite; None where all are.
-        low: smallest finite value; for integers a Python integer, since float64 is too narrow for
-            64 bits.
+        origin: integer that is subtracted from the values before they become floats; 0 for most.
+        low: smallest finite value, less the origin; for integers a Python integer, since float64
+            is too narrow for 64 bits.
         high: largest finite value, likewise.
         quality: the quality asked for.
         error: bound on the decoded values; None for none.
@@ -188,6 +190,7 @@ class _Task:
 
     tile: Values
     finite: Mask | None
+    origin: int
     low: float
     high: float
     quality: Quality
@@ -257,11 +260,20 @@ def _task(tile: Values, quality: Quality) -> _Task | None:
     if not values.size:
         return None
     low, high = values.min().item(), values.max().item()
+    origin = integer_origin(low, high, tile.dtype)
+    low, high = low - origin, high - origin
     with_bound = quality.step is None
     error, reach = _bound(quality, low, high, tile.dtype) if with_bound else (None, 0.0)
     mask = None if all_finite else finite
     return _Task(
-        tile=tile, finite=mask, low=low, high=high, quality=quality, error=error, reach=reach
+        tile=tile,
+        finite=mask,
+        origin=origin,
+        low=low,
+        high=high,
+        quality=quality,
+        error=error,
+        reach=reach,
     )
 
 
@@ -269,7 +281,7 @@ def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple
     """The bound on decoded values, and the largest error before they are rounded to their type."""
     error = 0.0 if quality.max_error is None else float(quality.max_error)
     if quality.max_error_rel is not None:
-        fraction, span = float(quality.max_error_rel), float(high) - float(low)
+        fraction, span = float(quality.max_error_rel), float(high - low)
         error = fraction * span
         if not math.isfinite(span):
             error = fraction * float(high) - fraction * float(low)
@@ -279,10 +291,16 @@ def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple
     return error, error - max(abs(low), abs(high)) * float(np.finfo(dtype).eps)
 
 
-def _constant_tile(tile: Values, center: float) -> CodedTile:
+def _constant_tile(tile: Values, center: float, origin: int = 0) -> CodedTile:
     """A tile whose finite values all decode to one value."""
     settings = TileSettings(
-        transform=NO_TRANSFORM, step=1.0, center=center, low=center, high=center, double=True
+        transform=NO_TRANSFORM,
+        step=1.0,
+        center=center,
+        low=center,
+        high=center,
+        double=True,
+        origin=origin,
     )
     nothing = np.zeros(tile.shape, bool)
     return encode_tile(tile, settings, Coding(own_settings=True), in_coreset=nothing)
@@ -293,7 +311,7 @@ def _encode_constant(task: _Task) -> CodedTile | None:
     error, values_equal = task.error, task.high == task.low
     if not values_equal and (error is None or task.half_range > task.reach):
         return None
-    constant = _constant_tile(task.tile, task.center)
+    constant = _constant_tile(task.tile, task.center, task.origin)
     # A lossless zero keeps its sign, and a constant has one sign only.
     counted = task.tile if task.finite is None else task.tile[task.finite]
     signed = error == 0 and task.low == 0 and bool(np.signbit(counted).any())
@@ -320,8 +338,9 @@ def _first_settings(task: _Task, transform: TransformSpec) -> TileSettings | Non
         transform=transform,
         step=first,
         center=task.center,
-        low=float(task.low),
-        high=float(task.high),
+        low=exact_number(task.low),
+        high=exact_number(task.high),
+        origin=task.origin,
         clip=True,
         double=_double(task.tile.dtype, task.largest, 2 * task.half_range, first),
         quantum=0.0 if task.error is None else 2 * task.reach * _QUANTUM_SHARE,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fhash_formats.transform.tile.decoding import decode_tile_table, within_range
 from fhash_formats.transform.tile.sections import Shape, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
-from fhash_formats.transform.values.elementwise import corrected
+from fhash_formats.transform.values.elementwise import at_origin, corrected
 
 __all__ = ["corrected_part", "uncorrected"]
 
@@ -67,7 +67,10 @@ def corrected_part(
         slice(along.start - wide.start, along.stop - wide.start)
         for along, wide in zip(part, widened, strict=True)
     )
-    return within_range(corrected(base[inner], None, 0.0, np.dtype(dtype)), settings)
+    kind = np.dtype(dtype)
+    coded = settings.differences_of(kind)
+    values = within_range(corrected(base[inner], None, 0.0, coded), settings)
+    return at_origin(values, settings.origin, kind) if settings.origin else values
 
 
 def _widened(part: Part, shape: tuple[int, ...], settings: TileSettings) -> Part:
