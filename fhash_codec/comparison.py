@@ -145,7 +145,9 @@ def _read_about(series: Series, origin: int) -> Callable[[int], npt.NDArray[Any]
 
     def read(step: int) -> npt.NDArray[Any]:
         frame = series.read(step)
-        return frame - origin if frame.dtype.kind == "f" else about_origin(frame, origin)
+        if frame.dtype.kind == "f":
+            return np.asarray(frame - origin)
+        return about_origin(frame, origin)
 
     return read
 

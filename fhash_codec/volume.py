@@ -250,6 +250,16 @@ class Volume(Card, ArrayLike):
         compact files have levels of detail. Raises RegionError for a step outside the series and
         for a region without such a vertex, InputError for another profile or another lod.
         """
+        values, occupied = self.decoded_lod(t, lod, region)
+        values = values.astype(self.float_dtype)
+        values[~occupied] = np.nan
+        return values
+
+    def decoded_lod(self, t: float, lod: int, region: Spans | None = None) -> Decoded:
+        """Values (z, y, x) as `read_lod` gives them, in the type of the file, and which count.
+
+        Arguments and errors as in `read_lod`.
+        """
         vertices = self.lod_vertices(lod, region)
         if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
@@ -258,10 +268,9 @@ class Volume(Card, ArrayLike):
             ((along[0] - first) >> lod, ((along[-1] - first) >> lod) + 1)
             for along, first in zip(vertices, self.box.first, strict=True)
         )
-        values = self._model.read_lod(step, int(lod), coarse).astype(self.float_dtype)
+        values = self._model.read_lod(step, int(lod), coarse)
         surrounding = Box.of((along[0], along[-1] + 1) for along in vertices)
-        values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
-        return values
+        return values, self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]
 
     def lod_vertices(self, lod: int, region: Spans | None = None) -> tuple[range, range, range]:
         """The vertices (z, y, x) of the domain whose values `read_lod` gives.

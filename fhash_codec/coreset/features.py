@@ -412,9 +412,8 @@ def _numbers(
 
 def _number(text: str) -> float:
     """The number in a text; integers beyond 2^53 stay integers."""
-    return exact_number(
-        int(text) if re.fullmatch(r"\s*[+-]?[0-9]{1,300}\s*", text) else float(text)
-    )
+    whole = re.fullmatch(r"\s*[+-]?[0-9]{1,300}\s*", text)
+    return exact_number(float(text) if whole is None else int(text))
 
 
 def _text(value: float) -> str:

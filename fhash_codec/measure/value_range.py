@@ -132,9 +132,7 @@ class ValueRange:
         """The range of the values plus an integer; integers stay exact."""
         if not distance:
             return self
-        return ValueRange(
-            exact_number(int(self.low) + distance), exact_number(int(self.high) + distance)
-        )
+        return ValueRange(*(exact_number(int(end) + distance) for end in self.ends))
 
     @property
     def scale(self) -> float:

@@ -85,7 +85,7 @@ class Blocks:
     def __init__(self, series: Series, extent: Extent, tile: Shape, origin: int = 0) -> None:
         self._series, self._extent, self.origin = series, extent, origin
         self.source_dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
-        self.dtype = np.dtype(np.int64) if origin else self.source_dtype
+        self.dtype: np.dtype[Any] = np.dtype(np.int64) if origin else self.source_dtype
         self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.complete = extent.samples == prod(self.shape)
         self.weights: tuple[int, ...] = (1,)

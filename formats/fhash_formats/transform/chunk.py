@@ -8,7 +8,7 @@ gives the same bytes on every machine.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,7 +70,8 @@ class Quality:
 
     Attributes:
         max_error: bound on |decoded - value|, in units of the values, kept strictly; 0 is lossless.
-        max_error_rel: the same bound as a fraction of the range of the chunk's finite values.
+        max_error_rel: the same bound as a fraction of the range of the chunk's finite values, but
+            for those that a store may have put there, see `encode_chunk`.
         step: quantiser step, in units of the values, without a bound.
     """
 
@@ -135,10 +136,14 @@ def encode_chunk(
     max_error_rel: float | None = None,
     step: float | None = None,
     transform: TransformSpec | Mapping[str, Any] | None = None,
+    fill: Any = 0,
 ) -> bytes:
     """The stream of an array.
 
-    NaN and infinities come back where they were and take no part in range or bound.
+    NaN and infinities come back where they were and take no part in range or bound. Stores put fill
+    values where nothing was written, and beyond the end of an array. So these take no part in the
+    range of `max_error_rel` either, nor does a value that is the only one of a plane at either end
+    of an axis: a filter may have changed the fill value, and some stores do not tell it.
 
     Args:
         values: array of a type that `supported` accepts; its axes become those of `tile_shape`.
@@ -146,6 +151,7 @@ def encode_chunk(
         max_error_rel: as in `Quality`.
         step: as in `Quality`.
         transform: transform along (t, z, y, x); None for the one that codes best in a trial.
+        fill: the fill value of the store; None where it has none.
 
     Raises InputError.
     """
@@ -155,7 +161,18 @@ def encode_chunk(
         tile_shape(values.shape)
     )
     specs = candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
-    return _encode(tile, quality, specs).data if tile.size else b""
+    fills = _fills(values, fill) if quality.max_error_rel is not None else []
+    return _encode(tile, quality, specs, fills).data if tile.size else b""
+
+
+def _fills(values: Values, fill: Any) -> list[Any]:
+    """The values of an array that a store may have put there: see `encode_chunk`."""
+    fills = [] if fill is None else [np.asarray(fill).astype(values.dtype)[()]]
+    for axis in range(values.ndim):
+        for plane in (values.take(end, axis) for end in (0, -1) if values.shape[axis]):
+            if plane.size and bool((plane == plane.flat[0]).all()):
+                fills.append(plane.flat[0])
+    return fills
 
 
 def decode_chunk(data: bytes | memoryview, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Values:
@@ -219,9 +236,14 @@ class _Task:
         return max(abs(float(self.low)), abs(float(self.high)))
 
 
-def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) -> CodedTile:
-    """The coded chunk, stored without loss where that takes no more bytes."""
-    task = _task(tile, quality)
+def _encode(
+    tile: Values, quality: Quality, specs: tuple[TransformSpec, ...], fills: Sequence[Any]
+) -> CodedTile:
+    """The coded chunk, stored without loss where that takes no more bytes.
+
+    fills: values that take no part in the range of a relative bound.
+    """
+    task = _task(tile, quality, fills)
     if task is None:
         return _constant_tile(tile, 0.0)
     constant = _encode_constant(task)
@@ -252,7 +274,7 @@ def _transformed(task: _Task, specs: tuple[TransformSpec, ...]) -> CodedTile | N
     )
 
 
-def _task(tile: Values, quality: Quality) -> _Task | None:
+def _task(tile: Values, quality: Quality, fills: Sequence[Any]) -> _Task | None:
     """The chunk with its range and bound; None where no value is finite."""
     finite = np.isfinite(tile)
     all_finite = bool(finite.all())
@@ -263,7 +285,9 @@ def _task(tile: Values, quality: Quality) -> _Task | None:
     origin = integer_origin(low, high, tile.dtype)
     low, high = low - origin, high - origin
     with_bound = quality.step is None
-    error, reach = _bound(quality, low, high, tile.dtype) if with_bound else (None, 0.0)
+    kept = values[np.logical_and.reduce([values != fill for fill in fills])] if fills else values
+    ends = (kept.min().item(), kept.max().item()) if kept.size else (0, 0)
+    error, reach = _bound(quality, low, high, ends, tile.dtype) if with_bound else (None, 0.0)
     mask = None if all_finite else finite
     return _Task(
         tile=tile,
@@ -277,14 +301,19 @@ def _task(tile: Values, quality: Quality) -> _Task | None:
     )
 
 
-def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple[float, float]:
-    """The bound on decoded values, and the largest error before they are rounded to their type."""
+def _bound(
+    quality: Quality, low: Any, high: Any, ends: tuple[Any, Any], dtype: np.dtype[Any]
+) -> tuple[float, float]:
+    """The bound on decoded values, and the largest error before they are rounded to their type.
+
+    low, high: range of the values. ends: of the range that a relative bound is of.
+    """
     error = 0.0 if quality.max_error is None else float(quality.max_error)
     if quality.max_error_rel is not None:
-        fraction, span = float(quality.max_error_rel), float(high - low)
+        fraction, span = float(quality.max_error_rel), float(ends[1] - ends[0])
         error = fraction * span
         if not math.isfinite(span):
-            error = fraction * float(high) - fraction * float(low)
+            error = fraction * float(ends[1]) - fraction * float(ends[0])
     if dtype.kind != "f":
         largest = math.floor(error) if math.isfinite(error) else 1 << 64
         return error, largest + 0.5

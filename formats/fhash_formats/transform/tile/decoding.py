@@ -53,6 +53,7 @@ __all__ = [
     "decode_tile_table",
     "linear_values",
     "predicted_values",
+    "table_about_origin",
     "transform_for",
     "within_range",
 ]
@@ -119,10 +120,24 @@ def decode_tile_table(
 ) -> Values:
     """The table (t, z, y, x) of a tile: its values before head, residual and rounding.
 
-    They are finite, of the working type of the settings (float64 without), and less their origin.
-    Where the tile is not coded by transform, they are its values; `center` stands for those that
-    are not finite.
+    They are finite, of `TileSettings.table_dtype` (float64 without settings). Where the tile is not
+    coded by transform, they are its values; `center` stands for those that are not finite.
     Arguments and errors are those of `decode_tile`.
+    """
+    table, origin = table_about_origin(data, shape, dtype, settings, lod)
+    return table.astype(np.float64) + origin if origin else table
+
+
+def table_about_origin(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None,
+    lod: int = 0,
+) -> tuple[Values, int]:
+    """The table of a tile less the origin of its settings, in their working type; and the origin.
+
+    Arguments and errors are those of `decode_tile_table`.
     """
     stream, settings = _parsed(data, settings)
     kind = np.dtype(dtype) if settings is None else _coded_type(settings, np.dtype(dtype))
@@ -132,10 +147,11 @@ def decode_tile_table(
         with np.errstate(over="ignore"):
             values = values.astype(working)
         values[~np.isfinite(values)] = 0.0 if settings is None else settings.center
-        return values
+        return values, 0 if settings is None else settings.origin
     assert stream.body is not None
     _check_numbers(settings, kind)
-    return _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
+    table = _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
+    return table, settings.origin
 
 
 def _decode(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.tile.decoding import decode_tile_table, within_range
+from fhash_formats.transform.tile.decoding import table_about_origin, within_range
 from fhash_formats.transform.tile.sections import Shape, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import at_origin, corrected
@@ -33,7 +33,7 @@ Part = tuple[slice, ...]
 def uncorrected(
     data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: TileSettings, part: Part
 ) -> Values | None:
-    """The values of a tile before its head, where nothing but `corrected_part` is left to do.
+    """The values of a tile before its head and less the origin, where nothing but `corrected_part` is left to do.
 
     None for other tiles, and where the part is a large one.
 
@@ -48,7 +48,7 @@ def uncorrected(
     more = (stream.settings, stream.missing, stream.residual)
     if not stream.coded or stream.predicted or stream.masked or any(x is not None for x in more):
         return None
-    return decode_tile_table(data, shape, dtype, settings)
+    return table_about_origin(data, shape, dtype, settings)[0]
 
 
 def corrected_part(

@@ -136,6 +136,11 @@ class TileSettings:
         """The type of the arithmetic."""
         return np.dtype(np.float64 if self.double else np.float32)
 
+    @property
+    def table_dtype(self) -> np.dtype[Any]:
+        """The type of the table of a tile: that of the arithmetic, or float64 with an origin."""
+        return np.dtype(np.float64) if self.origin else self.dtype
+
     def differences_of(self, dtype: np.dtype[Any]) -> np.dtype[Any]:
         """The type of what is coded of an array: int64 with an origin, else that of the array.
 
