@@ -144,10 +144,7 @@ def _read_about(series: Series, origin: int) -> Callable[[int], npt.NDArray[Any]
         return series.read
 
     def read(step: int) -> npt.NDArray[Any]:
-        frame = series.read(step)
-        if frame.dtype.kind == "f":
-            return np.asarray(frame - origin)
-        return about_origin(frame, origin)
+        return about_origin(series.read(step), origin)
 
     return read
 

@@ -230,7 +230,7 @@ class Volume(Card, ArrayLike):
         """
         read, decoded = self._read_steps(steps, None, "nan")
         if decoded is None or decoded[0].dtype.kind == "f":
-            return np.asarray(read.astype(np.float64) - origin)
+            return about_origin(read, origin)
         differences = about_origin(decoded[0], origin)
         if not np.isnan(read).any():
             return differences

@@ -39,9 +39,6 @@ KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], change:D, onset:V, mask
 FramesAround = Callable[[int], Iterator[Frame]]
 """Step -> the frames from the key frame before it to the one after it, in their order."""
 
-_BEYOND = 1 << 65
-"""Number beyond all integers of 64 bits."""
-
 BINS = 1024
 """Bins of the histogram for Otsu's threshold."""
 
@@ -51,7 +48,8 @@ class Feature(ABC):
 
     Thresholds are rounded to the number type of a floating-point frame before the comparison, as
     numpy does: in a float32 frame `interval:0.1:0.3` includes the value 0.3. Integers are compared
-    exactly. NaN and infinite vertices are never selected.
+    as float64, and exactly with a threshold that is an integer beyond 2^53. NaN and infinite
+    vertices are never selected.
     """
 
     @abstractmethod
@@ -83,8 +81,8 @@ class Interval(Feature):
 
     def select(self, frame: Frame, step: int) -> FrameMask:
         selected: FrameMask = np.isfinite(frame)
-        selected &= frame >= _least_from(self.low, frame)
-        selected &= frame <= _greatest_to(self.high, frame)
+        selected &= frame >= _as_frame_type(self.low, frame)
+        selected &= frame <= _as_frame_type(self.high, frame)
         return selected
 
     def __str__(self) -> str:
@@ -102,14 +100,11 @@ class Isosurface(Feature):
     value: float
 
     def select(self, frame: Frame, step: int) -> FrameMask:
-        to, since, finite = (
-            _greatest_to(self.value, frame),
-            _least_from(self.value, frame),
-            np.isfinite(frame),
-        )
-        above: FrameMask = (frame > to) & finite
-        below: FrameMask = (frame < since) & finite
-        selected: FrameMask = ~(above | below) & finite
+        value, finite = _as_frame_type(self.value, frame), np.isfinite(frame)
+        selected: FrameMask = frame == value
+        selected &= finite
+        above: FrameMask = (frame > value) & finite
+        below: FrameMask = (frame < value) & finite
         for axis in range(3):
             high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
             crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
@@ -137,7 +132,7 @@ class Segmentation(Feature):
                 "resolve_features finds Otsu's from the data"
             )
         selected: FrameMask = np.isfinite(frame)
-        selected &= frame > _greatest_to(self.threshold, frame)
+        selected &= frame > _as_frame_type(self.threshold, frame)
         return selected
 
     def __str__(self) -> str:
@@ -209,7 +204,7 @@ class Change(InTime):
         if is_wide_integer(before.dtype):
             rises = after > before
             change = np.where(rises, after - before, before - after).view(np.uint64)
-            return np.asarray(change > _greatest_to(self.threshold, change))
+            return np.asarray(change > _as_frame_type(self.threshold, change))
         with np.errstate(invalid="ignore", over="ignore"):
             change = np.abs(np.subtract(after, before, dtype=np.float64))
         return np.isfinite(before) & np.isfinite(after) & (change > self.threshold)
@@ -223,7 +218,7 @@ class Onset(InTime):
 
     def happens(self, before: Frame, after: Frame) -> FrameMask:
         """Mask (z, y, x) of values at or below the threshold before, and above it after."""
-        threshold = _greatest_to(self.threshold, before)
+        threshold = _as_frame_type(self.threshold, before)
         rises: FrameMask = (before <= threshold) & (after > threshold)
         return rises & np.isfinite(before) & np.isfinite(after)
 
@@ -284,9 +279,11 @@ def resolve_features(
     """
     features = [parse_feature(text) for text in texts]
     if Segmentation() in features:
-        edges = value_range.from_unit(np.linspace(0.0, 1.0, BINS + 1))
+        origin = value_range.origin(series.source_dtype or series.dtype)
+        edges = value_range.moved(-origin).from_unit(np.linspace(0.0, 1.0, BINS + 1))
         histogram = _histogram(series, key_frames, value_range, progress)
-        by_otsu = Segmentation(otsu_threshold(histogram, edges))
+        threshold = otsu_threshold(histogram, edges)
+        by_otsu = Segmentation(math.floor(threshold) + origin if origin else threshold)
         features = [by_otsu if feature == Segmentation() else feature for feature in features]
     features = [
         dataclasses.replace(feature, around=_frames_around(series, key_frames))
@@ -361,22 +358,15 @@ def dilate(mask: FrameMask, vertices: int) -> FrameMask:
     return mask
 
 
-def _greatest_to(value: float, frame: Frame) -> Any:
-    """The greatest number that a frame can hold up to a threshold.
+def _as_frame_type(value: float, frame: Frame) -> Any:
+    """A threshold as a scalar of the frame's floating-point type, or of float64 for integers.
 
-    It is a scalar of the frame's floating-point type, to which the threshold is rounded, of float64
-    for integers of up to 32 bits, and an integer for those of 64. numpy then compares without
-    converting the frame.
+    numpy then compares without converting the frame. An integer stays one in a frame of integers.
     """
-    if is_wide_integer(frame.dtype):
-        return math.floor(max(min(value, _BEYOND), -_BEYOND))
+    if isinstance(value, int) and frame.dtype.kind != "f":
+        return value
     with np.errstate(over="ignore"):
         return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
-
-
-def _least_from(value: float, frame: Frame) -> Any:
-    """The least number that a frame can hold from a threshold on; see `_greatest_to`."""
-    return -_greatest_to(-value, frame)
 
 
 def _histogram(

@@ -1,8 +1,8 @@
 """The codec `fhash.transform` for numcodecs, and so for Zarr format 2; loaded by its entry point.
 
 The bytes are, with little-endian numbers: the magic `FHC1`; the type as numpy writes it, without
-byte order (such as `f4`); the number of axes (one byte), plus 128 for an array in Fortran order; the
-lengths (uint64); the CRC-32 of all these (uint32); and the stream of one tile.
+byte order (such as `f4`); the number of axes (one byte), plus 128 for an array in Fortran order;
+the lengths (uint64); the CRC-32 of all these (uint32); and the stream of one tile.
 """
 
 from __future__ import annotations

@@ -189,7 +189,8 @@ class TransformCodec(ArrayBytesCodec):
                 f"{NAME} without a configuration only decodes: "
                 "give max_error, max_error_rel or step to write"
             )
-        values = np.asarray(chunk_array.as_ndarray_like())
+        # Filters of numcodecs give one axis, and decoding knows the shape alone.
+        values = np.asarray(chunk_array.as_ndarray_like()).reshape(chunk_spec.shape)
         if self.axes is not None:
             values = ArrayAxes.of(self.axes).to_tile(values)
         if self.settings is None:

@@ -33,9 +33,10 @@ Part = tuple[slice, ...]
 def uncorrected(
     data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: TileSettings, part: Part
 ) -> Values | None:
-    """The values of a tile before its head and less the origin, where nothing but `corrected_part` is left to do.
+    """The values of a tile before its head, where nothing but `corrected_part` is left to do.
 
-    None for other tiles, and where the part is a large one.
+    They are less the origin of the settings. None for other tiles, and where the part is a large
+    one.
 
     Raises DamagedFileError for bytes that no encoder writes.
     """

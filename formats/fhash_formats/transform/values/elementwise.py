@@ -234,8 +234,14 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
         return np.clip(values, kind(low), kind(high), out=values)
 
 
-def about_origin(values: Values, origin: int) -> npt.NDArray[np.int64]:
-    """The differences int64 of 64-bit integers from an origin; raises InputError beyond int64."""
+def about_origin(values: Values, origin: int) -> Values:
+    """The differences int64 of 64-bit integers from an origin, or float64 ones of floats.
+
+    Raises InputError beyond int64.
+    """
+    if values.dtype.kind == "f":
+        rounded = float(origin)
+        return (values.astype(np.float64) - rounded) + (int(rounded) - origin)
     for end in (values.min(), values.max()) if values.size else ():
         if not _INT64.min <= int(end) - origin <= _INT64.max:
             raise InputError(
