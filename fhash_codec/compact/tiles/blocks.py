@@ -16,7 +16,7 @@ from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import Series
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.sections import Shape
-from fhash_formats.transform.values.elementwise import about_origin
+from fhash_formats.transform.values.elementwise import about_origin, cast
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -244,7 +244,7 @@ class Blocks:
             if frame.dtype.kind == "f" and self.dtype.kind != "f":
                 # Missing values are outside the coreset; any integer may stand there.
                 frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
-                frame = np.where(np.isfinite(frame), frame, 0.0)
+                frame = cast(np.where(np.isfinite(frame), frame, 0.0), self.source_dtype)
             values[number] = frame
         values = about_origin(values, self.origin) if self.origin else values
         if self.complete:
