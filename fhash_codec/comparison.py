@@ -173,7 +173,8 @@ class DecodedFrames:
         volume = self._volume
         if self._together == 1:
             if self._origin:
-                return volume.differences_of_steps(range(step, step + 1), self._origin)[0]
+                alone = range(step, step + 1)
+                return np.asarray(volume.differences_of_steps(alone, self._origin)[0])
             return volume.values(step) if self._exact else volume.read(step)
         if step not in self._steps:
             self._frames = np.empty(0)  # its memory is free before more is decoded

@@ -67,10 +67,22 @@ def describe_variable(series: Series) -> dict[str, Any]:
 
 
 def describe_source(
-    series: Series, value_range: ValueRange, config: EncodeConfig
+    series: Series, value_range: ValueRange, config: EncodeConfig, *, gaps: bool = False
 ) -> dict[str, Any]:
-    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
+    """Header entries of a series: variable, source, shape, range, and a quality to be filled in.
+
+    gaps: whether vertices are outside the coreset. Integers that floats have not all of then get a
+    fill value, where the source has none: a reader cannot give them as floats with NaN.
+    """
     variable = describe_variable(series)
+    dtype = series.source_dtype or series.dtype
+    if gaps and "fill" not in variable and value_range.origin(dtype):
+        low, high = (int(end) for end in value_range.ends)
+        limits = np.iinfo(dtype)
+        ends = int(limits.min), int(limits.max)
+        free = [end for end in (*ends, low - 1, high + 1) if ends[0] <= end <= ends[1]]
+        free = [fill for fill in free if not low <= fill <= high]
+        variable |= {"fill": free[0]} if free else {}
     source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),

@@ -277,7 +277,8 @@ class _Job:
         own["model"]["levels"] = [list(parts.shape)]
         own["model"]["parameters"] += coded.outcome.nonzero
         own["model"]["gains"].append(all_tiles(coded.outcome.size))
-        told = describe_source(steps, value_range, plan.config)
+        gaps = plan.samples < prod(self.series.shape)
+        told = describe_source(steps, value_range, plan.config, gaps=gaps)
         return {**told, **described, **own, PART: source}
 
     def _measured(

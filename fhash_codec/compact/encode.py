@@ -76,7 +76,8 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
-    source = describe_source(series, selection.scanned.value_range, config)
+    gaps = selection.extent.fraction < 1
+    source = describe_source(series, selection.scanned.value_range, config, gaps=gaps)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,

@@ -380,13 +380,15 @@ def test_features_of_integers_far_from_zero_are_those_of_their_differences(tmp_p
     near_config = replace(config, features=("interval:300:400", "isosurface:700"))
     near_figures = fhash_codec.encode(near, tmp_path / "b.fhz", near_config)
     with (
-        fhash_codec.open(tmp_path / "a.fhz", fill=0) as volume,
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
         fhash_codec.open(tmp_path / "b.fhz", fill=0) as other,
     ):
+        assert volume.dtype == source.dtype  # with a fill value of the encoder's
         kept = np.stack([volume.occupancy(step) for step in range(3)])
         assert (kept == np.stack([other.occupancy(step) for step in range(3)])).all()
         assert list(volume.info["features"]) == list(texts)
         errors = (volume[...].astype(object) - source.astype(object))[kept]
+        assert (volume[...][~kept] == volume.fill).all()
     assert max(abs(errors)) == figures["max_abs_error"] <= 2
     assert figures["data_range"] == near_figures["data_range"]
 
