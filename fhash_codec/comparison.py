@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -117,11 +118,13 @@ def measure(
     # Integers of 64 bits are compared as such: as floats, equal ones could differ. Far from 0
     # their differences from one integer are, of which floats hold more digits.
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
-    origin = volume.value_range.origin(volume.value_type.source)
-    read, bulk = _read_about(series, origin), _bulk(series, volume)
+    source = volume.value_type.source
+    origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
+    read = partial(_differences, series, origin) if far else series.read
+    bulk = _bulk(series, volume)
     quality = measure_quality(
         read,
-        DecodedFrames(volume, exact=exact, origin=origin).read,
+        DecodedFrames(volume, exact=exact, origin=origin if far else None).read,
         series.shape[0],
         float(data_range),
         volume.background - origin,
@@ -138,15 +141,9 @@ def measure(
     return figures
 
 
-def _read_about(series: Series, origin: int) -> Callable[[int], npt.NDArray[Any]]:
-    """The function that gives the frame of a step less an integer."""
-    if not origin:
-        return series.read
-
-    def read(step: int) -> npt.NDArray[Any]:
-        return about_origin(series.read(step), origin)
-
-    return read
+def _differences(series: Series, origin: int, step: int) -> npt.NDArray[Any]:
+    """The frame of a step less an integer."""
+    return about_origin(series.read(step), origin)
 
 
 class DecodedFrames:
@@ -156,10 +153,11 @@ class DecodedFrames:
     larger than the cache. Then the steps of a layer are decoded together.
     """
 
-    def __init__(self, volume: Volume, *, exact: bool, origin: int = 0) -> None:
+    def __init__(self, volume: Volume, *, exact: bool, origin: int | None = None) -> None:
         """Read nothing yet. exact: whether integers come as such, and not as floats.
 
-        origin: integer that is subtracted from the values.
+        origin: integer that is subtracted from the values, which are 64-bit integers; None for
+            others.
         """
         self._volume, self._exact, self._origin = volume, exact, origin
         self._steps, self._frames = range(0), np.empty(0)
@@ -172,7 +170,7 @@ class DecodedFrames:
         """The frame (z, y, x) of a step."""
         volume = self._volume
         if self._together == 1:
-            if self._origin:
+            if self._origin is not None:
                 alone = range(step, step + 1)
                 return np.asarray(volume.differences_of_steps(alone, self._origin)[0])
             return volume.values(step) if self._exact else volume.read(step)
@@ -183,7 +181,7 @@ class DecodedFrames:
             end = min(first + self._together, start + self._layer, volume.shape[0])
             self._steps = range(first, end)
             read = volume.values_of_steps if self._exact else volume.read_steps
-            if self._origin:
+            if self._origin is not None:
                 self._frames = volume.differences_of_steps(self._steps, self._origin)
             else:
                 self._frames = read(self._steps)
@@ -209,7 +207,7 @@ def _bulk(series: Series, volume: Volume) -> ValueRange | None:
         return None if known["bulk"] is None else ValueRange(*known["bulk"]["range"])
 
     origin = volume.value_range.origin(volume.value_type.source)
-    read = _read_about(series, origin)
+    read = partial(_differences, series, origin) if origin else series.read
 
     def counted_values() -> Iterator[npt.NDArray[Any]]:
         for step in range(series.shape[0]):

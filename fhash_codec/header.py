@@ -76,7 +76,7 @@ def describe_source(
     """
     variable = describe_variable(series)
     dtype = series.source_dtype or series.dtype
-    if gaps and "fill" not in variable and value_range.origin(dtype):
+    if gaps and "fill" not in variable and value_range.is_far(dtype):
         low, high = (int(end) for end in value_range.ends)
         limits = np.iinfo(dtype)
         ends = int(limits.min), int(limits.max)

@@ -124,6 +124,10 @@ class ValueRange:
         )
         return inner if inner[0] <= inner[1] else (low, high)
 
+    def is_far(self, dtype: np.dtype[Any]) -> bool:
+        """Whether values of a type may be integers that float64 has not."""
+        return is_wide_integer(dtype) and max(map(abs, self.ends)) > 1 << 53
+
     def origin(self, dtype: np.dtype[Any]) -> int:
         """The integer that is subtracted from values of a type before they become floats."""
         return integer_origin(self.low, self.high, dtype)
