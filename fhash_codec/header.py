@@ -33,6 +33,7 @@ from fhash_formats.container.header import MISSING
 from fhash_formats.container.named import Names
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.number_types import is_within
 
 MISSING_CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
@@ -79,8 +80,8 @@ def describe_source(
     if gaps and "fill" not in variable and value_range.is_far(dtype):
         low, high = (int(end) for end in value_range.ends)
         limits = np.iinfo(dtype)
-        ends = int(limits.min), int(limits.max)
-        free = [end for end in (*ends, low - 1, high + 1) if ends[0] <= end <= ends[1]]
+        ends = [int(limits.min), int(limits.max)][:: 1 if dtype.kind == "i" else -1]
+        free = [end for end in (*ends, low - 1, high + 1) if is_within(end, dtype)]
         free = [fill for fill in free if not low <= fill <= high]
         variable |= {"fill": free[0]} if free else {}
     source, _ = source_parts(series, _storable_coords(series), variable["attributes"])

@@ -95,8 +95,9 @@ class ValueRange:
     """The range of a series: finite numbers `low` <= `high` in data units.
 
     Differences that could overflow or be denormal are computed after scaling by an exact power of
-    two, so that +-1.7e308 and denormal ranges work like any other range. Ends beyond 2^53 of
-    integers of 64 bits are integers, and exact. Raises InputError for other numbers.
+    two, so that +-1.7e308 and denormal ranges work like any other range. Where an end is an integer
+    beyond 2^53, both are integers, and their difference is exact. Raises InputError for other
+    numbers.
     """
 
     low: float
@@ -108,6 +109,11 @@ class ValueRange:
                 f"value range is {self.low!r} to {self.high!r}; "
                 "two finite numbers, the lower first, are needed"
             )
+        ends = [exact_number(end) for end in self.ends]
+        if any(isinstance(end, int) for end in ends):
+            ends = [int(end) for end in ends]
+        for name, end in zip(("low", "high"), ends, strict=True):
+            object.__setattr__(self, name, end)
 
     @property
     def ends(self) -> tuple[float, float]:
