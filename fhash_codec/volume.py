@@ -214,7 +214,9 @@ class Volume(Card, ArrayLike):
         if self.dtype.itemsize < 8:
             result: npt.NDArray[Any] = rounded(read, self.dtype)
         else:  # float64 has not every integer of 64 bits
-            result = np.full(read.shape, round(self.background), self.dtype)
+            limits = np.iinfo(self.dtype)
+            nearest = min(max(round(self.background), int(limits.min)), int(limits.max))
+            result = np.full(read.shape, nearest, self.dtype)
             common = shared_part(self.box, self._checked(region))
             if common is not None:
                 assert decoded is not None, "only such files hold integers"
