@@ -370,6 +370,20 @@ def test_integers_far_from_zero_keep_their_range_and_the_promise(tmp_path, name,
         assert figures["bytes"] <= 1.2 * exact["bytes"]
 
 
+@pytest.mark.parametrize("dtype", ["int64", "uint64"])
+@pytest.mark.parametrize("psnr", [5.0, 20.0])
+def test_noise_over_all_64_bits_stays_in_its_range(tmp_path, dtype, psnr) -> None:
+    limits = np.iinfo(dtype)
+    ends = int(limits.min) + 100, int(limits.max) - 100
+    chance = np.random.default_rng(0)
+    source = chance.integers(*ends, (3, 8, 10, 12), dtype=dtype)
+    source[:, :4] = chance.choice(np.array(ends, dtype), (3, 4, 10, 12))
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=2, psnr=psnr))
+    back = decoded(tmp_path / "a.fhz")
+    assert ends[0] <= back.min()
+    assert back.max() <= ends[1]
+
+
 @pytest.mark.parametrize("name", FAR)
 def test_features_of_integers_far_from_zero_are_those_of_their_differences(tmp_path, name) -> None:
     source, least = far(name), FAR[name]

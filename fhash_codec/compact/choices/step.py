@@ -76,9 +76,9 @@ def with_step(
     if goal.error:
         slack = min(rounding * largest / goal.error, MAX_ROUNDING_SLACK)
         quantum = 2 * goal.error * (1 - SLACK - slack)
-    # A residual takes values beyond the range, and so does the rounding of its ends to float32.
-    ends = (settings.low, settings.high)
-    beyond = quantum > 0 or (not double and any(float(np.float32(end)) != end for end in ends))
+    # A residual takes values beyond the range, and so does the rounding of its ends.
+    working = float if double else np.float32
+    beyond = quantum > 0 or any(float(working(end)) != end for end in (settings.low, settings.high))
     return replace(settings, step=step, double=double, quantum=quantum, clip=beyond)
 
 
