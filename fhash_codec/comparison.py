@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from fhash_formats.container import Place
 from fhash_formats.container.reader import CACHE_BYTES
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
+from fhash_formats.transform.values.elementwise import about_origin
 
 LAYER_BYTES = 1 << 30
 """Bytes of decoded frames that are held at a time, at most; a single larger one is allowed."""
@@ -113,22 +115,35 @@ def measure(
     Raises InputError if the series changed since it was opened.
     """
     data_range = volume.value_range.high - volume.value_range.low
-    # Integers of 64 bits are compared as such: as floats, equal ones could differ.
+    # Integers of 64 bits are compared as such: as floats, equal ones could differ. Far from 0
+    # their differences from one integer are, of which floats hold more digits.
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
+    source = volume.value_type.source
+    origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
+    read = partial(_differences, series, origin) if far else series.read
+    bulk = _bulk(series, volume)
     quality = measure_quality(
-        series.read,
-        DecodedFrames(volume, exact=exact).read,
+        read,
+        DecodedFrames(volume, exact=exact, origin=origin if far else None).read,
         series.shape[0],
-        data_range,
-        volume.background,
+        float(data_range),
+        volume.background - origin,
         progress,
-        bulk=_bulk(series, volume),
-        neighbours=_neighbours(series, volume),
+        bulk=None if bulk is None else bulk.moved(-origin),
+        neighbours=_neighbours(read, series.shape[0], volume),
         ssim_budget=ssim_budget,
         **options,
     )
     series.check()
-    return quality.to_dict()
+    figures = quality.to_dict()
+    if figures["bulk"] is not None and bulk is not None:
+        figures["bulk"]["range"] = list(bulk.ends)
+    return figures
+
+
+def _differences(series: Series, origin: int, step: int) -> npt.NDArray[Any]:
+    """The frame of a step less an integer."""
+    return about_origin(series.read(step), origin)
 
 
 class DecodedFrames:
@@ -138,9 +153,13 @@ class DecodedFrames:
     larger than the cache. Then the steps of a layer are decoded together.
     """
 
-    def __init__(self, volume: Volume, *, exact: bool) -> None:
-        """Read nothing yet. exact: whether integers come as such, and not as floats."""
-        self._volume, self._exact = volume, exact
+    def __init__(self, volume: Volume, *, exact: bool, origin: int | None = None) -> None:
+        """Read nothing yet. exact: whether integers come as such, and not as floats.
+
+        origin: integer that is subtracted from the values, which are 64-bit integers; None for
+            others.
+        """
+        self._volume, self._exact, self._origin = volume, exact, origin
         self._steps, self._frames = range(0), np.empty(0)
         layer = min(volume.chunks[0], volume.shape[0])
         room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
@@ -151,6 +170,9 @@ class DecodedFrames:
         """The frame (z, y, x) of a step."""
         volume = self._volume
         if self._together == 1:
+            if self._origin is not None:
+                alone = range(step, step + 1)
+                return np.asarray(volume.differences_of_steps(alone, self._origin)[0])
             return volume.values(step) if self._exact else volume.read(step)
         if step not in self._steps:
             self._frames = np.empty(0)  # its memory is free before more is decoded
@@ -159,29 +181,39 @@ class DecodedFrames:
             end = min(first + self._together, start + self._layer, volume.shape[0])
             self._steps = range(first, end)
             read = volume.values_of_steps if self._exact else volume.read_steps
-            self._frames = read(self._steps)
+            if self._origin is not None:
+                self._frames = volume.differences_of_steps(self._steps, self._origin)
+            else:
+                self._frames = read(self._steps)
         # A copy, so that a frame that is still compared does not hold the others.
         frame: npt.NDArray[Any] = self._frames[step - self._steps.start].copy()
         return frame
 
 
-def _neighbours(series: Series, volume: Volume) -> NeighboursOf | None:
+def _neighbours(
+    read: Callable[[int], npt.NDArray[Any]], steps: int, volume: Volume
+) -> NeighboursOf | None:
     """The key frames of a series around each other step; None if every step is a key frame."""
     times = volume.key_times
-    if len(times.key_frames) == series.shape[0]:
+    if len(times.key_frames) == steps:
         return None
-    return neighbours_of(times.key_frames, times.key_index, series.read, volume.occupancy)
+    return neighbours_of(times.key_frames, times.key_index, read, volume.occupancy)
 
 
 def _bulk(series: Series, volume: Volume) -> ValueRange | None:
     """The bulk of the values of a series that are in the coreset of a volume."""
     known = volume.info["quality"]
     if "bulk" in known:
-        return None if known["bulk"] is None else ValueRange(*map(float, known["bulk"]["range"]))
+        return None if known["bulk"] is None else ValueRange(*known["bulk"]["range"])
+
+    origin = volume.value_range.origin(volume.value_type.source)
+    read = partial(_differences, series, origin) if origin else series.read
 
     def counted_values() -> Iterator[npt.NDArray[Any]]:
-        for step, frame in enumerate(series.frames()):
-            mask = volume.occupancy(step)
+        for step in range(series.shape[0]):
+            frame, mask = read(step), volume.occupancy(step)
             yield frame if mask.all() else frame[mask]
 
-    return find_bulk(counted_values, volume.value_range, whole=series.dtype.kind in "iu")
+    whole = series.dtype.kind in "iu"
+    bulk = find_bulk(counted_values, volume.value_range.moved(-origin), whole=whole)
+    return None if bulk is None else bulk.moved(origin)

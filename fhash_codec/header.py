@@ -33,6 +33,7 @@ from fhash_formats.container.header import MISSING, NOT_STORED
 from fhash_formats.container.named import Names
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.number_types import is_within
 
 MISSING_CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
@@ -71,10 +72,22 @@ def describe_variable(series: Series) -> dict[str, Any]:
 
 
 def describe_source(
-    series: Series, value_range: ValueRange, config: EncodeConfig
+    series: Series, value_range: ValueRange, config: EncodeConfig, *, gaps: bool = False
 ) -> dict[str, Any]:
-    """Header entries of a series: variable, source, shape, range, and a quality to be filled in."""
+    """Header entries of a series: variable, source, shape, range, and a quality to be filled in.
+
+    gaps: whether vertices are outside the coreset. Integers that floats have not all of then get a
+    fill value, where the source has none: a reader cannot give them as floats with NaN.
+    """
     variable = describe_variable(series)
+    dtype = series.source_dtype or series.dtype
+    if gaps and "fill" not in variable and value_range.is_far(dtype):
+        low, high = (int(end) for end in value_range.ends)
+        limits = np.iinfo(dtype)
+        ends = [int(limits.min), int(limits.max)][:: 1 if dtype.kind == "i" else -1]
+        free = [end for end in (*ends, low - 1, high + 1) if is_within(end, dtype)]
+        free = [fill for fill in free if not low <= fill <= high]
+        variable |= {"fill": free[0]} if free else {}
     source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),

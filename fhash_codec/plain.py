@@ -143,7 +143,9 @@ class _Export:
         volume = self._volume
         array = self._arrays["tables/level_1"]
         tables, settings = volume.tables, array.settings
-        head = None if settings is None else settings.head
+        # A head takes differences from the origin, and plain tables have none; what it would do is
+        # in the corrections then.
+        head = None if settings is None or settings.origin else settings.head
         tiles = prod(array.grid)
         keys = array.shape[0]
         self._total = 2 * tiles + keys + sum(map(_chunk_count, tables[1:]))

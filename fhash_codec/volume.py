@@ -26,6 +26,8 @@ from fhash_codec.volume_model import Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.support.number_types import exact_number
+from fhash_formats.transform.values.elementwise import about_origin
 
 OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
@@ -105,7 +107,7 @@ class Volume(Card, ArrayLike):
         self.box = Box.of(header["feature_bounding_box"])
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
-        self.background = float(header["background"])
+        self.background = exact_number(header["background"])
         self._clips = tuple(header["format_version"]) >= CLIPPED_SINCE
         self._outside_is_missing = header.get("missing") == OUTSIDE_IS_MISSING
         self._model = open_model(container)
@@ -209,13 +211,34 @@ class Volume(Card, ArrayLike):
         read, decoded = self._read_steps(steps, region, outside)
         if self.dtype.kind == "f":
             return filled(read, self.fill)
-        result: npt.NDArray[Any] = rounded(read, self.dtype)
-        common = shared_part(self.box, self._checked(region))
-        if common is not None and self.dtype.itemsize == 8:
-            assert decoded is not None, "only such files hold integers"
-            # float64 has not every integer of 64 bits.
-            np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
+        if self.dtype.itemsize < 8:
+            result: npt.NDArray[Any] = rounded(read, self.dtype)
+        else:  # float64 has not every integer of 64 bits
+            limits = np.iinfo(self.dtype)
+            nearest = min(max(round(self.background), int(limits.min)), int(limits.max))
+            result = np.full(read.shape, nearest, self.dtype)
+            common = shared_part(self.box, self._checked(region))
+            if common is not None:
+                assert decoded is not None, "only such files hold integers"
+                np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
         result[np.isnan(read)] = self.fill
+        return result
+
+    def differences_of_steps(self, steps: range, origin: int) -> npt.NDArray[Any]:
+        """Values (t, z, y, x) at neighbouring steps less an integer, as the file holds them.
+
+        They are int64 where all vertices have a value and the file holds integers, else float64
+        with NaN where there is none.
+        """
+        read, decoded = self._read_steps(steps, None, "nan")
+        if decoded is None or decoded[0].dtype.kind == "f":
+            return about_origin(read, origin)
+        differences = about_origin(decoded[0], origin)
+        if not np.isnan(read).any():
+            return differences
+        result = read.astype(np.float64)
+        in_box = result[(slice(None), *self.box.slices())]
+        np.copyto(in_box, differences, where=~np.isnan(in_box))
         return result
 
     def read_lod(self, t: float, lod: int, region: Spans | None = None) -> npt.NDArray[Any]:
@@ -229,6 +252,16 @@ class Volume(Card, ArrayLike):
         compact files have levels of detail. Raises RegionError for a step outside the series and
         for a region without such a vertex, InputError for another profile or another lod.
         """
+        values, occupied = self.decoded_lod(t, lod, region)
+        values = values.astype(self.float_dtype)
+        values[~occupied] = np.nan
+        return values
+
+    def decoded_lod(self, t: float, lod: int, region: Spans | None = None) -> Decoded:
+        """Values (z, y, x) as `read_lod` gives them, in the type of the file, and which count.
+
+        Arguments and errors as in `read_lod`.
+        """
         vertices = self.lod_vertices(lod, region)
         if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
@@ -237,10 +270,9 @@ class Volume(Card, ArrayLike):
             ((along[0] - first) >> lod, ((along[-1] - first) >> lod) + 1)
             for along, first in zip(vertices, self.box.first, strict=True)
         )
-        values = self._model.read_lod(step, int(lod), coarse).astype(self.float_dtype)
+        values = self._model.read_lod(step, int(lod), coarse)
         surrounding = Box.of((along[0], along[-1] + 1) for along in vertices)
-        values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
-        return values
+        return values, self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]
 
     def lod_vertices(self, lod: int, region: Spans | None = None) -> tuple[range, range, range]:
         """The vertices (z, y, x) of the domain whose values `read_lod` gives.
@@ -319,7 +351,7 @@ class Volume(Card, ArrayLike):
         """Interpolated values without the rounding that takes some beyond the series' range."""
         if not self._clips:
             return values
-        low, high = map(self.float_dtype.type, (self.value_range.low, self.value_range.high))
+        low, high = map(self.float_dtype.type, self.value_range.floats)
         return np.asarray(np.clip(values, low, high))
 
     def _steps_of_times(self, times: Any) -> npt.NDArray[np.float64]:

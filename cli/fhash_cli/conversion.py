@@ -25,16 +25,18 @@ def convert(
     *,
     fill: float | None = None,
     background: bool = False,
+    integers: npt.NDArray[Any] | None = None,
 ) -> npt.NDArray[Any]:
     """Convert a decoded frame to another number type; for integers it is rounded and clipped.
 
     fill: value in place of NaN; None for NaN itself. background: vertices outside the coreset hold
-    the background's value; NaN means a missing value. Raises InputError where the type cannot hold
-    a value.
+    the background's value; NaN means a missing value. integers: the values as integers, where
+    floats have not all of them. Raises InputError where the type cannot hold a value.
     """
     import numpy as np
 
     gaps = np.isnan(frame)
+    frame = frame if integers is None else integers
     if not gaps.any():
         return _converted(frame, kind)
     if fill is None:
@@ -70,6 +72,10 @@ def _converted(frame: npt.NDArray[Any], kind: np.dtype[Any]) -> npt.NDArray[Any]
             )
         return narrow
     limits = np.iinfo(kind)
+    if frame.dtype.kind != "f":
+        own = np.iinfo(frame.dtype)
+        low, high = max(int(limits.min), int(own.min)), min(int(limits.max), int(own.max))
+        return np.asarray(np.clip(frame, low, high).astype(kind))
     rounded = np.rint(frame.astype(np.float64))
     # No float64 equals the largest 64-bit integer: the float of the limit lies one above it.
     clipped = rounded >= float(limits.max)

@@ -95,17 +95,24 @@ class Selection:
         from fhash_formats.support.number_types import is_wide_integer
 
         background, done = self.outside == "background", 0
-        exact = self.kind == volume.dtype and is_wide_integer(self.kind) and self.lod is None
+        wide = is_wide_integer(volume.dtype) and all(float(t).is_integer() for t in self.steps)
         for steps, frames in self._decoded(volume):
             inside = count_inside(volume, steps, self.region, frames, self.outside)
-            statistics.add(frames, inside)
-            if exact:
-                # float64 has not every integer of 64 bits.
-                whole = range(int(steps[0]), int(steps[-1]) + 1)
-                frames = volume.values_of_steps(whole, self.region, outside=self.outside)
-            yield from convert(frames, self.kind, fill=self.fill, background=background)
+            # float64 has not every integer of 64 bits.
+            integers = self._integers(volume, steps) if wide else None
+            statistics.add(frames, inside, integers)
+            yield from convert(
+                frames, self.kind, fill=self.fill, background=background, integers=integers
+            )
             done += len(steps)
             progress("decoding", done, len(self.steps), "")
+
+    def _integers(self, volume: Volume, steps: Sequence[float]) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of some whole steps as the integers that the file holds."""
+        if self.lod is None:
+            whole = range(int(steps[0]), int(steps[-1]) + 1)
+            return volume.values_of_steps(whole, self.region, outside=self.outside)
+        return volume.decoded_lod(steps[0], self.lod, self.region)[0][None]
 
     def _decoded(self, volume: Volume) -> Iterator[tuple[Sequence[float], npt.NDArray[Any]]]:
         """Some steps at a time, and their frames (t, z, y, x)."""

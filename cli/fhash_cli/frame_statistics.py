@@ -20,19 +20,27 @@ class Statistics:
         self.low, self.high, self.mean = float("inf"), float("-inf"), Mean()
         self.inside = self.all = 0
 
-    def add(self, frame: npt.NDArray[Any], inside: int) -> None:
-        """Add values of any shape; inside: number of their vertices in the coreset."""
+    def add(
+        self, frame: npt.NDArray[Any], inside: int, integers: npt.NDArray[Any] | None = None
+    ) -> None:
+        """Add values of any shape.
+
+        inside: number of their vertices in the coreset. integers: the values as integers, where
+        floats have not all of them.
+        """
         import numpy as np
 
         from fhash_codec.measure.value_range import pieces
+        from fhash_formats.support.number_types import exact_number
 
         gaps = np.isnan(frame)
+        frame = frame if integers is None else integers
         values = frame[~gaps] if gaps.any() else frame.reshape(-1)
         self.all, self.inside = self.all + frame.size, self.inside + inside
         if values.size:
             self.low, self.high = (
-                min(self.low, float(values.min())),
-                max(self.high, float(values.max())),
+                min(self.low, exact_number(values.min().item())),
+                max(self.high, exact_number(values.max().item())),
             )
         for piece in pieces(values):
             self.mean.add(piece)

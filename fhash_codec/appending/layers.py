@@ -15,6 +15,7 @@ from fhash_codec.appending.figures import Figures, StepErrors
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, code
 from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.support.number_types import exact_number, is_within
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.support.threads import map_ahead, usable_threads
 from fhash_formats.transform.tile.decoding import decode_tile
@@ -82,7 +83,7 @@ class LayerCoder:
             streams.append(tile.data)
             nonzero += tile.nonzero
         errors = [figures.measure(*pair) for pair in zip(values, decoded, strict=True)]
-        value_range = ValueRange(float(values.min()), float(values.max()))
+        value_range = ValueRange(*_ends(values))
         return CodedLayer(streams=streams, errors=errors, nonzero=nonzero, value_range=value_range)
 
     def _tile(self, values: npt.NDArray[Any], index: Index) -> Tile:
@@ -105,22 +106,35 @@ class LayerCoder:
         bring them back; of the two codings the one with fewer bytes is taken.
         """
         number, tile = job
-        coded = code(tile, self.settings, self.coding)[0]
-        settings = self.settings
-        for other in self._wider(tile):
-            own = code(tile, other, replace(self.coding, own_settings=True))[0]
-            if len(own.data) < len(coded.data):
-                coded, settings = own, other
+        own = replace(self.coding, own_settings=True)
+        trials = [(code(tile, other, own)[0], other) for other in self._wider(tile)]
+        if not self._is_far(tile):
+            trials.insert(0, (code(tile, self.settings, self.coding)[0], self.settings))
+        coded, settings = min(trials, key=lambda trial: len(trial[0].data))
         if number % DECODED_AGAIN == 0:
             again = decode_tile(coded.data, self.tile, self.dtype, settings)
             if not np.array_equal(again, coded.decoded):
                 raise RuntimeError(f"tile {number} decodes to other values than its encoder found")
         return coded
 
+    def _is_far(self, tile: Tile) -> bool:
+        """Whether the differences from the origin that tiles share are beyond int64."""
+        origin = self.settings.origin
+        return origin != 0 and not all(
+            is_within(int(end) - origin, np.dtype(np.int64)) for end in _ends(tile.values)
+        )
+
     def _wider(self, tile: Tile) -> Iterator[TileSettings]:
         """Yield settings with a wider range for a tile whose values leave that of the file."""
-        low, high = float(tile.values.min()), float(tile.values.max())
         shared = self.settings
+        ends = ValueRange(*_ends(tile.values))
+        low, high = ends.moved(-shared.origin).ends
+        if self._is_far(tile):
+            origin = ends.origin(self.dtype)
+            low, high = ends.moved(-origin).ends
+            wider = replace(shared, origin=origin, center=0.0, low=low, high=high)
+            yield replace(wider, double=True, head=None, predictor=None)
+            return
         if self.coding.exact or (shared.low <= low and high <= shared.high):
             return
         yield replace(
@@ -131,3 +145,8 @@ class LayerCoder:
             predictor=None,
             clip=False,
         )
+
+
+def _ends(values: npt.NDArray[Any]) -> tuple[float, float]:
+    """The least and the greatest of finite values, exactly."""
+    return exact_number(values.min().item()), exact_number(values.max().item())

@@ -354,7 +354,7 @@ class _Whole:
         comparer = Comparer(
             value_range.high - value_range.low,
             background,
-            None if bulk is None else ValueRange(*map(float, bulk)),
+            None if bulk is None else ValueRange(*bulk),
         )
         for part in self._parts:
             for comparison in comparisons_of(part.errors, part.first):

@@ -11,7 +11,7 @@ import re
 import time
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -237,7 +237,9 @@ class _Job:
             samples=plan.samples,
             background=plan.header["background"],
         )
-        return Blocks(self.series, extent, plan.recipe.tile).by_layers()
+        dtype = self.series.source_dtype or self.series.dtype
+        origin = plan.value_range.origin(dtype)
+        return Blocks(self.series, extent, plan.recipe.tile, origin).by_layers()
 
     def _write_arrays(
         self,
@@ -264,9 +266,9 @@ class _Job:
             described["missing"] = OUTSIDE
         parts = TableParts(
             shape=(len(self.steps), *blocks.shape[1:]),
-            dtype=blocks.dtype,
+            dtype=blocks.source_dtype,
             tile=blocks.tile,
-            settings=plan.recipe.settings,
+            settings=replace(plan.recipe.settings, origin=blocks.origin),
             streams=coded.streams,
         )
         parts.write(writer)
@@ -275,7 +277,8 @@ class _Job:
         own["model"]["levels"] = [list(parts.shape)]
         own["model"]["parameters"] += coded.outcome.nonzero
         own["model"]["gains"].append(all_tiles(coded.outcome.size))
-        told = describe_source(steps, value_range, plan.config)
+        gaps = plan.samples < prod(self.series.shape)
+        told = describe_source(steps, value_range, plan.config, gaps=gaps)
         return {**told, **described, **own, PART: source}
 
     def _measured(

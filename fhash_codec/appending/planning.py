@@ -94,13 +94,15 @@ def plan_layers(
     series.keep_extremes = True  # values of a simulation are data
     promised = replace(config, max_error=bound, max_error_rel=None, timings=False)
     selection = select_features(series, promised, silent)
-    expected = _joined(selection.scanned.value_range, value_range)
+    whole = _joined(selection.scanned.value_range, value_range)
+    origin = whole.origin(series.dtype)
+    expected = whole.moved(-origin)
     raw_bytes = prod(series.shape) * series.dtype.itemsize
     integers = series.dtype.kind in "iu"
     goal = goal_of(promised, expected, raw_bytes, OVERHEAD_BYTES, integers=integers)
     with thread_pool() as workers:
         found = plan(
-            Blocks(series, selection.extent, series.shape),
+            Blocks(series, selection.extent, series.shape, origin),
             expected,
             promised,
             goal,
@@ -111,9 +113,9 @@ def plan_layers(
         )
     coder = LayerCoder(
         tile=found.blocks.tile,
-        settings=found.settings,
+        settings=replace(found.settings, origin=origin),
         coding=found.coding,
-        dtype=found.blocks.dtype,
+        dtype=found.blocks.source_dtype,
     )
     header = _header(selection, promised, coder)
     header["training"] = training_header(found.history, timings=False)

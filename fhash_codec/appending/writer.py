@@ -26,6 +26,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, check_values, index_coordinate
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.number_types import exact_number
 from fhash_formats.support.threads import thread_pool
 
 __all__ = ["Writer"]
@@ -108,7 +109,7 @@ class Writer:
         check_output(path, force)
         frame = _frame_shape(shape)
         settings = _settings(config, max_error, max_error_rel)
-        known = None if value_range is None else ValueRange(*map(float, value_range))
+        known = None if value_range is None else ValueRange(*map(_number, value_range))
         self._source: _Source | None = _Source(
             path=path,
             shape=frame,
@@ -290,6 +291,11 @@ class Writer:
             self._stack.close()
             raise
         del self._frames[:count], self._times[:count]
+
+
+def _number(value: Any) -> float:
+    """An end of a range, of any number type; integers beyond 2^53 stay integers."""
+    return exact_number(int(value)) if hasattr(value, "__index__") else float(value)
 
 
 def _frame_shape(shape: Sequence[int]) -> tuple[int, int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from fhash_codec.compact.tiles.coding import Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container.table_parts import TableParts
+from fhash_formats.transform.values.elementwise import at_origin
 
 __all__ = ["CodedTable", "DecodedTiles", "model_header"]
 
@@ -33,9 +34,17 @@ class CodedTable:
     outcome: Outcome
     """Size and error of all tiles."""
     decoded: DecodedTiles = field(default_factory=dict)
-    """All tiles as they decode, where the plan keeps them."""
+    """All tiles as they decode, less the origin, where the plan keeps them."""
     bulk: ValueRange | None = None
     """Bulk of the values that count, in data units; None if they have none."""
+
+    @property
+    def in_source(self) -> DecodedTiles:
+        """The decoded tiles in the type of the source."""
+        origin, dtype = self.plan.blocks.origin, self.plan.blocks.source_dtype
+        if not origin:
+            return self.decoded
+        return {index: at_origin(tile, origin, dtype) for index, tile in self.decoded.items()}
 
     @cached_property
     def parts(self) -> TableParts:
@@ -43,9 +52,9 @@ class CodedTable:
         blocks = self.plan.blocks
         return TableParts(
             shape=blocks.shape,
-            dtype=blocks.dtype,
+            dtype=blocks.source_dtype,
             tile=blocks.tile,
-            settings=self.plan.settings,
+            settings=replace(self.plan.settings, origin=blocks.origin),
             streams=self.streams,
         )
 
@@ -58,7 +67,7 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
         "profile": "compact",
         "levels": [list(blocks.shape)],
         "embedding_size": 1,
-        "tables": blocks.dtype.name,
+        "tables": blocks.source_dtype.name,
         "parameters": table.outcome.nonzero + weights,
         "head": None if head is None else {"hidden": list(head.hidden), "cross": head.cross},
         "gains": [

@@ -76,7 +76,8 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
-    source = describe_source(series, selection.scanned.value_range, config)
+    gaps = selection.extent.fraction < 1
+    source = describe_source(series, selection.scanned.value_range, config, gaps=gaps)
     with stage("writing", "coordinates and masks of missing values, tiles, header"):
         described = write_series(
             writer,
@@ -100,7 +101,7 @@ def encode_compact(
         own = table_header(selection, table, config, seconds)
         own["required_features"] = list(parts.features)
         own["required_features"] += coordinate_features(described["coordinates"])
-        header = complete(source | described | own, table.decoded)
+        header = complete(source | described | own, table.in_source)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
             break

@@ -44,9 +44,9 @@ class CompactTable:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the numbers: that of the arithmetic of the tiles."""
+        """Type of the numbers: that of the tables of the tiles."""
         settings = self._array.settings
-        return settings.dtype if isinstance(settings, TileSettings) else np.dtype(np.float64)
+        return settings.table_dtype if isinstance(settings, TileSettings) else np.dtype(np.float64)
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
         """Return the numbers of a region, 5 slices of step 1 with explicit ends."""

@@ -16,10 +16,10 @@ from typing import Any
 
 from fhash_codec.compact.choices.head_prospects import HEAD_BYTES
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE
-from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
+from fhash_codec.compact.choices.step import FINEST_PSNR, psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
-from fhash_codec.compact.goal import Goal, goal_of
+from fhash_codec.compact.goal import Goal, goal_of, integer_goal
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
 from fhash_codec.compact.tiles.coding import (
@@ -31,7 +31,7 @@ from fhash_codec.compact.tiles.coding import (
     total,
 )
 from fhash_codec.compact.tiles.known import TileRun
-from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
+from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size, is_exact
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.measure.bulk import bulk_of_ranks, find_bulk
@@ -99,9 +99,28 @@ def code_series(
         else:
             aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, quick=config.effort == 1)
             table = _code_to_psnr(coding_plan, aim, workers, progress)
+        if _is_exact_by_chance(table, goal):
+            blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
+            about = selection.scanned.value_range.moved(-blocks.origin)
+            exactly = integer_goal(0, goal.data_range)
+            exact = plan(
+                *(blocks, about, config, exactly, OVERHEAD_BYTES),
+                *(workers, progress, selection.features),
+            )
+            other = _code_all(replace(exact, goal=goal), workers, progress)
+            table = other if other.outcome.size < table.outcome.size else table
     gain = {**all_tiles(table.outcome.size), "seconds": round(time.perf_counter() - begun, 3)}
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
+
+
+def _is_exact_by_chance(table: CodedTable, goal: Goal) -> bool:
+    """Whether a PSNR or a ratio left no error of integers, which cost less if none is allowed.
+
+    A strict bound tries both as it codes each tile.
+    """
+    plain = goal.error is None and not (table.plan.coding.error or table.plan.settings.labels)
+    return plain and table.plan.blocks.dtype.kind in "iu" and is_exact(table)
 
 
 def plan_series(
@@ -115,22 +134,29 @@ def plan_series(
 ) -> tuple[CodingPlan, Goal, ValueRange | None]:
     """Return the plan of a series, its promise, and the bulk of its values; None without one.
 
-    Arguments and errors are those of `code_series`.
+    Plan and promise are of the values less the origin of the plan's blocks. Arguments and errors
+    are those of `code_series`.
     """
     value_range = selection.scanned.value_range
     raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
-    blocks = Blocks(series, selection.extent, series.shape)
+    origin = value_range.origin(series.source_dtype or series.dtype)
+    blocks = Blocks(series, selection.extent, series.shape, origin)
+    about = value_range.moved(-origin)
     integers = blocks.dtype.kind in "iu"
     with stage("bulk", "range of the middle 98 % of the values, which has a promise of its own"):
         if blocks.in_memory or selection.ranks is None:
-            bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+            bulk = find_bulk(blocks.counted_values, about, whole=integers)
         else:  # the series was too long to be read for this alone
             bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
-    goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
+            bulk = None if bulk is None else bulk.moved(-origin)
+    goal = goal_of(config, about, raw_bytes, overhead, bulk, integers=integers)
+    # No step of the quantiser reaches such a PSNR, and integers can be exact.
+    beyond = integers and goal.psnr is not None and goal.psnr > FINEST_PSNR
+    asked = integer_goal(0, goal.data_range) if beyond else goal
     coding_plan = plan(
-        blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
+        blocks, about, config, asked, OVERHEAD_BYTES, workers, progress, selection.features
     )
-    return coding_plan, goal, bulk
+    return coding_plan, goal, None if bulk is None else bulk.moved(origin)
 
 
 def all_tiles(size: int) -> dict[str, Any]:

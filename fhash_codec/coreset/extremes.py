@@ -168,8 +168,7 @@ class Extremes:
         rest = self._rest(ends)
         if rest is None or self._low.value is None or self._high.value is None:
             return False
-        # halved, so that no difference of finite numbers overflows
-        full, left = self._high.value / 2 - self._low.value / 2, rest[1] / 2 - rest[0] / 2
+        full, left = _half(self._low.value, self._high.value), _half(*rest)
         values = [end.value for end in ends if end.value is not None]
         if left == 0:
             # all others are equal, as in a mask; only a value that is hardly ever data counts
@@ -206,6 +205,11 @@ class Extremes:
             f"{series.source}: '{series.name}' has {stands} of its vertices, and only {others}"
             f" elsewhere; give {mark} if that marks missing values, or {keep} if it is data"
         )
+
+
+def _half(low: float, high: float) -> float:
+    """Half of a range; integers are subtracted first, and halved floats do not overflow."""
+    return (high - low) / 2 if isinstance(low, int) else high / 2 - low / 2
 
 
 def _percent(share: float) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from fhash_codec.measure.value_range import ValueRange, pieces
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
+from fhash_formats.support.number_types import exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
 """Values (z, y, x) of one step."""
@@ -46,7 +48,8 @@ class Feature(ABC):
 
     Thresholds are rounded to the number type of a floating-point frame before the comparison, as
     numpy does: in a float32 frame `interval:0.1:0.3` includes the value 0.3. Integers are compared
-    as float64. NaN and infinite vertices are never selected.
+    as float64, and exactly with a threshold that is an integer beyond 2^53. NaN and infinite
+    vertices are never selected.
     """
 
     @abstractmethod
@@ -197,7 +200,11 @@ class Change(InTime):
     """Vertices whose value changes by more than a threshold from one step to the next."""
 
     def happens(self, before: Frame, after: Frame) -> FrameMask:
-        """Mask (z, y, x) of larger changes; they are computed in float64."""
+        """Mask (z, y, x) of larger changes; they are computed in float64, of integers exactly."""
+        if is_wide_integer(before.dtype):
+            rises = after > before
+            change = np.where(rises, after - before, before - after).view(np.uint64)
+            return np.asarray(change > _as_frame_type(self.threshold, change))
         with np.errstate(invalid="ignore", over="ignore"):
             change = np.abs(np.subtract(after, before, dtype=np.float64))
         return np.isfinite(before) & np.isfinite(after) & (change > self.threshold)
@@ -272,9 +279,11 @@ def resolve_features(
     """
     features = [parse_feature(text) for text in texts]
     if Segmentation() in features:
-        edges = value_range.from_unit(np.linspace(0.0, 1.0, BINS + 1))
+        origin = value_range.origin(series.source_dtype or series.dtype)
+        edges = value_range.moved(-origin).from_unit(np.linspace(0.0, 1.0, BINS + 1))
         histogram = _histogram(series, key_frames, value_range, progress)
-        by_otsu = Segmentation(otsu_threshold(histogram, edges))
+        threshold = otsu_threshold(histogram, edges)
+        by_otsu = Segmentation(math.floor(threshold) + origin if origin else threshold)
         features = [by_otsu if feature == Segmentation() else feature for feature in features]
     features = [
         dataclasses.replace(feature, around=_frames_around(series, key_frames))
@@ -349,11 +358,13 @@ def dilate(mask: FrameMask, vertices: int) -> FrameMask:
     return mask
 
 
-def _as_frame_type(value: float, frame: Frame) -> np.generic:
+def _as_frame_type(value: float, frame: Frame) -> Any:
     """A threshold as a scalar of the frame's floating-point type, or of float64 for integers.
 
-    numpy then compares without converting the frame.
+    numpy then compares without converting the frame. An integer stays one in a frame of integers.
     """
+    if isinstance(value, int) and frame.dtype.kind != "f":
+        return value
     with np.errstate(over="ignore"):
         return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
 
@@ -379,7 +390,7 @@ def _numbers(
     """The numbers of a feature's text; raises InputError, with the form that is allowed."""
     parts = [] if values is None else values.split(":")
     try:
-        numbers = [float(part) for part in parts]
+        numbers = [_number(part) for part in parts]
     except ValueError:
         numbers = []
     if len(numbers) != count or any(
@@ -389,5 +400,11 @@ def _numbers(
     return numbers
 
 
+def _number(text: str) -> float:
+    """The number in a text; integers beyond 2^53 stay integers."""
+    whole = re.fullmatch(r"\s*[+-]?[0-9]{1,300}\s*", text)
+    return exact_number(float(text) if whole is None else int(text))
+
+
 def _text(value: float) -> str:
-    return repr(float(value)).removesuffix(".0")
+    return str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")

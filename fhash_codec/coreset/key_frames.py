@@ -18,6 +18,8 @@ from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Series
+from fhash_formats.support.number_types import integer_origin, is_wide_integer
+from fhash_formats.transform.values.elementwise import about_origin
 
 FORMS = "all, every:K, auto:N or a list such as 0,4,9"
 """Forms of the setting `key_frames`, for error messages."""
@@ -244,6 +246,11 @@ def gram_matrix(samples: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
     not change an interpolation error, since the weights of an interpolation add up to one, but it
     avoids cancellation. NaN and infinite values are set to the mean of all finite values.
     """
+    if is_wide_integer(samples[0].dtype):
+        low = min(int(frame.min()) for frame in samples)
+        high = max(int(frame.max()) for frame in samples)
+        origin = integer_origin(low, high, samples[0].dtype)
+        samples = [about_origin(frame, origin) if origin else frame for frame in samples]
     peak = max(
         float(np.abs(frame[np.isfinite(frame)].astype(np.float64)).max(initial=0.0))
         for frame in samples

@@ -17,6 +17,7 @@ from fhash_codec.measure.value_range import Mean, ValueRange, pieces, power_of_t
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series, warn_defaults
+from fhash_formats.support.number_types import exact_number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +192,7 @@ def scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
     """Number, minimum and maximum of the finite values of a piece; they are added to the mean."""
     if piece.dtype.kind != "f":
         mean.add(piece)
-        return piece.size, float(piece.min()), float(piece.max())
+        return piece.size, exact_number(piece.min().item()), exact_number(piece.max().item())
     wide = piece.astype(np.float32 if piece.dtype.itemsize <= 4 else np.float64, copy=False)
     # A sum of float32 values does not overflow; float64 values are scaled before they are summed.
     count, low, high, total = range_and_sum(wide)

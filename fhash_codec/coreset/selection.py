@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.times import settled
 from fhash_formats.series import Series
+from fhash_formats.support.number_types import is_wide_integer
 
 Source = str | Path | Series | npt.ArrayLike
 """Data to encode: a file, a Series, an array (t, z, y, x) or (z, y, x), labelled or not, or a
@@ -63,6 +65,28 @@ def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
             f"mask has shape {values.shape}; the series has {series.shape} in (t, z, y, x)"
         )
     return Mask("array", read=lambda step: values if values.ndim == 3 else values[step])
+
+
+def _check_rounding(series: Series, scanned: Scan, config: EncodeConfig) -> None:
+    """Tell of integers of 64 bits that missing values beside them made floats, and so rounded.
+
+    Raises InputError where a bound of the error is promised, and warns (FhashWarning) elsewhere.
+    """
+    largest = max(map(abs, scanned.value_range.ends))
+    if series.source_dtype is None or not is_wide_integer(series.source_dtype):
+        return
+    if largest <= 1 << 53:
+        return
+    told = (
+        f"{series.source}: '{series.name}' has integers beyond 2^53 beside missing values, which "
+        f"make floats of them: they are rounded, by up to {math.ulp(float(largest)) / 2:g}"
+    )
+    if config.max_error is not None or config.max_error_rel is not None:
+        raise InputError(
+            f"{told}, and no bound of the error can be kept; promise a PSNR or a ratio, or encode "
+            "the numbers as they are stored (--raw-values with --keep-extremes)"
+        )
+    warnings.warn(told, FhashWarning, stacklevel=4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +167,7 @@ def resolve_selection(
         )
     with stage("scan", "range and missing values, by one pass over all steps"):
         scanned = scan(series, progress, ranks) if scanned is None else scanned
+    _check_rounding(series, scanned, config)
     with stage("key frames", f"steps to encode: {config.key_frames}"):
         key_frames = select_key_frames(config.key_frames, series, times, progress)
     with stage("features", f"thresholds of {', '.join(config.features)}"):

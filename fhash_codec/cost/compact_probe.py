@@ -106,8 +106,9 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
     share = part.shape[0] / steps
     begun = now()
     selection = select_features(part, config, silent)
-    value_range = selection.scanned.value_range
-    blocks = Blocks(part, selection.extent, part.shape)
+    origin = selection.scanned.value_range.origin(part.source_dtype or part.dtype)
+    value_range = selection.scanned.value_range.moved(-origin)
+    blocks = Blocks(part, selection.extent, part.shape, origin)
     integers = blocks.dtype.kind in "iu"
     bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
     selecting = (now() - begun) / share

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.sums import Values, histogram
 from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.support.number_types import exact_number
 
 __all__ = ["BULK_SHARE", "bulk_of_ranks", "find_bulk", "is_wide", "whole_psnr"]
 
@@ -124,5 +125,5 @@ def _rounded(low: float, high: float, limits: ValueRange, *, whole: bool) -> Val
         unit = Decimal(1).scaleb(math.floor(math.log10(high - low)) - DIGITS)
         low = float(Decimal(low).quantize(unit, ROUND_FLOOR, exact))
         high = float(Decimal(high).quantize(unit, ROUND_CEILING, exact))
-    low, high = max(float(low), limits.low), min(float(high), limits.high)
+    low, high = max(exact_number(low), limits.low), min(exact_number(high), limits.high)
     return ValueRange(low, high) if math.isfinite(high - low) and high > low else None

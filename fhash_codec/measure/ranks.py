@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.measure.value_range import pieces
+from fhash_formats.support.number_types import exact_number
 
 SIZE = 1 << 18
 """Values of a block. With 2^34 values the error is below 1/30,000 of them, in 40 MB."""
@@ -116,8 +117,8 @@ class Ranks:
         values, weights = values[order], weights[order]
         first, last = self._place(weights, beyond), self._place(weights[::-1], beyond)
         return (
-            -math.inf if first is None else float(values[first]),
-            math.inf if last is None else float(values[::-1][last]),
+            -math.inf if first is None else exact_number(values[first].item()),
+            math.inf if last is None else exact_number(values[::-1][last].item()),
         )
 
     def _place(self, weights: npt.NDArray[np.int64], beyond: int) -> int | None:

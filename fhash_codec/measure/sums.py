@@ -259,7 +259,7 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
     if is_wide_integer(original.dtype):
         limits = np.iinfo(original.dtype)
         nearest = np.clip(
-            np.rint(decoded.astype(np.float64)),
+            np.rint(np.nan_to_num(decoded.astype(np.float64))),
             float(limits.min),
             np.nextafter(float(limits.max), 0.0),
         )

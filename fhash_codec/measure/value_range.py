@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.number_types import exact_number, integer_origin, is_wide_integer
+from fhash_formats.transform.values.elementwise import about_origin
 
 PIECE = 2**20
 """Values that are converted to float64 at a time; they take 8 MiB."""
@@ -50,15 +52,23 @@ class Mean:
     def __init__(self) -> None:
         self.count = 0
         self._total = Fraction(0)
+        self._whole = False
 
     def add(self, values: npt.NDArray[Any]) -> None:
         """Add finite values of any shape and number type; cut large arrays with `pieces` first."""
         if values.size == 0:
             return
+        origin = 0
+        if is_wide_integer(values.dtype):
+            low, high = int(values.min()), int(values.max())
+            origin = integer_origin(low, high, values.dtype)
+            values = about_origin(values, origin) if origin else values
         wide = values.astype(np.float64)
         scale = power_of_two(max(abs(float(wide.min())), abs(float(wide.max()))))
         wide *= scale
         self.add_sum(values.size, float(wide.sum()), scale)
+        self._total += origin * values.size
+        self._whole |= origin != 0
 
     def add_sum(self, count: int, total: float, scale: float) -> None:
         """Add `count` values by their sum: `total` is their sum times `scale`."""
@@ -69,10 +79,15 @@ class Mean:
         """Add the values of another mean."""
         self._total += other._total
         self.count += other.count
+        self._whole |= other._whole
 
     def value(self) -> float:
-        """The mean of all values added; there must be at least one."""
-        return float(self._total / self.count)
+        """The mean of all values added; there must be at least one.
+
+        It is a whole number for integers of 64 bits some of which are beyond 2^53.
+        """
+        mean = self._total / self.count
+        return exact_number(round(mean)) if self._whole else float(mean)
 
 
 @dataclass(frozen=True)
@@ -80,8 +95,9 @@ class ValueRange:
     """The range of a series: finite numbers `low` <= `high` in data units.
 
     Differences that could overflow or be denormal are computed after scaling by an exact power of
-    two, so that +-1.7e308 and denormal ranges work like any other range. Raises InputError for
-    other numbers.
+    two, so that +-1.7e308 and denormal ranges work like any other range. Where an end is an integer
+    beyond 2^53, both are integers, and their difference is exact. Raises InputError for other
+    numbers.
     """
 
     low: float
@@ -93,6 +109,40 @@ class ValueRange:
                 f"value range is {self.low!r} to {self.high!r}; "
                 "two finite numbers, the lower first, are needed"
             )
+        ends = [exact_number(end) for end in self.ends]
+        if any(isinstance(end, int) for end in ends):
+            ends = [int(end) for end in ends]
+        for name, end in zip(("low", "high"), ends, strict=True):
+            object.__setattr__(self, name, end)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both ends."""
+        return self.low, self.high
+
+    @property
+    def floats(self) -> tuple[float, float]:
+        """The least and the greatest float64 within the range; its rounded ends if none is."""
+        low, high = float(self.low), float(self.high)
+        inner = (
+            low if low >= self.low else math.nextafter(low, math.inf),
+            high if high <= self.high else math.nextafter(high, -math.inf),
+        )
+        return inner if inner[0] <= inner[1] else (low, high)
+
+    def is_far(self, dtype: np.dtype[Any]) -> bool:
+        """Whether values of a type may be integers that float64 has not."""
+        return is_wide_integer(dtype) and max(map(abs, self.ends)) > 1 << 53
+
+    def origin(self, dtype: np.dtype[Any]) -> int:
+        """The integer that is subtracted from values of a type before they become floats."""
+        return integer_origin(self.low, self.high, dtype)
+
+    def moved(self, distance: int) -> ValueRange:
+        """The range of the values plus an integer; integers stay exact."""
+        if not distance:
+            return self
+        return ValueRange(*(exact_number(int(end) + distance) for end in self.ends))
 
     @property
     def scale(self) -> float:
@@ -111,6 +161,10 @@ class ValueRange:
         time.
         """
         source = np.asarray(values)
+        origin = self.origin(source.dtype)
+        if origin:
+            differences = about_origin(np.clip(source, int(self.low), int(self.high)), origin)
+            return self.moved(-origin).to_unit(differences)
         unit = np.empty(source.shape, dtype=np.float32)
         for piece, out in zip(pieces(source), pieces(unit), strict=True):
             out[:] = self._piece_to_unit(piece.astype(np.float64))
@@ -141,4 +195,4 @@ class ValueRange:
         values /= self.scale
         # If the ends differ by 300 orders of magnitude, scaling takes digits from the smaller one:
         # clip in data units as well.
-        return np.clip(values, self.low, self.high, out=values)
+        return np.clip(values, *self.floats, out=values)

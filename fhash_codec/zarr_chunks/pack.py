@@ -40,6 +40,7 @@ from fhash_formats.readers.common.request import Request, selection
 from fhash_formats.readers.zarr_coded import CodedArray, coded_names, open_coded
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.attributes import json_attributes
+from fhash_formats.support.number_types import exact_number
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -245,7 +246,7 @@ def _header(
             *coordinate_features(described["coordinates"]),
         ],
         "encoder": {**encoder, **({"codec": array.quality} if array.quality else {})},
-        "background": float(_in_type(scan.mean, array.dtype)),
+        "background": exact_number(_in_type(scan.mean, array.dtype)),
         "feature_bounding_box": [[0, n] for n in array.shape[1:]],
         "features": ["all"],
         "dilation": 0,
@@ -267,7 +268,7 @@ def _header(
 
 
 def _in_type(value: float, dtype: np.dtype[Any]) -> float:
-    """A number within the range of the type of the values, as a float."""
+    """A number within the range of the type of the values."""
     return float(dtype.type(value)) if dtype.kind == "f" else value
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.value_type import filled, rounded
 from fhash_codec.volume import Volume
 from fhash_codec.zarr_view.arrays import Region
 from fhash_formats.support.fork_lock import ForkLock
@@ -87,7 +86,9 @@ class Level:
         volume = self._volume
         time, *space = region
         shape = [along.stop - along.start for along in region]
-        result = np.full(shape, np.nan, dtype=volume.float_dtype)
+        floats = self.dtype.kind == "f"
+        empty = np.nan if floats and volume.fill is None else volume.fill
+        result = np.full(shape, empty, dtype=self.dtype)
         common = self._common(region)
         if common is not None:
             place = common.shift(-along.start for along in space).slices()
@@ -96,13 +97,9 @@ class Level:
                 for (low, high), o in zip(common, self.first, strict=True)
             )
             for number, step in enumerate(range(time.start, time.stop)):
-                result[number][place] = volume.read_lod(step, self.lod, spans)
-        if self.dtype.kind == "f":
-            return filled(result, volume.fill).astype(self.dtype, copy=False)
-        gaps = np.isnan(result)
-        integers = rounded(result, self.dtype)
-        integers[gaps] = volume.fill
-        return integers
+                values, counted = volume.decoded_lod(step, self.lod, spans)
+                np.copyto(result[number][place], values, where=counted, casting="same_kind")
+        return result
 
     def _common(self, region: Region) -> Box | None:
         """The vertices of the level that a region shares with the feature bounding box."""

@@ -120,3 +120,14 @@ def test_few_integers_are_pointed_to_the_lossless_way(fhash, tmp_path) -> None:
     exact = fhash("encode", tmp_path / "few.npy", *words, tmp_path / "exact.fhz")
     assert "--max-error 0" not in exact.stderr
     assert "none, lossless" in exact.stdout
+
+
+def test_integers_of_64_bits_are_converted_as_such() -> None:
+    integers = np.array([2**60 + 1, 2**60 + 3])
+    frame = np.array([2.0**60, np.nan])
+    kinds = [np.dtype("i8"), np.dtype("u8")]
+    for kind in kinds:
+        found = convert(frame, kind, fill=7, integers=integers)
+        assert found.tolist() == [2**60 + 1, 7]
+    assert convert(frame[:1], np.dtype("i4"), integers=integers[:1]).tolist() == [2**31 - 1]
+    assert convert(frame[:1], np.dtype("u8"), integers=-integers[:1]).tolist() == [0]

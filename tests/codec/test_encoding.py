@@ -11,7 +11,9 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError, OutputError, OutputExistsError, QualityError
 from fhash_codec.compact.tiles.coding import code
 from fhash_codec.container_name import DATA_SUFFIXES
+from fhash_formats.errors import FhashWarning
 from fhash_formats.readers import REGISTRY
+from fhash_formats.series import ArraySeries
 from fhash_formats.writers.mesh import MESH_SUFFIXES
 from fhash_formats.writers.registry import WRITERS
 
@@ -319,3 +321,95 @@ def test_effort_1_finds_a_coder_that_does_not_decode_what_it_coded(
     with pytest.raises(RuntimeError, match="decodes to other values"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(psnr=45.0, effort=1))
     assert not (tmp_path / "a.fhz").exists()
+
+
+FAR = {"int64 -2^63": -(2**63), "int64 2^60": 2**60, "ns": 1_700_000_000 * 10**9}
+FAR |= {"uint64 2^63": 2**63 - 500, "uint64 2^64": 2**64 - 999}
+"""Least of 999 integers where floats have few."""
+
+
+def far(name: str) -> np.ndarray:
+    """Waves of 999 integers from a number on."""
+    t, z, y, x = np.ogrid[0:3, 0:8, 0:10, 0:12]
+    waves = np.sin(t * 0.3) + np.sin(z * 0.4) + np.sin(y * 0.3) + np.cos(x * 0.2)
+    steps = np.rint((waves - waves.min()) / np.ptp(waves) * 998).astype(np.uint64)
+    values = steps + np.uint64(FAR[name] % 2**64)
+    return values.view(np.uint64 if name.startswith("uint") else np.int64)
+
+
+@pytest.mark.filterwarnings("ignore:.*its values are exact already")
+@pytest.mark.parametrize("name", FAR)
+@pytest.mark.parametrize(
+    "promise",
+    [{"ratio": 4.0}, {"max_error": 3.0}, {"max_error_rel": 0.01}, {"psnr": 40.0}, {"psnr": 400.0}],
+    ids=str,
+)
+def test_integers_far_from_zero_keep_their_range_and_the_promise(tmp_path, name, promise) -> None:
+    source = far(name)
+    least = source.astype(object).min()
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=1, **promise))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        back = volume[...]
+        assert volume.info["value_range"] == [least, least + 998]
+    assert back.dtype == source.dtype
+    steps, again = ((values.astype(object) - least).astype(float) for values in (source, back))
+    assert again.min() >= 0
+    assert again.max() <= 998
+    errors = np.abs(again - steps)
+    assert figures["max_abs_error"] == errors.max()
+    assert figures["data_range"] == 998
+    bounds = {"max_error": 3.0, "max_error_rel": 9.98}
+    assert errors.max() <= next((bounds[key] for key in promise if key in bounds), 998)
+    squares = float(np.mean(errors**2))
+    if squares:
+        psnr = 20 * np.log10(998) - 10 * np.log10(squares)
+        assert figures["psnr"] == pytest.approx(psnr, abs=1e-3)
+        assert psnr >= promise.get("psnr", 0)
+    else:
+        exact = fhash_codec.encode(source, tmp_path / "b.fhz", EncodeConfig(max_error=0.0))
+        assert figures["bytes"] <= 1.2 * exact["bytes"]
+
+
+@pytest.mark.parametrize("dtype", ["int64", "uint64"])
+@pytest.mark.parametrize("psnr", [20.0, 150.0])
+def test_noise_over_half_of_64_bits_stays_in_its_range(tmp_path, dtype, psnr) -> None:
+    middle = 0 if dtype == "int64" else 2**63
+    ends = middle - 2**62 - 700, middle + 2**62 + 700  # differences that float64 rounds outwards
+    chance = np.random.default_rng(0)
+    source = chance.integers(*ends, (3, 8, 10, 12), dtype=dtype)
+    source[:, :4] = chance.choice(np.array(ends, dtype), (3, 4, 10, 12))
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=2, psnr=psnr))
+    back = decoded(tmp_path / "a.fhz")
+    assert ends[0] <= back.min()
+    assert back.max() <= ends[1]
+
+
+@pytest.mark.parametrize("name", FAR)
+def test_features_of_integers_far_from_zero_are_those_of_their_differences(tmp_path, name) -> None:
+    source, least = far(name), FAR[name]
+    texts = (f"interval:{least + 300}:{least + 400}", f"isosurface:{least + 700}")
+    config = EncodeConfig(effort=1, max_error=2.0, features=texts, dilation=0, timings=False)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
+    near = (source - source.dtype.type(least)).astype(np.int64)
+    near_config = replace(config, features=("interval:300:400", "isosurface:700"))
+    near_figures = fhash_codec.encode(near, tmp_path / "b.fhz", near_config)
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        fhash_codec.open(tmp_path / "b.fhz", fill=0) as other,
+    ):
+        assert volume.dtype == source.dtype  # with a fill value of the encoder's
+        kept = np.stack([volume.occupancy(step) for step in range(3)])
+        assert (kept == np.stack([other.occupancy(step) for step in range(3)])).all()
+        assert list(volume.info["features"]) == list(texts)
+        errors = (volume[...].astype(object) - source.astype(object))[kept]
+        assert (volume[...][~kept] == volume.fill).all()
+    assert max(abs(errors)) == figures["max_abs_error"] <= 2
+    assert figures["data_range"] == near_figures["data_range"]
+
+
+def test_integers_that_missing_values_round_promise_no_bound(tmp_path) -> None:
+    values = ArraySeries(far("ns"), missing=[FAR["ns"] + 5])
+    with pytest.raises(InputError, match="rounded, by up to 128, and no bound"):
+        fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(max_error=0.0))
+    with pytest.warns(FhashWarning, match="rounded, by up to 128"):
+        fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=30.0))

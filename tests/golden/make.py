@@ -134,6 +134,7 @@ GOLDENS = {
     "compact-1.8-named": EncodeConfig(
         max_error=0.02, effort=1, timings=False, features=("interval:0.5:2",)
     ),
+    "compact-1.8-origin": EncodeConfig(max_error=3.0, effort=2, timings=False, tile="3x6x4x9"),
 }
 
 PLAIN = {
@@ -255,6 +256,14 @@ def grains() -> ArraySeries:
     return series
 
 
+def nanoseconds() -> ArraySeries:
+    """Times in nanoseconds, at the end of the range of uint64, where floats have few integers."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 6, 7, 9)), indexing="ij")
+    waves = np.sin(5 * x + 3 * t) * np.cos(4 * y) + z
+    values = np.uint64(2**64 - 1) - np.rint(500 + 200 * waves).astype(np.uint64)
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+
+
 def cells() -> ArraySeries:
     """The values of `series`, at cell centres that no rule gives to the last bit."""
     plain = series()
@@ -316,6 +325,7 @@ SERIES = {
     "compact-1.5-trellis": fronts,
     "compact-1.7-source": with_source,
     "compact-1.8-named": long_axis,
+    "compact-1.8-origin": nanoseconds,
 }
 """Sources of the goldens that are not made from `series`."""
 

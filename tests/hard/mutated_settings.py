@@ -149,6 +149,7 @@ def _settings_changed(
     elif turn == 8:
         for name in ("clip", "labels", "many_labels"):
             settings[name] = chance.choice((True, True, False, 1, None))
+        settings["origin"] = chance.choice((0, 1, -(1 << 63), (1 << 64) - 1, 1 << 64, 10**400, 2.0))
     else:
         holder, key = chance.choice(list(places(settings)))
         holder[key] = hostile(chance, holder[key])

@@ -9,20 +9,23 @@ import math
 import os
 import tempfile
 import warnings
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray
+import zarr
 from hypothesis import example, given
 from hypothesis import strategies as st
-from properties import Draw, looking, one_line
+from properties import FLOATS, INTEGERS, Draw, looking, one_line, same
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning
 from fhash_formats.container import Container
 from fhash_formats.errors import FhashError, QualityError
 
-DTYPES = ("float16", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32")
+DTYPES = (*FLOATS, *INTEGERS, "int64", "uint64")  # those of 64 bits twice: floats have not all
 Shape = tuple[int, int, int, int]
 
 
@@ -73,9 +76,14 @@ def fields(draw: Draw) -> np.ndarray:
         limits = np.iinfo(dtype)
         values = values - values.min()
         share = values / (values.max() or 1.0)
-        return np.rint(
-            limits.min + share * (limits.max - limits.min) * draw(st.sampled_from([1.0, 0.3, 1e-2]))
-        ).astype(dtype)
+        most = int(limits.max) - int(limits.min)
+        width = draw(st.sampled_from([most - most // 1024, 3 * most // 10, most // 100, 998]))
+        width = min(width, most)
+        base = draw(st.sampled_from([int(limits.min), int(limits.max) - width, -(width // 2), 0]))
+        base = max(base, int(limits.min))
+        # Modulo 2^64, so that nothing is rounded once the steps are whole numbers.
+        steps = np.minimum(np.rint(share * width), float(width)).astype(np.uint64)
+        return (steps + np.uint64(base % 2**64)).astype(dtype)
     power = draw(st.integers(-4, 3) if dtype.itemsize == 2 else st.integers(-30, 30))
     offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1e3]))
     with np.errstate(over="ignore"):  # values beyond float16 become infinite
@@ -168,7 +176,14 @@ def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
         with Container.open(path) as container:
             container.verify()
         with fhash_codec.open(path) as volume:
-            decoded = np.asarray(volume[...]).astype(np.float64)
+            decoded = np.asarray(volume[...])
+            assert same(volume.values_of_steps(range(len(values))), decoded)
+            read = volume.read_steps(range(len(values)))
+            assert same(read, np.where(np.isnan(read), np.nan, decoded).astype(read.dtype))
+        shown = zarr.open_group(fhash_codec.zarr_store(path), mode="r")["values"]
+        assert same(np.asarray(shown[...]).reshape(decoded.shape), decoded)
+        with xarray.open_dataset(path, engine="fhash") as dataset:
+            assert same(dataset["values"].to_numpy().reshape(decoded.shape), decoded)
     check(values, config, decoded, figures, missed)
 
 
@@ -180,7 +195,9 @@ def check(
     missed: str,
 ) -> None:
     """Compare the promise and the stated figures with the decoded values."""
-    original, finite, kept = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
+    whole = values.dtype.kind != "f"  # Python's integers have no end
+    original = values.astype(object if whole else np.float64)
+    finite, kept = np.isfinite(values), np.isfinite(decoded)
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()
     assert not kept[~finite].any()
@@ -191,10 +208,20 @@ def check(
     elif config.features[0].startswith("interval"):
         ends = [float(end) for end in config.features[0].split(":")[1:]]
         assert kept[finite & (original >= ends[0]) & (original <= ends[1])].all()
-    errors = np.abs(decoded[kept] - original[kept])
+    ends = [original[finite].min(), original[finite].max()]
+    found = decoded[kept]
+    if whole and decoded.dtype.kind == "f":  # the nearest floats of integers
+        ends = [float(end) for end in ends]
+        assert (found.astype(decoded.dtype) % 1 == 0).all() or config.profile == "paper"
+    if config.profile == "compact":
+        assert ends[0] <= found.min().item()
+        assert found.max().item() <= ends[1]
+    exact = np.array([Fraction(each) if whole else each for each in found.tolist()])
+    errors = np.abs(exact - original[kept])
     span = float(original[finite].max() - original[finite].min())
-    largest, squares = float(errors.max()), float(np.sqrt(np.mean((errors / (span or 1.0)) ** 2)))
-    assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (
+    largest = errors.max() if whole else float(errors.max())
+    squares = float(np.sqrt(np.mean((errors.astype(np.float64) / (span or 1.0)) ** 2)))
+    assert math.isclose(float(largest), figures["max_abs_error"], rel_tol=1e-9), (
         largest,
         figures["max_abs_error"],
     )

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from properties import FLOATS, Draw, arrays, looking, same
+from properties import Draw, arrays, looking, same
 
 from fhash_formats import native
 from fhash_formats.transform.axes.bands import band_table
@@ -31,6 +31,7 @@ from fhash_formats.transform.entropy.coder import (
     encode_integers,
 )
 from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
 
 NATIVE = pytest.mark.skipif(
     native.library() is None, reason="the native library was not built here"
@@ -201,9 +202,32 @@ def test_any_chunk_keeps_its_bound_strictly(values: np.ndarray, bound: float) ->
 
 
 @looking(80)
-@given(values=arrays(FLOATS, dims=(1, 4), side=6), share=st.floats(1e-7, 1))
-def test_any_chunk_keeps_its_relative_bound(values: np.ndarray, share: float) -> None:
-    decoded = decode_chunk(encode_chunk(values, max_error_rel=share), values.shape, values.dtype)
+@given(
+    values=arrays(dims=(1, 4), side=6),
+    share=st.floats(1e-7, 1),
+    padding=st.lists(st.integers(0, 3), min_size=4, max_size=4),
+    fill=st.sampled_from([0, 1, 100]),
+    codec=st.booleans(),
+)
+@example(
+    values=np.arange(2**63 - 9, 2**63), share=0.3, padding=[2] * 4, fill=0, codec=True
+)  # far from the padding
+def test_any_chunk_keeps_its_relative_bound(
+    values: np.ndarray, share: float, padding: list[int], fill: int, codec: bool
+) -> None:
+    """The range is that of the values without those that a store has put behind them."""
+    ends = [(0, more) for more in padding[: values.ndim]]
+    whole = np.pad(values, ends, constant_values=fill)
+    if codec:
+        numcodec = NumcodecsTransform(max_error_rel=share)
+        decoded = numcodec.decode(numcodec.encode(whole))
+    else:
+        data = encode_chunk(whole, max_error_rel=share, fill=None)
+        decoded = decode_chunk(data, whole.shape, whole.dtype)
+    kept = np.isfinite(whole)
+    assert not kept.any() or decoded[kept].max() <= whole[kept].max()
+    assert not kept.any() or decoded[kept].min() >= whole[kept].min()
+    decoded = decoded[tuple(slice(0, n) for n in values.shape)]
     finite = np.isfinite(values)
     assert same(decoded[~finite], values[~finite])
     exact = [Fraction(value) for value in values[finite].tolist()]

@@ -23,7 +23,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["AIM", "find_step", "psnr_search", "require_reach", "with_step"]
+__all__ = ["AIM", "FINEST_PSNR", "find_step", "psnr_search", "require_reach", "with_step"]
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
@@ -76,9 +76,9 @@ def with_step(
     if goal.error:
         slack = min(rounding * largest / goal.error, MAX_ROUNDING_SLACK)
         quantum = 2 * goal.error * (1 - SLACK - slack)
-    # A residual takes values beyond the range, and so does the rounding of its ends to float32.
-    ends = (settings.low, settings.high)
-    beyond = quantum > 0 or (not double and any(float(np.float32(end)) != end for end in ends))
+    # A residual takes values beyond the range, and so does the rounding of its ends.
+    working = float if double else np.float32
+    beyond = quantum > 0 or any(float(working(end)) != end for end in (settings.low, settings.high))
     return replace(settings, step=step, double=double, quantum=quantum, clip=beyond)
 
 

@@ -16,6 +16,7 @@ from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.sections import Shape
+from fhash_formats.transform.values.elementwise import about_origin, cast
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -73,14 +74,18 @@ class Blocks:
         grid: number of tiles along each axis; along t, of all boxes together.
         weights: of each box of this shape, one after the other: boxes of the series that it stands
             for. A series itself is one box.
-        dtype: type of the source, in the byte order of this machine. It is an integer type also
-            where missing values made floats of integers.
+        source_dtype: type of the source, in the byte order of this machine. It is an integer type
+            also where missing values made floats of integers.
+        origin: integer that is subtracted from the values of the source; 0 but for 64-bit integers
+            beyond 2^53.
+        dtype: type of the values: that of the source, or int64 for differences from the origin.
         complete: whether all vertices of the box are in the coreset at all steps.
     """
 
-    def __init__(self, series: Series, extent: Extent, tile: Shape) -> None:
-        self._series, self._extent = series, extent
-        self.dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
+    def __init__(self, series: Series, extent: Extent, tile: Shape, origin: int = 0) -> None:
+        self._series, self._extent, self.origin = series, extent, origin
+        self.source_dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
+        self.dtype: np.dtype[Any] = np.dtype(np.int64) if origin else self.source_dtype
         self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.complete = extent.samples == prod(self.shape)
         self.weights: tuple[int, ...] = (1,)
@@ -181,7 +186,7 @@ class Blocks:
         yield from product(*(range(n) for n in self.grid))
 
     def read(self, index: Index) -> Tile:
-        """Return a tile in the type of the source; beyond the box, border values are repeated.
+        """Return a tile of values less the origin; beyond the box, border values are repeated.
 
         Vertices beyond the box do not count. Any thread may call this where the box is in memory.
         Otherwise only one thread may, in C order, because just the last layer in t is kept.
@@ -202,7 +207,7 @@ class Blocks:
         return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
 
     def counted_values(self) -> Iterator[Values]:
-        """Yield the values that count of each step, in the type of the source.
+        """Yield the values that count of each step, less the origin.
 
         A series that does not stay in memory is read once, step by step.
         """
@@ -234,18 +239,19 @@ class Blocks:
     def _load(self, steps: range) -> Tile:
         """Read the box at some steps from the series; an array in memory is not copied."""
         held = self._series.values if isinstance(self._series, ArraySeries) else None
-        if held is not None and held.dtype == self.dtype:
+        if held is not None and held.dtype == self.source_dtype and not self.origin:
             values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
             values.flags.writeable = False  # it is the caller's
             return Tile(values, self._masks(steps))
-        values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
+        values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
         for number, step in enumerate(steps):
             frame = self._series.read(step)[self._extent.box.slices()]
             if frame.dtype.kind == "f" and self.dtype.kind != "f":
                 # Missing values are outside the coreset; any integer may stand there.
                 frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
-                frame = np.where(np.isfinite(frame), frame, 0.0)
+                frame = cast(np.where(np.isfinite(frame), frame, 0.0), self.source_dtype)
             values[number] = frame
+        values = about_origin(values, self.origin) if self.origin else values
         return Tile(values, self._masks(steps))
 
     def _masks(self, steps: range) -> Mask | None:

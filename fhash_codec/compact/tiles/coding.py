@@ -96,7 +96,7 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
         occupied = None
         if settings.mask is not None:
             occupied = np.ones(values.shape, bool) if counted is None else counted
-        coded = exact_tile(values, occupied=occupied)
+        coded = exact_tile(values, occupied=occupied, origin=settings.origin)
         size = len(coded.data)
         return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
     coded = encode_tile(values, settings, coding, in_coreset=counted)

@@ -41,6 +41,7 @@ KNOWN_FEATURES = frozenset(
         "many-labels",
         "mask",
         "named",
+        "origin",
         "predictor",
         SPARSE_FEATURE,
         "trellis",

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.support.number_types import exact_number
 
 MAX_LENGTH = 1 << 40
 """Length that a header may declare for an axis, and a limit for other counts in it."""
@@ -109,7 +110,7 @@ class Record:
         return None if self._values.get(key) is None else self.number(key)
 
     def numbers(self, key: str, count: int) -> list[float]:
-        """The value of `key`, a list of `count` finite numbers."""
+        """The value of `key`, a list of `count` finite numbers; integers beyond 2^53 stay such."""
         values = self.get(key)
         fits = (
             isinstance(values, list)
@@ -117,7 +118,7 @@ class Record:
             and all(_is_finite(value) for value in values)
         )
         self.need(fits, key, f"{count} finite numbers")
-        return [float(value) for value in values]
+        return [exact_number(value) for value in values]
 
 
 def _is_finite(value: object) -> bool:

@@ -8,7 +8,7 @@ gives the same bytes on every machine.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.number_types import exact_number, integer_origin
 from fhash_formats.transform.axes.candidates import NO_TRANSFORM, candidates
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.decoding import decode_tile, transform_for
@@ -69,7 +70,8 @@ class Quality:
 
     Attributes:
         max_error: bound on |decoded - value|, in units of the values, kept strictly; 0 is lossless.
-        max_error_rel: the same bound as a fraction of the range of the chunk's finite values.
+        max_error_rel: the same bound as a fraction of the range of the chunk's finite values, but
+            for those that a store may have put there, see `encode_chunk`.
         step: quantiser step, in units of the values, without a bound.
     """
 
@@ -134,10 +136,14 @@ def encode_chunk(
     max_error_rel: float | None = None,
     step: float | None = None,
     transform: TransformSpec | Mapping[str, Any] | None = None,
+    fill: Any = 0,
 ) -> bytes:
     """The stream of an array.
 
-    NaN and infinities come back where they were and take no part in range or bound.
+    NaN and infinities come back where they were and take no part in range or bound. Stores put fill
+    values where nothing was written, and beyond the end of an array. So these take no part in the
+    range of `max_error_rel` either, nor does a value that is the only one of a plane at either end
+    of an axis: a filter may have changed the fill value, and some stores do not tell it.
 
     Args:
         values: array of a type that `supported` accepts; its axes become those of `tile_shape`.
@@ -145,6 +151,7 @@ def encode_chunk(
         max_error_rel: as in `Quality`.
         step: as in `Quality`.
         transform: transform along (t, z, y, x); None for the one that codes best in a trial.
+        fill: the fill value of the store; None where it has none.
 
     Raises InputError.
     """
@@ -154,7 +161,18 @@ def encode_chunk(
         tile_shape(values.shape)
     )
     specs = candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
-    return _encode(tile, quality, specs).data if tile.size else b""
+    fills = _fills(values, fill) if quality.max_error_rel is not None else []
+    return _encode(tile, quality, specs, fills).data if tile.size else b""
+
+
+def _fills(values: Values, fill: Any) -> list[Any]:
+    """The values of an array that a store may have put there: see `encode_chunk`."""
+    fills = [] if fill is None else [np.asarray(fill).astype(values.dtype)[()]]
+    for axis in range(values.ndim):
+        for plane in (values.take(end, axis) for end in (0, -1) if values.shape[axis]):
+            if plane.size and bool((plane == plane.flat[0]).all()):
+                fills.append(plane.flat[0])
+    return fills
 
 
 def decode_chunk(data: bytes | memoryview, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Values:
@@ -178,8 +196,9 @@ class _Task:
     Attributes:
         tile: the values (t, z, y, x).
         finite: where they are finite; None where all are.
-        low: smallest finite value; for integers a Python integer, since float64 is too narrow for
-            64 bits.
+        origin: integer that is subtracted from the values before they become floats; 0 for most.
+        low: smallest finite value, less the origin; for integers a Python integer, since float64
+            is too narrow for 64 bits.
         high: largest finite value, likewise.
         quality: the quality asked for.
         error: bound on the decoded values; None for none.
@@ -188,6 +207,7 @@ class _Task:
 
     tile: Values
     finite: Mask | None
+    origin: int
     low: float
     high: float
     quality: Quality
@@ -216,9 +236,14 @@ class _Task:
         return max(abs(float(self.low)), abs(float(self.high)))
 
 
-def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) -> CodedTile:
-    """The coded chunk, stored without loss where that takes no more bytes."""
-    task = _task(tile, quality)
+def _encode(
+    tile: Values, quality: Quality, specs: tuple[TransformSpec, ...], fills: Sequence[Any]
+) -> CodedTile:
+    """The coded chunk, stored without loss where that takes no more bytes.
+
+    fills: values that take no part in the range of a relative bound.
+    """
+    task = _task(tile, quality, fills)
     if task is None:
         return _constant_tile(tile, 0.0)
     constant = _encode_constant(task)
@@ -249,7 +274,7 @@ def _transformed(task: _Task, specs: tuple[TransformSpec, ...]) -> CodedTile | N
     )
 
 
-def _task(tile: Values, quality: Quality) -> _Task | None:
+def _task(tile: Values, quality: Quality, fills: Sequence[Any]) -> _Task | None:
     """The chunk with its range and bound; None where no value is finite."""
     finite = np.isfinite(tile)
     all_finite = bool(finite.all())
@@ -257,32 +282,54 @@ def _task(tile: Values, quality: Quality) -> _Task | None:
     if not values.size:
         return None
     low, high = values.min().item(), values.max().item()
+    origin = integer_origin(low, high, tile.dtype)
+    low, high = low - origin, high - origin
     with_bound = quality.step is None
-    error, reach = _bound(quality, low, high, tile.dtype) if with_bound else (None, 0.0)
+    kept = values[np.logical_and.reduce([values != fill for fill in fills])] if fills else values
+    ends = (kept.min().item(), kept.max().item()) if kept.size else (0, 0)
+    error, reach = _bound(quality, low, high, ends, tile.dtype) if with_bound else (None, 0.0)
     mask = None if all_finite else finite
     return _Task(
-        tile=tile, finite=mask, low=low, high=high, quality=quality, error=error, reach=reach
+        tile=tile,
+        finite=mask,
+        origin=origin,
+        low=low,
+        high=high,
+        quality=quality,
+        error=error,
+        reach=reach,
     )
 
 
-def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple[float, float]:
-    """The bound on decoded values, and the largest error before they are rounded to their type."""
+def _bound(
+    quality: Quality, low: Any, high: Any, ends: tuple[Any, Any], dtype: np.dtype[Any]
+) -> tuple[float, float]:
+    """The bound on decoded values, and the largest error before they are rounded to their type.
+
+    low, high: range of the values. ends: of the range that a relative bound is of.
+    """
     error = 0.0 if quality.max_error is None else float(quality.max_error)
     if quality.max_error_rel is not None:
-        fraction, span = float(quality.max_error_rel), float(high) - float(low)
+        fraction, span = float(quality.max_error_rel), float(ends[1] - ends[0])
         error = fraction * span
         if not math.isfinite(span):
-            error = fraction * float(high) - fraction * float(low)
+            error = fraction * float(ends[1]) - fraction * float(ends[0])
     if dtype.kind != "f":
         largest = math.floor(error) if math.isfinite(error) else 1 << 64
         return error, largest + 0.5
     return error, error - max(abs(low), abs(high)) * float(np.finfo(dtype).eps)
 
 
-def _constant_tile(tile: Values, center: float) -> CodedTile:
+def _constant_tile(tile: Values, center: float, origin: int = 0) -> CodedTile:
     """A tile whose finite values all decode to one value."""
     settings = TileSettings(
-        transform=NO_TRANSFORM, step=1.0, center=center, low=center, high=center, double=True
+        transform=NO_TRANSFORM,
+        step=1.0,
+        center=center,
+        low=center,
+        high=center,
+        double=True,
+        origin=origin,
     )
     nothing = np.zeros(tile.shape, bool)
     return encode_tile(tile, settings, Coding(own_settings=True), in_coreset=nothing)
@@ -293,7 +340,7 @@ def _encode_constant(task: _Task) -> CodedTile | None:
     error, values_equal = task.error, task.high == task.low
     if not values_equal and (error is None or task.half_range > task.reach):
         return None
-    constant = _constant_tile(task.tile, task.center)
+    constant = _constant_tile(task.tile, task.center, task.origin)
     # A lossless zero keeps its sign, and a constant has one sign only.
     counted = task.tile if task.finite is None else task.tile[task.finite]
     signed = error == 0 and task.low == 0 and bool(np.signbit(counted).any())
@@ -320,8 +367,9 @@ def _first_settings(task: _Task, transform: TransformSpec) -> TileSettings | Non
         transform=transform,
         step=first,
         center=task.center,
-        low=float(task.low),
-        high=float(task.high),
+        low=exact_number(task.low),
+        high=exact_number(task.high),
+        origin=task.origin,
         clip=True,
         double=_double(task.tile.dtype, task.largest, 2 * task.half_range, first),
         quantum=0.0 if task.error is None else 2 * task.reach * _QUANTUM_SHARE,

@@ -1,8 +1,8 @@
 """The codec `fhash.transform` for numcodecs, and so for Zarr format 2; loaded by its entry point.
 
 The bytes are, with little-endian numbers: the magic `FHC1`; the type as numpy writes it, without
-byte order (such as `f4`); the number of axes (one byte); the lengths (uint64); the CRC-32 of all
-these (uint32); and the stream of one tile.
+byte order (such as `f4`); the number of axes (one byte), plus 128 for an array in Fortran order;
+the lengths (uint64); the CRC-32 of all these (uint32); and the stream of one tile.
 """
 
 from __future__ import annotations
@@ -27,6 +27,11 @@ _MAGIC = b"FHC1"
 """First bytes of a coded array."""
 _TYPES = {b"f2", b"f4", b"f8", b"i1", b"i2", b"i4", b"i8", b"u1", b"u2", b"u4", b"u8"}
 """Types that are coded."""
+_FORTRAN = 128
+"""Added to the number of axes of an array whose first axis is the one that varies fastest.
+
+Zarr format 2 takes the decoded bytes in the order that it gave them in.
+"""
 _MAX_AXES = 32
 """Most axes of an array."""
 _MAX_VALUES = 1 << 40
@@ -38,7 +43,7 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
 
     Args:
         max_error: as in `Quality`; exactly one of the three is given.
-        max_error_rel: as in `Quality`.
+        max_error_rel: as in `Quality`. The range leaves out 0, with which Zarr fills.
         step: as in `Quality`.
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             array best.
@@ -74,27 +79,31 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
             raise InputError("fhash.transform codes numbers: give an array, not bytes")
         values = np.asarray(buf)
         dtype = supported(values.dtype)
+        fortran = values.flags.f_contiguous and not values.flags.c_contiguous
+        axes = values.ndim + (_FORTRAN if fortran else 0)
         header = (
             _MAGIC
             + dtype.str[1:].encode("ascii")
-            + struct.pack(f"<B{values.ndim}Q", values.ndim, *values.shape)
+            + struct.pack(f"<B{values.ndim}Q", axes, *values.shape)
         )
         data = encode_chunk(values, **self.quality.to_dict(), transform=self.transform)
         return header + zlib.crc32(header).to_bytes(4, "little") + data
 
     def decode(self, buf: Any, out: Any = None) -> Any:
-        """The array, with the shape and type that were coded, in this machine's byte order.
+        """The array, with the shape, order and type that were coded, in this machine's byte order.
 
         Raises DamagedFileError.
         """
         data = ensure_bytes(buf)
-        if len(data) < 11 or data[:4] != _MAGIC or data[4:6] not in _TYPES or data[6] > _MAX_AXES:
+        fortran, axes = divmod(data[6], _FORTRAN) if len(data) >= 11 else (0, 0)
+        if len(data) < 11 or data[:4] != _MAGIC or data[4:6] not in _TYPES or axes > _MAX_AXES:
             raise DamagedFileError("these bytes are not of the codec fhash.transform")
-        end = 7 + 8 * data[6]
+        end = 7 + 8 * axes
         if zlib.crc32(data[:end]).to_bytes(4, "little") != data[end : end + 4]:
             raise DamagedFileError("the head of an array coded by fhash.transform is damaged")
-        shape = struct.unpack_from(f"<{data[6]}Q", data, 7)
+        shape = struct.unpack_from(f"<{axes}Q", data, 7)
         if math.prod(shape) > _MAX_VALUES:
             raise DamagedFileError(f"an array coded by fhash.transform claims the shape {shape}")
         values = decode_chunk(memoryview(data)[end + 4 :], shape, data[4:6].decode("ascii"))
+        values = np.asfortranarray(values) if fortran else values
         return values if out is None else ndarray_copy(values, out)

@@ -11,8 +11,9 @@
     )
 
 Each chunk is one tile. Do not compress the chunks again: use `compressors=None`, or the checksum
-`crc32c`. Zarr pads chunks at the border of the array with the fill value. NaN is the best fill
-value, since it takes no part in the range and hardly any bytes.
+`crc32c`. Zarr pads chunks at the border of the array with the fill value, which takes no part in
+the range of `max_error_rel`. NaN is the best fill value, since it takes hardly any bytes; beside
+another one, decoded values may lie between it and the others, within the bound.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ class TransformCodec(ArrayBytesCodec):
 
     Attributes:
         max_error: as in `Quality`; exactly one of the three is given.
-        max_error_rel: as in `Quality`, relative to the range of each chunk.
+        max_error_rel: as in `Quality`, relative to the range of each chunk, which is that of the
+            array at most.
         step: as in `Quality`.
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             chunk best.
@@ -187,7 +189,8 @@ class TransformCodec(ArrayBytesCodec):
                 f"{NAME} without a configuration only decodes: "
                 "give max_error, max_error_rel or step to write"
             )
-        values = np.asarray(chunk_array.as_ndarray_like())
+        # Filters of numcodecs give one axis, and decoding knows the shape alone.
+        values = np.asarray(chunk_array.as_ndarray_like()).reshape(chunk_spec.shape)
         if self.axes is not None:
             values = ArrayAxes.of(self.axes).to_tile(values)
         if self.settings is None:
@@ -197,6 +200,7 @@ class TransformCodec(ArrayBytesCodec):
                 max_error_rel=self.max_error_rel,
                 step=self.step,
                 transform=self.transform,
+                fill=chunk_spec.fill_value,
             )
         else:
             tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(

@@ -15,6 +15,7 @@ import fhash_codec
 import fhash_formats
 from fhash_cli.commands.decode import TYPES
 from fhash_cli.conversion import convert
+from fhash_codec import EncodeConfig
 from fhash_codec.compact.model import CompactModel
 from fhash_formats.errors import InputError
 
@@ -383,3 +384,23 @@ def test_only_integers_of_64_bits_are_decoded_twice(
     got = saved(fhash, path, tmp_path / "out.npy")
     assert got.dtype == values.dtype
     assert len(decoded) == reads
+
+
+def test_figures_and_files_of_integers_far_from_zero_are_exact(
+    fhash: Fhash, tmp_path: Path
+) -> None:
+    values = np.arange(2**64 - 960, 2**64, dtype=np.uint64).reshape(2, 6, 8, 10)
+    fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(max_error=0.0, effort=1))
+    for more, shown in (((), values), (("--lod", "1"), values[:, ::2, ::2, ::2])):
+        result = fhash(
+            "decode", tmp_path / "a.fhz", "-o", tmp_path / "a.npy", "--force", "--json", *more
+        )
+        report = json.loads(result.stdout)
+        found = np.load(tmp_path / "a.npy")
+        assert found.dtype == values.dtype
+        assert (report["min"], report["max"]) == (int(found.min()), int(found.max()))
+        assert found.shape == shown.shape
+        assert found.min() >= values.min()
+        if not more:
+            assert (found == values).all()
+            assert report["mean"] == 2**64 - 480

@@ -353,3 +353,23 @@ def test_killed_it_loses_no_layer_that_was_written(tmp_path) -> None:
     with Writer.resume(path):
         pass
     assert os.listdir(tmp_path) == ["run.fhz"]
+
+
+@pytest.mark.parametrize("bound", [0, 3])
+def test_integers_far_from_zero_and_from_each_other(tmp_path, bound) -> None:
+    near = np.rint(300 * np.sin(np.arange(4 * 60) / 9)).astype(np.int64).reshape(4, 3, 4, 5)
+    steps = [near[0] + 2**61, near[1] + 2**61, near[2] - 2**62, near[3] + (2**63 - 400)]
+    with Writer(
+        tmp_path / "a.fhz",
+        shape=near.shape[1:],
+        max_error=bound,
+        config=EncodeConfig(tile="1x3x4x5", effort=1),
+    ) as writer:
+        for step in steps:
+            writer.append(step)
+    values = np.stack(steps).astype(object)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        errors = abs(volume[...].astype(object) - values)
+        assert errors.max() <= bound
+        assert volume.info["quality"]["max_abs_error"] == errors.max()
+        assert volume.info["value_range"] == [values.min(), values.max()]

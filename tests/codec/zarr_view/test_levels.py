@@ -134,3 +134,19 @@ def test_a_tile_whose_chunks_are_asked_for_at_once_is_decoded_once(
             return volume.container.bytes_read
 
     assert bytes_read(8) == bytes_read(1)
+
+
+def test_levels_of_integers_far_from_zero_stay_in_their_range(tmp_path: Path) -> None:
+    steps = np.arange(2 * 12 * 40 * 40, dtype=np.uint64).reshape(2, 12, 40, 40) // 97
+    values = np.uint64(2**64 - 1) - steps
+    config = fhash_codec.EncodeConfig(max_error=3.0, effort=1)
+    fhash_codec.encode(values, tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        for lod in range(level_count(volume)):
+            level = Level(volume, lod)
+            found = level.read(region_of(level))
+            assert found.dtype == values.dtype
+            assert found.min() >= values.min()
+            near = values[:, :: level.stride, :: level.stride, :: level.stride]
+            pair = [(each - values.min()).astype(float) for each in (found, near)]
+            assert np.abs(pair[0] - pair[1]).max() < 60

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from fhash_formats import native
-from fhash_formats.errors import InputError
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
 
 FLOATS = ["f2", "f4", "f8", ">f4"]
@@ -255,3 +255,32 @@ def test_labels_keep_every_bit_of_floats() -> None:
     values[values == 5] = np.inf
     decoded = decode_chunk(encode_chunk(values, max_error=0), values.shape, "f4")
     assert decoded.tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize("least", [-(2**63), 2**60, 2**63 - 999])
+def test_integers_far_from_zero_are_coded_as_near_ones(least: int) -> None:
+    near = np.rint(field((9, 11, 13), 400, "f8")).astype(np.int64)
+    near -= near.min()
+    values = near + np.int64(least)
+    sizes = []
+    for tile in (near, values):
+        for quality in ({"max_error": 3}, {"max_error_rel": 0.01}, {"step": 9.0}):
+            data = encode_chunk(tile, **quality)
+            decoded = decode_chunk(data, tile.shape, tile.dtype)
+            assert decoded.min() >= tile.min()
+            assert decoded.max() <= tile.max()
+            sizes.append(len(data))
+    assert max(sizes[3:]) <= max(sizes[:3]) + 40
+
+
+def test_an_origin_is_of_64_bit_integers_alone() -> None:
+    values = np.arange(2**60, 2**60 + 60).reshape(3, 4, 5)
+    data = encode_chunk(values, max_error=3)
+    for dtype in ("f8", "i4", "u2"):
+        with pytest.raises(
+            DamagedFileError, match="no values about the origin 1152921504606847006"
+        ):
+            decode_chunk(data, values.shape, dtype)
+    # As the other type of 64 bits the same integers come out, within its range.
+    again = decode_chunk(data, values.shape, np.uint64)
+    assert (again == decode_chunk(data, values.shape, np.int64).astype(np.uint64)).all()

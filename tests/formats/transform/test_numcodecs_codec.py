@@ -58,6 +58,25 @@ def test_zarr_format_2(tmp_path: Path) -> None:
     assert np.abs(zarr.open_array(tmp_path / "a.zarr", mode="r")[...] - values).max() <= 0.001
 
 
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("fill", [0, None, 5])
+def test_padding_in_zarr_format_2_leaves_the_relative_bound(order: str, fill: int | None) -> None:
+    values = (1_900_000_000 + np.random.default_rng(0).integers(0, 50, (17, 21))).astype("i4")
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(),
+        shape=values.shape,
+        chunks=(5, 8),
+        dtype=values.dtype,
+        zarr_format=2,
+        filters=None,
+        fill_value=fill,
+        order=order,
+        compressors=NumcodecsTransform(max_error_rel=0.1),
+    )
+    array[...] = values
+    assert np.abs(array[...] - values).max() <= 0.1 * np.ptp(values)
+
+
 def test_damage_and_bytes_are_refused() -> None:
     codec = NumcodecsTransform(max_error=0.01)
     values = np.sin(np.arange(30.0)).reshape(5, 6)

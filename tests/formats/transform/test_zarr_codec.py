@@ -14,6 +14,7 @@ import xarray
 import zarr
 from specs import spec_of
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.codecs.numcodecs import FixedScaleOffset
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import encode_chunk
@@ -36,11 +37,9 @@ def create(store: Any, values: npt.NDArray[Any], chunks: tuple[int, ...], **opti
     options = {
         "serializer": TransformCodec(max_error=0.01),
         "compressors": None,
-        "fill_value": np.nan,
+        "fill_value": np.nan if values.dtype.kind == "f" else 0,
         **options,
     }
-    if values.dtype.kind != "f":
-        options["fill_value"] = 0
     array = zarr.create_array(
         store, shape=values.shape, chunks=chunks, dtype=values.dtype, **options
     )
@@ -134,6 +133,43 @@ def test_padding_with_nan_leaves_the_relative_bound(tmp_path: Path) -> None:
         tmp_path / "a.zarr", values, (5, 8), serializer=TransformCodec(max_error_rel=0.001)
     )[...]
     assert np.abs(read - values).max() <= 0.001 * np.ptp(values)
+
+
+@pytest.mark.parametrize("dtype", ["i4", "f4", "i8", "u2", "f8"])
+@pytest.mark.parametrize("shards", [None, (10, 16)])
+@pytest.mark.parametrize("fill", [0, 9])
+def test_padding_leaves_the_relative_bound(
+    dtype: str, shards: tuple[int, int] | None, fill: float
+) -> None:
+    base = {"u2": 60_000, "i8": 2**61}.get(dtype, 1_900_000_000)
+    values = (base + np.random.default_rng(0).integers(0, 50, (17, 21))).astype(dtype)
+    codec = TransformCodec(max_error_rel=0.1)
+    options: dict[str, Any] = {"serializer": codec, "fill_value": fill, "shards": shards}
+    whole = create(zarr.storage.MemoryStore(), values, (5, 8), **options)
+    bound = 0.1 * float(np.ptp(values))
+    assert np.abs((whole[...] - values).astype(float)).max() <= bound
+    # Chunks that were coded beside fill values are coded once more with the others.
+    parts = create(zarr.storage.MemoryStore(), np.full_like(values, fill), (5, 8), **options)
+    for part in (np.s_[:7, :9], np.s_[7:, 9:], np.s_[:7, 9:], np.s_[7:, :9]):
+        parts[part] = values[part]
+    assert np.abs((parts[...] - values).astype(float)).max() <= 4 * bound
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr")
+def test_padding_that_a_filter_changed_leaves_the_relative_bound() -> None:
+    values = np.random.default_rng(0).normal(5000, 1, (17, 21))
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(),
+        shape=values.shape,
+        chunks=(5, 8),
+        dtype="f8",
+        fill_value=0.0,
+        filters=FixedScaleOffset(offset=-7.0, scale=100.0, dtype="f8", astype="f8"),
+        serializer=TransformCodec(max_error_rel=0.1),
+        compressors=None,
+    )
+    array[...] = values
+    assert np.abs(array[...] - values).max() <= 0.1 * np.ptp(values) + 0.005
 
 
 def test_xarray_writes_and_reads_lazily(tmp_path: Path) -> None:

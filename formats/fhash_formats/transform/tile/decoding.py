@@ -37,7 +37,13 @@ from fhash_formats.transform.tile.sections import (
     zero_levels,
 )
 from fhash_formats.transform.tile.settings import TileSettings
-from fhash_formats.transform.values.elementwise import cast, clip_shifted, clipped, corrected
+from fhash_formats.transform.values.elementwise import (
+    at_origin,
+    cast,
+    clip_shifted,
+    clipped,
+    corrected,
+)
 from fhash_formats.transform.values.quantise import OFFSET_UNIT, dequantise
 
 __all__ = [
@@ -47,6 +53,7 @@ __all__ = [
     "decode_tile_table",
     "linear_values",
     "predicted_values",
+    "table_about_origin",
     "transform_for",
     "within_range",
 ]
@@ -113,23 +120,38 @@ def decode_tile_table(
 ) -> Values:
     """The table (t, z, y, x) of a tile: its values before head, residual and rounding.
 
-    They are finite, of the working type of the settings (float64 without). Where the tile is not
+    They are finite, of `TileSettings.table_dtype` (float64 without settings). Where the tile is not
     coded by transform, they are its values; `center` stands for those that are not finite.
     Arguments and errors are those of `decode_tile`.
     """
-    stream = parse_stream(data)
-    if stream.settings is not None:
-        settings = unpack_settings(stream.settings)
+    table, origin = table_about_origin(data, shape, dtype, settings, lod)
+    return table.astype(np.float64) + origin if origin else table
+
+
+def table_about_origin(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None,
+    lod: int = 0,
+) -> tuple[Values, int]:
+    """The table of a tile less the origin of its settings, in their working type; and the origin.
+
+    Arguments and errors are those of `decode_tile_table`.
+    """
+    stream, settings = _parsed(data, settings)
+    kind = np.dtype(dtype) if settings is None else _coded_type(settings, np.dtype(dtype))
     if settings is None or not stream.coded or stream.predicted:
-        values = _decode(data, shape, dtype, settings, lod)[0]
+        values = _decode_stream(stream, shape, kind, settings, lod)[0]
         working = np.dtype(np.float64) if settings is None else settings.dtype
         with np.errstate(over="ignore"):
             values = values.astype(working)
         values[~np.isfinite(values)] = 0.0 if settings is None else settings.center
-        return values
+        return values, 0 if settings is None else settings.origin
     assert stream.body is not None
-    _check_numbers(settings, np.dtype(dtype))
-    return _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
+    _check_numbers(settings, kind)
+    table = _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
+    return table, settings.origin
 
 
 def _decode(
@@ -139,10 +161,38 @@ def _decode(
     settings: TileSettings | None,
     lod: int,
 ) -> Decoded:
+    stream, settings = _parsed(data, settings)
     kind = np.dtype(dtype)
+    if settings is None or not settings.origin:
+        return _decode_stream(stream, shape, kind, settings, lod)
+    values, mask = _decode_stream(stream, shape, _coded_type(settings, kind), settings, lod)
+    return at_origin(values, settings.origin, kind), mask
+
+
+def _parsed(
+    data: bytes | memoryview, settings: TileSettings | None
+) -> tuple[TileStream, TileSettings | None]:
+    """The parts of a stream, and its settings: its own, or those that all tiles share."""
     stream = parse_stream(data)
-    if stream.settings is not None:
-        settings = unpack_settings(stream.settings)
+    return stream, settings if stream.settings is None else unpack_settings(stream.settings)
+
+
+def _coded_type(settings: TileSettings, kind: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of what is coded of an array; raises DamagedFileError for one without an origin."""
+    try:
+        return settings.differences_of(kind)
+    except InputError as error:
+        raise DamagedFileError(f"the settings of a coded tile do not fit: {error}") from error
+
+
+def _decode_stream(
+    stream: TileStream,
+    shape: Shape,
+    kind: np.dtype[Any],
+    settings: TileSettings | None,
+    lod: int,
+) -> Decoded:
+    """The values of a stream less the origin of its settings, and which are occupied."""
     if stream.flags & EXACT:
         return _decode_exact(stream, shape, kind, lod)
     if settings is None and not (stream.labelled and not stream.masked):
@@ -203,9 +253,9 @@ def _decode_predicted(
     _check_digest(stream, zlib.crc32(little_endian(integers)), None)
     values = predicted_values(integers, settings.predictor, settings)
     if lod:
-        return cast(values[_every(lod)], kind), None
+        return within_range(cast(values[_every(lod)], kind), settings), None
     mask = None if stream.mask is None else _unpack_mask(stream.mask, values, settings)
-    return cast(values, kind), mask
+    return within_range(cast(values, kind), settings), mask
 
 
 def _decode_transformed(

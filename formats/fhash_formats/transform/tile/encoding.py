@@ -6,7 +6,7 @@ values by the same operations in the same order as a decoder, so it knows what e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,9 @@ from fhash_formats.transform.tile.sections import (
 )
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import (
+    about_origin,
     all_finite,
+    at_origin,
     cast,
     corrected,
     free_values,
@@ -114,12 +116,26 @@ def encode_tile(
     """Code the values of a tile.
 
     Args:
-        values: the tile (t, z, y, x), of any real type.
+        values: the tile (t, z, y, x), of any real type, with the origin of the settings.
         settings: transform, step, range and so on.
         coding: options of the encoder.
         in_coreset: the values that count, of the same shape; None for all. Values that are not
             finite never count.
+
+    Raises InputError for values that have no differences from the origin.
     """
+    if settings.origin:
+        assert settings.differences_of(values.dtype) == np.int64
+        coded = _encode(about_origin(values, settings.origin), settings, coding, in_coreset)
+        decoded = at_origin(coded.decoded, settings.origin, values.dtype)
+        return replace(coded, decoded=decoded)
+    return _encode(values, settings, coding, in_coreset)
+
+
+def _encode(
+    values: Values, settings: TileSettings, coding: Coding, in_coreset: Mask | None
+) -> CodedTile:
+    """The coded values of a tile less the origin of its settings."""
     task = _task(values, settings, coding, in_coreset)
     if not task.values.size or (task.counted is not None and not task.counted.any()):
         return _empty_tile(task)
@@ -137,7 +153,11 @@ def encode_tile(
 
 
 def exact_tile(
-    values: Values, settings: TileSettings | None = None, occupied: Mask | None = None
+    values: Values,
+    settings: TileSettings | None = None,
+    occupied: Mask | None = None,
+    *,
+    origin: int = 0,
 ) -> CodedTile:
     """A tile stored without loss: its bytes, those of equal weight together, deflated.
 
@@ -146,7 +166,11 @@ def exact_tile(
         settings: settings to put into the stream; None for none.
         occupied: the mask, for a stream with one. Values outside of it become NaN, or 0 for
             integers.
+        origin: integer that is subtracted from the values, where they have not lost it yet.
     """
+    if origin:
+        coded = exact_tile(about_origin(values, origin), settings, occupied)
+        return replace(coded, decoded=at_origin(coded.decoded, origin, values.dtype))
     if occupied is not None:
         blank = values.dtype.type(np.nan if values.dtype.kind == "f" else 0)
         values = np.where(occupied, values, blank)
@@ -274,7 +298,7 @@ def _predicted_tile(task: _Task, predictor: Predictor, error: float) -> CodedTil
         return task.exact()
     data, integers = encode_predicted(integers, task.counted, predictor)
     linear = predicted_values(integers, predictor, task.settings)
-    decoded = cast(linear, task.values.dtype)
+    decoded = within_range(cast(linear, task.values.dtype), task.settings)
     if not within(task.values, decoded, error, task.counted):
         return task.exact()
     mask = task.mask_section(linear)

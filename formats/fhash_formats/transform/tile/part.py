@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.tile.decoding import decode_tile_table, within_range
+from fhash_formats.transform.tile.decoding import table_about_origin, within_range
 from fhash_formats.transform.tile.sections import Shape, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
-from fhash_formats.transform.values.elementwise import corrected
+from fhash_formats.transform.values.elementwise import at_origin, corrected
 
 __all__ = ["corrected_part", "uncorrected"]
 
@@ -35,7 +35,8 @@ def uncorrected(
 ) -> Values | None:
     """The values of a tile before its head, where nothing but `corrected_part` is left to do.
 
-    None for other tiles, and where the part is a large one.
+    They are less the origin of the settings. None for other tiles, and where the part is a large
+    one.
 
     Raises DamagedFileError for bytes that no encoder writes.
     """
@@ -48,7 +49,7 @@ def uncorrected(
     more = (stream.settings, stream.missing, stream.residual)
     if not stream.coded or stream.predicted or stream.masked or any(x is not None for x in more):
         return None
-    return decode_tile_table(data, shape, dtype, settings)
+    return table_about_origin(data, shape, dtype, settings)[0]
 
 
 def corrected_part(
@@ -67,7 +68,10 @@ def corrected_part(
         slice(along.start - wide.start, along.stop - wide.start)
         for along, wide in zip(part, widened, strict=True)
     )
-    return within_range(corrected(base[inner], None, 0.0, np.dtype(dtype)), settings)
+    kind = np.dtype(dtype)
+    coded = settings.differences_of(kind)
+    values = within_range(corrected(base[inner], None, 0.0, coded), settings)
+    return at_origin(values, settings.origin, kind) if settings.origin else values
 
 
 def _widened(part: Part, shape: tuple[int, ...], settings: TileSettings) -> Part:

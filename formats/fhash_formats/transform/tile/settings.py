@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.number_types import is_wide_integer, is_within
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.entropy.coder import CODERS
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
@@ -37,9 +38,12 @@ _KEYS = _REQUIRED | {
     "predictor",
     "coder",
     "residual_coder",
+    "origin",
     *_SWITCHES,
 }
 """All keys of settings."""
+_LARGEST = sys.float_info.max
+"""Largest magnitude of a number; whole numbers of JSON may be larger."""
 _LISTS = "range is [low, high] and offsets are three whole numbers, six with trellis"
 """Message for a range or offsets that are no lists."""
 
@@ -73,6 +77,8 @@ class TileSettings:
         trellis: whether coefficients are quantised by two quantisers in turn (entropy/trellis.py).
             Integers are then in steps, of which each quantiser has every other one. Needs a coder
             other than "contexts".
+        origin: integer that is subtracted from the values before anything else, for arrays of
+            64-bit integers alone; `center`, `low` and `high` are then those of the differences.
     """
 
     transform: TransformSpec
@@ -92,6 +98,7 @@ class TileSettings:
     coder: str = CODERS[0]
     residual_coder: str = CODERS[0]
     trellis: bool = False
+    origin: int = 0
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -119,6 +126,8 @@ class TileSettings:
             raise InputError(f"trellis needs a coder other than {CODERS[0]}")
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
+        if type(self.origin) is not int or not -(1 << 63) <= self.origin < 1 << 64:
+            raise InputError(f"origin is {self.origin!r:.40}; a 64-bit integer is needed")
         if self.many_labels and not self.labels:
             raise InputError("many_labels needs labels")
 
@@ -126,6 +135,22 @@ class TileSettings:
     def dtype(self) -> np.dtype[Any]:
         """The type of the arithmetic."""
         return np.dtype(np.float64 if self.double else np.float32)
+
+    @property
+    def table_dtype(self) -> np.dtype[Any]:
+        """The type of the table of a tile: that of the arithmetic, or float64 with an origin."""
+        return np.dtype(np.float64) if self.origin else self.dtype
+
+    def differences_of(self, dtype: np.dtype[Any]) -> np.dtype[Any]:
+        """The type of what is coded of an array: int64 with an origin, else that of the array.
+
+        Raises InputError for an array whose type has no such origin.
+        """
+        if not self.origin:
+            return dtype
+        if not (is_wide_integer(dtype) and is_within(self.origin, dtype)):
+            raise InputError(f"an array of {dtype} has no values about the origin {self.origin}")
+        return np.dtype(np.int64)
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -141,6 +166,7 @@ class TileSettings:
             "coder-signs": "signs" in (self.coder, self.residual_coder),
             "coder-linear": "linear" in (self.coder, self.residual_coder),
             "trellis": self.trellis,
+            "origin": self.origin != 0,
         }
         return tuple(name for name, is_used in used.items() if is_used)
 
@@ -175,6 +201,8 @@ class TileSettings:
                 result[name] = getattr(self, name)
         if self.trellis:
             result["trellis"] = True
+        if self.origin:
+            result["origin"] = self.origin
         return result
 
     @classmethod
@@ -205,6 +233,7 @@ class TileSettings:
             **switches,
             coder=values.get("coder", CODERS[0]),
             residual_coder=values.get("residual_coder", CODERS[0]),
+            origin=values.get("origin", 0),
             quantum=values.get("quantum", 0.0),
             head=_unpack_head(values.get("head")),
             mask=None if mask is None else MaskLevels.from_dict(mask),
@@ -214,7 +243,7 @@ class TileSettings:
 
 def _check_finite(name: str, value: Any) -> None:
     """Raises InputError unless a setting is a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
         raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
 
 

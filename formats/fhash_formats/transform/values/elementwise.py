@@ -16,10 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
+from fhash_formats.errors import InputError
 from fhash_formats.support.number_types import is_wide_integer
 
 __all__ = [
+    "about_origin",
     "all_finite",
+    "at_origin",
     "cast",
     "clip_shifted",
     "clipped",
@@ -33,6 +36,8 @@ __all__ = [
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int32]
+
+_INT64 = np.iinfo(np.int64)
 
 PIECE = 1 << 14
 """Values that a portable pass works on at once."""
@@ -229,18 +234,53 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
         return np.clip(values, kind(low), kind(high), out=values)
 
 
+def about_origin(values: Values, origin: int) -> Values:
+    """The differences int64 of 64-bit integers from an origin, or float64 ones of floats.
+
+    Raises InputError beyond int64.
+    """
+    if values.dtype.kind == "f":
+        rounded = float(origin)
+        return (values.astype(np.float64) - rounded) + (int(rounded) - origin)
+    for end in (values.min(), values.max()) if values.size else ():
+        if not _INT64.min <= int(end) - origin <= _INT64.max:
+            raise InputError(
+                f"the value {end} is too far from the origin {origin} of the settings: the "
+                "difference must be an int64"
+            )
+    differences = values.view(np.uint64) - np.uint64(origin % (1 << 64))
+    return differences.view(np.int64)
+
+
+def at_origin(differences: Values, origin: int, dtype: np.dtype[Any]) -> Values:
+    """The 64-bit integers whose differences from an origin are given, clipped to their type."""
+    limits = np.iinfo(dtype)
+    low, high = max(limits.min - origin, _INT64.min), min(limits.max - origin, _INT64.max)
+    sums = np.clip(differences, low, high).view(np.uint64) + np.uint64(origin % (1 << 64))
+    return sums.view(dtype)
+
+
 def clipped(values: Values, low: float, high: float) -> Values:
     """Values clipped to [low, high] in their own type, in place; NaN and signs of zeros stay.
 
-    `low` and `high` are first rounded to the type of the values, as by `cast`.
+    `low` and `high` are first rounded to the type of the values, as by `cast`; an int is exact in
+    an integer type.
     """
-    ends = cast(np.array([low, high]), values.dtype)
+    ends = [_end(end, values.dtype) for end in (low, high)]
     flat = values.reshape(-1) if values.flags.c_contiguous else values
     for part in (flat[piece] for piece in pieces(flat.shape[0])):
         # Comparisons say which values change: numpy's clip may change the sign of a zero.
         np.copyto(part, ends[0], where=part < ends[0])
         np.copyto(part, ends[1], where=part > ends[1])
     return values
+
+
+def _end(end: float, dtype: np.dtype[Any]) -> Any:
+    """An end of a range in a type."""
+    if isinstance(end, int) and dtype.kind != "f":
+        limits = np.iinfo(dtype)
+        return dtype.type(min(max(end, limits.min), limits.max))
+    return cast(np.array([float(end)]), dtype)[0]
 
 
 def free_values(

@@ -55,6 +55,9 @@ def test_defaults_are_left_out_of_json() -> None:
         ({"coder": 1}, "coder is 1"),
         ({"residual_coder": "no"}, "residual_coder is 'no'; known: contexts, signs, linear"),
         ({"trellis": True, "offsets": (0,) * 6}, "trellis needs a coder"),
+        ({"origin": 1.0}, "origin is 1.0; a 64-bit integer"),
+        ({"origin": 1 << 64}, "a 64-bit integer is needed"),
+        ({"high": 10**400}, "high is 1000"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str) -> None:
