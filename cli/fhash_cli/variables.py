@@ -113,7 +113,7 @@ def _names(
         raise InputError(f"{path} has no variable that can be encoded; see: fhash info {path}")
     others = [entry.name for entry in listed if entry.name not in names]
     if others and not quiet:
-        say(f"--var all leaves out {', '.join(others)}; fhash info {path} says why")
+        say(f"--var all makes no variables of {', '.join(others)}; fhash info {path} says why")
     return [entry.name for entry in listed if entry.name in names]
 
 

@@ -51,7 +51,10 @@ def test_all_takes_what_can_be_encoded_as_it_is(fhash: Fhash, data: Path, tmp_pa
     words = ["encode", data, "-o", path, "--effort", 1]
     result = fhash(*words, "--var", "all", "--max-error", "u=0.1,v=0.2")
     assert result.exit_code == 0
-    assert f"--var all leaves out members, numbers; fhash info {data} says why" in result.stderr
+    assert (
+        f"--var all makes no variables of members, numbers; fhash info {data} says why"
+        in result.stderr
+    )
     rows = [line.split() for line in result.stdout.splitlines() if line[:1] in ("u", "v")]
     assert [row[0] for row in rows] == ["variable", "u", "v"]
     info = json.loads(fhash("info", path, "--json").stdout)
