@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
 import pytest
 
 if TYPE_CHECKING:
@@ -19,6 +20,12 @@ sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 # The tests' models are tiny: a second thread costs more than it brings, above all where several
 # test runs share a machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A loaded machine is no failure.
+hypothesis.settings.register_profile(
+    "no clock", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("no clock")
 
 # A shell starts a background job with Ctrl-C ignored, and nohup starts one with SIGHUP ignored;
 # some tests send both signals.

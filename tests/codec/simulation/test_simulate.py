@@ -43,7 +43,7 @@ def tables(draw: st.DrawFn) -> dict[str, Any]:
     return table
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     effects=st.lists(tables(), max_size=4),
     shape=st.tuples(*[st.integers(1, 7)] * 3),

@@ -28,7 +28,7 @@ from fhash_formats.readers.common.flat import FlatArray
     block=st.sampled_from([1, 64, 10**6]),
     run=st.sampled_from([1, 10**6]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_part_of_a_flat_array_is_that_part(
     tmp_path_factory: pytest.TempPathFactory,
     shape: list[int],

@@ -36,7 +36,7 @@ def test_there_and_back(
     assert np.abs(again - values).max() < (5e-5 if dtype is np.float32 else 2e-12)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     shape=st.tuples(*(st.integers(1, 23),) * 4),
     kinds=st.tuples(*(st.sampled_from(KINDS),) * 4),
