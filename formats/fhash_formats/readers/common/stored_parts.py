@@ -615,7 +615,7 @@ def labelled_parts(source: str, array: Any) -> tuple[StoredParts | None, dict[in
 def _warn_of_sources(source: str, layers: Mapping[str, Mapping[Any, Any]]) -> None:
     """Warn of arrays behind a graph of dask that are not stored whole."""
     for key, layer in layers.items():
-        data = dict(layer).get(key) if key.startswith("original-") else None
+        data: Any = dict(layer).get(key) if key.startswith("original-") else None
         while hasattr(data, "array"):
             data = data.array
         array: Any = getattr(data, "_array", None)
