@@ -41,6 +41,7 @@ def append(
             _require_same(series, volume)
         with continued(path, keep) as growing:
             kept = growing.steps
+            growing.note(series.not_stored, series.shape[0])
             times = _times(series, growing)
             _add(series, growing, times, progress)
             series.check()

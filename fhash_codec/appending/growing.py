@@ -18,9 +18,10 @@ from fhash_formats.container import StoredArray, coordinate_features, describe_c
 from fhash_formats.container.apart import TABLE
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
+from fhash_formats.container.header import NOT_STORED
 from fhash_formats.container.named import Names
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
 
 __all__ = ["GrowingFile"]
 
@@ -160,6 +161,28 @@ class GrowingFile:
         known = self._coords["t"]
         values = np.array(self._times, dtype=np.float64)
         return Coordinate(name=known.name, values=values, attributes=known.attributes)
+
+    def note(self, never: NotStored | None, count: int) -> None:
+        """Keep in the header what nobody wrote of the next `count` steps, and of those before."""
+        variable = dict(self._header["variable"])
+        before = variable.pop(NOT_STORED, None)
+        told = [] if before is None else [(before, 0, self.steps)]
+        told += [] if never is None else [(never.to_dict(), self.steps, count)]
+        if told:
+            share = sum(each["share"] * steps for each, _, steps in told) / (self.steps + count)
+            spans = [
+                [min(first + low, first + steps), min(first + high, first + steps)]
+                for each, first, steps in told
+                for low, high in each["steps"]
+                if low < steps
+            ]
+            # of a file that keeps fewer steps than it told of, the share is a bound
+            share = min(share, sum(high - low for low, high in spans) / (self.steps + count))
+            fills = {each.get("fill") for each, _, _ in told}
+            variable[NOT_STORED] = {"share": round(share, 6), "steps": spans[:MAX_SPANS]}
+            if len(fills) == 1 and None not in fills:
+                variable[NOT_STORED]["fill"] = fills.pop()
+        self._header["variable"] = variable
 
     def _full_header(self, described: Mapping[str, Any]) -> dict[str, Any]:
         """The header of the file as it is now. described: the positions that it tells."""

@@ -25,6 +25,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_formats.container import SOURCE, Container, ContainerWriter, coordinate_features
 from fhash_formats.container.apart import TABLE
+from fhash_formats.container.header import NOT_STORED
 from fhash_formats.container.record import Record
 from fhash_formats.container.source import damage_named
 from fhash_formats.container.table_parts import TableParts
@@ -47,6 +48,8 @@ OWN = ("coordinates", "domain", "quality", "required_features", SOURCE, PART)
 """Keys of a part's header that differ from part to part."""
 OWN_MODEL = ("levels", "parameters", "gains")
 """Keys of its model that do."""
+OWN_VARIABLE = ("fill", NOT_STORED)
+"""Keys of its variable that do: of values that some steps alone have."""
 
 
 def merge(
@@ -148,6 +151,11 @@ class _Piece:
         time = self.container.coordinate("time")
         return {
             **{name: value for name, value in header.items() if name not in OWN},
+            "variable": {
+                name: value
+                for name, value in header["variable"].items()
+                if name not in OWN_VARIABLE
+            },
             "model": model,
             "gains": header["model"]["gains"][:-1],
             "frame": header["domain"]["shape"][1:],
@@ -303,6 +311,7 @@ class _Whole:
         progress("merging", 0, 1, "")
         table.write(writer)
         progress("merging", 1, 1, "")
+        header["variable"] = self._variable()
         if SOURCE in first.container.header[PART]:
             header[SOURCE] = first.container.header[PART][SOURCE]
         header["required_features"] = table.features + coordinate_features(described["coordinates"])
@@ -316,6 +325,17 @@ class _Whole:
         # They are in the lean form already.
         header["model"]["gains"] = gains
         return header, quality
+
+    def _variable(self) -> dict[str, Any]:
+        """The entry of the variable of the whole."""
+        headers = [part.container.header for part in self._parts]
+        variable = dict(headers[0]["variable"])
+        told = {name: variable.pop(name, None) for name in OWN_VARIABLE}
+        told["fill"] = next(
+            (h["variable"]["fill"] for h in headers if "fill" in h["variable"]), None
+        )
+        told[NOT_STORED] = headers[0][PART].get(NOT_STORED)
+        return variable | {name: value for name, value in told.items() if value is not None}
 
     def _coords(self) -> dict[str, Coordinate]:
         """The positions of the whole."""

@@ -41,6 +41,7 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import SOURCE, ContainerWriter, coordinate_features
+from fhash_formats.container.header import NOT_STORED
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series, StepsSeries
@@ -306,4 +307,5 @@ class _Job:
         whole = describe_source(self.series, self.plan.value_range, self.plan.config)
         for name, array in source_parts(self.series, self.series.coords, {})[1].items():
             writer.add_whole(f"{WHOLE}{name}", array)
-        return {SOURCE: whole[SOURCE]} if SOURCE in whole else {}
+        kept = {SOURCE: whole.get(SOURCE), NOT_STORED: whole["variable"].get(NOT_STORED)}
+        return {key: value for key, value in kept.items() if value is not None}

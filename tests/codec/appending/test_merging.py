@@ -6,11 +6,13 @@ import os
 from copy import deepcopy
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
+from fhash_codec.appending.append import append
 from fhash_codec.appending.merging import merge
 from fhash_codec.appending.parts import Part, encode_part
 from fhash_formats import open_series
@@ -205,3 +207,27 @@ def test_what_belongs_to_the_variable_in_its_source_is_that_of_the_whole(tmp_pat
         with fhash_codec.open(tmp_path / "run.fhz") as volume:
             assert {"long"} <= {one.name for one in volume.metadata.variables}
             assert volume.metadata.digest is None
+
+
+@pytest.mark.filterwarnings("default::fhash_formats.errors.FhashWarning")
+def test_parts_of_a_series_that_was_not_stored_whole(tmp_path: Path) -> None:
+    source = tmp_path / "a.h5"
+    with h5py.File(source, "w") as file:
+        made = file.create_dataset("u", (6, 4, 5, 6), "f4", chunks=(1, 4, 5, 6))
+        for step in (0, 1, 2, 4, 5):
+            made[step] = np.arange(120).reshape(4, 5, 6) + step + 1
+    config = EncodeConfig(max_error=0.1, effort=1, tile="1x4x5x6", timings=False)
+    whole = tmp_path / "whole.fhz"
+    fhash_codec.encode(source, whole, config)
+    merge(parts_of(source, tmp_path, config), tmp_path / "merged.fhz")
+    assert (tmp_path / "merged.fhz").read_bytes() == whole.read_bytes()
+    with fhash_codec.open(tmp_path / "merged.fhz") as volume:
+        told = volume.info["variable"]["not_stored"]
+    assert told == {"share": round(1 / 6, 6), "steps": [[3, 4]], "fill": 0}
+    grown = tmp_path / "grown.fhz"
+    with open_series(source, steps=slice(0, 2)) as series:
+        fhash_codec.encode(series, grown, config)
+    with open_series(source, steps=slice(2, None)) as series:
+        append(series, grown)
+    with fhash_codec.open(grown) as volume:
+        assert volume.info["variable"]["not_stored"] == told
