@@ -144,10 +144,10 @@ def paper(
     """Train the input encodings of the F-Hash paper's evaluation side by side.
 
     Without DATA: the scenes flame, bubble and shell, which resemble the paper's data sets. Each
-    encoding is trained by each protocol: published as the paper does, equal with the same samples,
-    steps and network, best with the fastest engine and number of steps of each. An interrupted
-    bench goes on where it was. The tables are those of the paper, its own figures beside ours,
-    marked as quoted.
+    encoding is trained by each protocol: published as the paper does, released as the authors'
+    code does (F-Hash alone), equal with the same samples, steps and network, best with the fastest
+    engine and number of steps of each. An interrupted bench goes on where it was. The tables are
+    those of the paper, its own figures beside ours, marked as quoted.
     """
     if parameters:
         emit(*_parameters(), as_json)
