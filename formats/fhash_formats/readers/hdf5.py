@@ -5,11 +5,13 @@ NetCDF files are HDF5 too, but have rules of their own (netcdf.py).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fhash_formats.readers.common import openpmd, step_groups
 from fhash_formats.readers.common.cf_packing import SCALING, Packing
@@ -40,8 +42,16 @@ from fhash_formats.readers.common.positions import Column, beside
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.stored_parts import Hdf5Sources, not_stored
+from fhash_formats.readers.common.surroundings import (
+    MAX_ARRAYS,
+    Stored,
+    Wanted,
+    metadata_of,
+    warn_left_out,
+)
 from fhash_formats.readers.common.times import counts_steps, written_times
 from fhash_formats.readers.common.variables import (
+    MIN_DIMENSIONS,
     Variable,
     choose,
     parent,
@@ -49,7 +59,7 @@ from fhash_formats.readers.common.variables import (
     series_like,
 )
 from fhash_formats.series import AXIS_NAMES, Coordinate
-from fhash_formats.source_metadata import shown_name
+from fhash_formats.source_metadata import SourceMetadata, shown_name
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -223,7 +233,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         parts = [
             behind.parts(member.name, member.handle) for member in variable.members or (variable,)
         ]
-    return FileSeries(
+    series = FileSeries(
         source=source,
         name=plain_name(shown_name(variable.name, names)),
         shape=layout.shape,
@@ -243,6 +253,94 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         beside=_beside(path, variable, behind.files),
         packing=packed,
         not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+    )
+    if not variable.members and not variable.field:
+        series.metadata = partial(_metadata, found, variable, layout, series, packed)
+    return series
+
+
+def _metadata(
+    found: Hdf5File,
+    variable: Variable,
+    layout: Layout,
+    series: FileSeries,
+    packed: Packing | None,
+) -> SourceMetadata | None:
+    """The datasets beside a variable; None where there are none but those of its positions.
+
+    Dimensions without a name have that of the axis, and beside the variable one of their own.
+    """
+    taken = {each.name for each in series.coords.values()}
+    axes = iter(layout.axes)
+    names = [
+        each.name or f"dim_{place}" if place in layout.picked else series.coords[next(axes)].name
+        for place, each in enumerate(layout.dimensions)
+    ]
+    stored = {variable.name: _stored(variable.handle, variable.name, names)}
+    positions = more = 0
+    for path, dataset in found.tree.items():
+        name = path.rpartition("/")[2]
+        if path == variable.name or dataset.shape is None or dataset.ndim >= MIN_DIMENSIONS:
+            continue  # what has so many dimensions can be encoded itself
+        is_position = name in taken and dataset.shape in ((), *((n,) for n in layout.shape))
+        positions += is_position
+        if len(stored) > MAX_ARRAYS:
+            more += 1
+        elif not (dataset.is_scale and _valueless(dataset)):
+            stored[path] = _stored(dataset, path, [name] * dataset.ndim if is_position else None)
+    if len(stored) == 1 + positions:
+        return None
+    in_group = {path.removeprefix(f"{parent(variable.name)}/"): path for path in stored}
+    flat = {path: short.replace("/", "_") for short, path in in_group.items()}
+    if len(set(flat.values())) < len(flat):
+        flat = {path: path.replace("/", "_") for path in stored}
+    if more:
+        warn_left_out(
+            f"{found.source}: not everything beside {variable.name} is kept",
+            {f"{more} datasets": f"more than {MAX_ARRAYS}"},
+        )
+    wanted = Wanted(source=found.source, name=flat[variable.name], path=found.path)
+    with refusing(f"{found.source} cannot be read as HDF5"):
+        return metadata_of(
+            flat[variable.name],
+            {flat[path]: each for path, each in stored.items()},
+            json_attributes(found.file.attrs),
+            layout,
+            found.request,
+            wanted,
+            packed,
+            series.coords["t"],
+        )
+
+
+def _stored(dataset: Any, path: str, names: Sequence[str] | None) -> Stored:
+    """A dataset as the file has it. names: of its dimensions; None for those it states."""
+    import h5py
+
+    text = h5py.check_string_dtype(dataset.dtype) is not None and dataset.dtype.kind == "O"
+
+    def read(places: tuple[slice | int, ...]) -> Any:
+        values = np.asarray(dataset[places])
+        if not text:
+            return values
+        texts = [text_of(each) for each in values.reshape(-1)]
+        return np.array(texts, dtype=object).reshape(values.shape)
+
+    if names is None:
+        own = path.replace("/", "_")
+        names = [
+            _dimension(each, length, None).name or f"{own}_dim_{place}"
+            for place, (each, length) in enumerate(
+                zip(dataset.dims if dataset.shape else (), dataset.shape, strict=True)
+            )
+        ]
+    return Stored(
+        dimensions=tuple(names),
+        shape=tuple(dataset.shape),
+        # references and lists of any length are objects, too
+        dtype=dataset.dtype if text or dataset.dtype.kind != "O" else np.dtype("V8"),
+        attributes=json_attributes(dataset.attrs),
+        read=read,
     )
 
 

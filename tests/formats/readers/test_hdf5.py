@@ -20,7 +20,7 @@ from stored_series import (
 )
 
 from fhash_formats import list_variables, open_series
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 
 
 @pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", ">f8", "f2", "u1", ">u2", "i4", ">i8", "u8"])
@@ -399,3 +399,35 @@ def test_times_that_are_written_as_dates_are_counted(tmp_path: Path) -> None:
     with open_series(tmp_path / "a.h5") as series:
         assert series.coords["t"].values.tolist() == [0, 6, 24, 48]
         assert series.coords["t"].attributes["units"] == "hours since 2020-01-01"
+
+
+def test_datasets_beside_a_variable_are_kept_and_the_others_named(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["code"] = "Athena"
+        file["rho"] = file["other"] = np.ones((5, 8, 10, 12), "f4")
+        file["time"], file["x"] = np.arange(5.0) / 2, np.linspace(0, 1, 12)
+    with open_series(path, var="rho") as series:
+        assert series.metadata is None  # positions, and a field of its own
+    with h5py.File(path, "a") as file:
+        file["params/gamma"], file["params/name"] = 1.4, "Stoß 7"
+        file["names"], file["x_faces"] = np.array([b"ab", b"c"]), np.linspace(0, 1, 13)
+        file["large"], file["flag"] = np.zeros(3000), True
+        file["link"] = np.array([file["rho"].ref], h5py.ref_dtype)
+    with open_series(path, var="rho") as series:
+        told = r"beside rho is kept: flag \(values of type bool\), large .*, link \("
+        with pytest.warns(FhashWarning, match=told):
+            metadata = series.metadata
+    assert metadata is not None
+    assert metadata.attributes == {"code": "Athena"}
+    assert metadata.dimensions == {"time": "t", "z": "z", "y": "y", "x": "x"}
+    found = {each.name: each.values.tolist() for each in metadata.variables}
+    assert found == {
+        "time": (np.arange(5.0) / 2).tolist(),
+        "x": np.linspace(0, 1, 12).tolist(),
+        "names": [b"ab", b"c"],
+        "params_gamma": 1.4,
+        "params_name": "Stoß 7",
+        "x_faces": np.linspace(0, 1, 13).tolist(),
+    }
+    assert [each.dimensions for each in metadata.variables if each.name == "x"] == [("x",)]

@@ -41,6 +41,7 @@ from fhash_formats.support.plain_json import UnknownValueError
 from fhash_formats.support.typed_values import stored_type, typed_attribute
 
 __all__ = [
+    "MAX_ARRAYS",
     "Stored",
     "Wanted",
     "digest_of",
