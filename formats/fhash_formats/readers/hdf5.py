@@ -47,6 +47,7 @@ from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
     metadata_of,
+    named_dimensions,
     warn_left_out,
 )
 from fhash_formats.readers.common.times import counts_steps, written_times
@@ -271,11 +272,7 @@ def _metadata(
     Dimensions without a name have that of the axis, and beside the variable one of their own.
     """
     taken = {each.name for each in series.coords.values()}
-    axes = iter(layout.axes)
-    names = [
-        each.name or f"dim_{place}" if place in layout.picked else series.coords[next(axes)].name
-        for place, each in enumerate(layout.dimensions)
-    ]
+    names = named_dimensions(layout, series.coords)
     stored = {variable.name: _stored(variable.handle, variable.name, names)}
     positions = more = 0
     for path, dataset in found.tree.items():

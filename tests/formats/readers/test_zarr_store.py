@@ -400,3 +400,23 @@ def test_members_are_selected_by_label(tmp_path: Path) -> None:
     with open_series(path, select={"member": 1, "lev": "850."}) as series:
         assert series.coords["z"].values.tolist() == [850]
         np.testing.assert_array_equal(series.read(2)[0], VALUES[2, 1] * 2)
+
+
+def test_arrays_beside_one_whose_dimensions_have_no_names_are_kept(tmp_path: Path) -> None:
+    group = zarr.open_group(tmp_path / "run.zarr", mode="w")
+    group.create_array("rho", data=np.ones((5, 8, 10, 12), "f4"))
+    group.create_array("time", data=np.arange(1.0, 6.0))
+    with open_series(tmp_path / "run.zarr", var="rho") as series:
+        assert series.metadata is None
+    group.create_array("gamma", data=np.array(1.4))
+    group.create_array("edges", data=np.arange(1.0, 14.0))
+    group.create_array("large", data=np.ones(9000))
+    with (
+        open_series(tmp_path / "run.zarr", var="rho") as series,
+        pytest.warns(FhashWarning, match="beside rho is kept: large"),
+    ):
+        metadata = series.metadata
+    assert metadata is not None
+    found = {each.name: each.dimensions for each in metadata.variables}
+    assert found == {"time": ("time",), "gamma": (), "edges": ("edges_dim_0",)}
+    assert list(metadata.dimensions) == ["time", "z", "y", "x"]

@@ -47,6 +47,7 @@ __all__ = [
     "digest_of",
     "kept_dimensions",
     "metadata_of",
+    "named_dimensions",
     "surroundings",
     "warn_left_out",
 ]
@@ -135,6 +136,15 @@ def kept_dimensions(
         else:
             kept[each] = NO_AXIS if place in layout.picked else next(axes)
     return kept, picked
+
+
+def named_dimensions(layout: Layout, coords: Mapping[str, Coordinate]) -> list[str]:
+    """A name for each dimension of an array; one without a name has that of its axis."""
+    axes = iter(layout.axes)
+    return [
+        each.name or f"dim_{place}" if place in layout.picked else coords[next(axes)].name
+        for place, each in enumerate(layout.dimensions)
+    ]
 
 
 def surroundings(

@@ -6,6 +6,7 @@ import base64
 import binascii
 import struct
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,9 @@ from fhash_formats.readers.common.surroundings import (
     Stored,
     Wanted,
     metadata_of,
+    named_dimensions,
 )
+from fhash_formats.readers.common.variables import MIN_DIMENSIONS
 from fhash_formats.series import Coordinate
 from fhash_formats.source_metadata import SourceMetadata
 from fhash_formats.support.attributes import PLUMBING
@@ -58,7 +61,9 @@ def zarr_metadata(
     packed: Packing | None,
     without: Collection[str],
 ) -> Callable[[], SourceMetadata | None]:
-    """A function that reads what belongs to an array; None where its dimensions have no names.
+    """A function that reads what belongs to an array.
+
+    It gives None where dimensions have no names, and nothing but positions lies beside the array.
 
     root: of the hierarchy. path: of the array in it. arrays, groups: all of them, and the
     attributes of groups. The other arguments are those of `netcdf_metadata`.
@@ -68,13 +73,25 @@ def zarr_metadata(
         source = str(root)
         group, _, name = path.rpartition("/")
         with refusing(f"{source} cannot be read as zarr"):
+            if not name:
+                return None
             variables = {
                 each.rpartition("/")[2]: stored
                 for place in dict.fromkeys(["", group])  # those of the nearest place count
                 for each, stored in _stored_in(arrays, place)
             }
-            if not name or name not in variables:
-                return None
+            if None in dimension_names(arrays[path]):
+                taken = {each.name.rpartition("/")[2] for each in coords.values()}
+                if not any(
+                    each not in (name, *taken) and len(stored.shape) < MIN_DIMENSIONS
+                    for each, stored in variables.items()
+                ):
+                    return None
+                own = tuple(named_dimensions(layout, coords))
+                variables[name] = replace(variables[name], dimensions=own)
+                for each in taken & variables.keys():  # positions have their own dimension
+                    if variables[each].shape in [(length,) for length in layout.shape]:
+                        variables[each] = replace(variables[each], dimensions=(each,))
             wanted = Wanted(
                 source=source,
                 name=name,
@@ -91,14 +108,16 @@ def zarr_metadata(
 
 
 def _stored_in(arrays: Mapping[str, zarr.Array[Any]], group: str) -> Sequence[tuple[str, Stored]]:
-    """The arrays of a group whose dimensions all have names."""
+    """The arrays of a group; a dimension without a name has one of its own."""
     found = []
     for path, array in arrays.items():
-        names = dimension_names(array)
-        if path.rpartition("/")[0] != group or any(name is None for name in names):
+        place, _, own = path.rpartition("/")
+        if place != group:
             continue
         stored = Stored(
-            dimensions=tuple(str(name) for name in names),
+            dimensions=tuple(
+                name or f"{own}_dim_{number}" for number, name in enumerate(dimension_names(array))
+            ),
             shape=array.shape,
             dtype=np.dtype(array.dtype),
             attributes=_attributes(array),
