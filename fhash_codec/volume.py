@@ -162,6 +162,11 @@ class Volume(Card, ArrayLike):
 
         return self._completed(decode, region, self._missing_at(t, region), outside)
 
+    @property
+    def source_dtype(self) -> np.dtype[Any]:
+        """Number type of the source, as a series has it."""
+        return self.value_type.source
+
     def read_steps(
         self, steps: range, region: Spans | None = None, *, outside: str = "nan"
     ) -> npt.NDArray[Any]:

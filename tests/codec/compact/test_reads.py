@@ -14,15 +14,18 @@ from fhash_codec.compact.tiles import blocks
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
+from fhash_formats.series import ArraySeries, StepsSeries
 
 SHAPE = (6, 10, 12, 14)
 
 
-class CountedSeries(ArraySeries):
-    """A series in memory that counts how often its frames are read."""
+class CountedSeries(StepsSeries):
+    """A series that is read by frames, as a file is, and counts how often."""
 
     reads = 0
+
+    def __init__(self, values: np.ndarray) -> None:
+        super().__init__(ArraySeries(values), range(len(values)))
 
     def read(self, step: int) -> np.ndarray:
         self.reads += 1
