@@ -24,7 +24,6 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Place
-from fhash_formats.container.reader import CACHE_BYTES
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
 from fhash_formats.transform.values.elementwise import about_origin
@@ -164,7 +163,9 @@ class DecodedFrames:
         layer = min(volume.chunks[0], volume.shape[0])
         room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
         parts = -(-room // LAYER_BYTES)
-        self._layer, self._together = layer, 1 if 2 * room <= CACHE_BYTES else -(-layer // parts)
+        self._layer, self._together = layer, -(-layer // parts)
+        if 2 * room <= volume.container.cache_bytes:
+            self._together = 1
 
     def read(self, step: int) -> npt.NDArray[Any]:
         """The frame (z, y, x) of a step."""

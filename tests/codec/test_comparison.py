@@ -46,7 +46,6 @@ def test_layers_beyond_the_cache_are_decoded_together(
     with fhash_codec.open(path) as volume:
         frames = [volume.values(step) if dtype == "i8" else volume.read(step) for step in range(4)]
     frame = frames[0].size * volume.float_dtype.itemsize
-    monkeypatch.setattr(comparison, "CACHE_BYTES", 1)
     monkeypatch.setattr(comparison, "LAYER_BYTES", steps_held * frame)
     monkeypatch.setattr(StoredArray, "_decode", watched)
     with fhash_codec.open(path) as volume:

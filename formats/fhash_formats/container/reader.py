@@ -232,6 +232,11 @@ class Container:
                 array.verify(count)
         return len(self.arrays)
 
+    @property
+    def cache_bytes(self) -> int:
+        """Most bytes of decoded chunks that are kept."""
+        return self._cache.limit
+
     def take_decoded(self, name: str, chunks: Mapping[Any, npt.NDArray[Any]]) -> None:
         """Take full chunks of an array into the cache, as whoever coded them knows they decode.
 

@@ -50,6 +50,10 @@ class Mark(NamedTuple):
     arrays: frozenset[str]
 
 
+PREVIEW_CACHE_BYTES = 128 << 20
+"""Bytes of decoded chunks that a preview keeps: it is read once, beside what was coded."""
+
+
 class ContainerWriter:
     """A container for writing; a context manager.
 
@@ -318,9 +322,8 @@ class ContainerWriter:
     def _open(self, tail: bytes) -> Container:
         self._file.flush()
         try:
-            return Container(
-                self.path, PreviewSource(FileSource(self._temporary), self._position, tail)
-            )
+            source = PreviewSource(FileSource(self._temporary), self._position, tail)
+            return Container(self.path, source, cache_bytes=PREVIEW_CACHE_BYTES)
         except DamagedFileError as error:
             raise InputError(f"the container would not be readable: {error}") from error
 
