@@ -194,6 +194,9 @@ class Trial:
         # do not grow, or do not belong together.
         if code == 2 and self.mutation.sealed and name in ("render", "append", "merge"):
             return None
+        # A flipped byte that decodes is of a golden of integers that pictures cannot show.
+        if code == 2 and name == "render" and "pictures are of float64" in lines[0]:
+            return None
         return None if code == 4 else f"exit code {code}: {lines[0][:300]}"
 
     def _is_golden(self) -> bool:

@@ -72,6 +72,7 @@ def plan_picture(
     """
     _check(scene)
     step = _step_of(volume, scene)
+    units = Units.of(volume)
     grid = Grid.of(volume.coords, scene.scale)
     function = _function(volume, scene, grid, histogram)
     _warn_of_unseen_surfaces(volume, scene)
@@ -81,7 +82,6 @@ def plan_picture(
     lod, why_lod = _level(volume, scene, rays)
     shadows, occlusion = secondary_light(scene, grid)
     lamp = lamp_of(rays, scene.effects.shading, shadows)
-    units = Units.of(volume)
     error = coding_noise(volume) / 2 * units.factor
     noise = 2 * error * grid.vertex_spacing / grid.series_spacing
     task = _task(scene, rays, function, units, lamp, lod, noise)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.colour.opacity import about
 from fhash_codec.volume import Volume
+from fhash_formats.errors import InputError
 
 __all__ = ["Units"]
 
@@ -37,8 +38,15 @@ class Units:
 
         float32 values are marched as they are, unless they are so much larger than their range that
         the values between them would be coarse.
+
+        Raises InputError for 64-bit integers that float64, of which pictures are, has all in one.
         """
         low, high = volume.value_range.low, volume.value_range.high
+        if isinstance(low, int) and low < high and high - low < 2 * math.ulp(max(-low, high)):
+            raise InputError(
+                f"pictures are of float64, which cannot tell values from {low} to {high} apart;"
+                " encode their differences from one of them to draw them"
+            )
         if low == high:
             low, high = about(low)
         extent = high / 2 - low / 2

@@ -12,6 +12,7 @@ import pytest
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering.task.units import LARGE_OFFSET, Units
 from fhash_codec.volume import Volume
+from fhash_formats.errors import InputError
 
 
 def volume(low: float, high: float, dtype: str) -> Volume:
@@ -36,3 +37,11 @@ def test_converted_values_have_a_size_near_one(low: float, high: float) -> None:
     ends = units.to([low, high])
     assert np.isfinite(ends).all()
     assert np.abs(ends).max() <= 1
+
+
+def test_integers_that_are_one_float_cannot_be_drawn() -> None:
+    top = 2**64 - 1
+    with pytest.raises(InputError, match=f"cannot tell values from {top - 998} to {top} apart"):
+        Units.of(volume(top - 998, top, "float64"))
+    assert Units.of(volume(2**60, 2**60 + 998, "float64")).factor == 2.0**-10
+    assert Units.of(volume(top, top, "float64")).factor > 0
