@@ -33,7 +33,7 @@ TORCH_FILES = re.compile(
     r"|bench/paper/encodings/.+\.py"
 )
 """Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""
-SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")
+SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy", "asyncio")
 
 
 def modules(package: str) -> list[Path]:

@@ -250,7 +250,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         )
         | layout.attributes(),
         chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
-        close=file.close,
+        close=partial(_close, file, variable),
         beside=_beside(path, variable, behind.files),
         packing=packed,
         not_stored=not_stored(parts, layout, joined=bool(variable.members)),
@@ -339,6 +339,14 @@ def _stored(dataset: Any, path: str, names: Sequence[str] | None) -> Stored:
         attributes=json_attributes(dataset.attrs),
         read=read,
     )
+
+
+def _close(file: Any, variable: Variable) -> None:
+    """Close a file, and those that its links lead to, which stay open with their datasets."""
+    handles = [member.handle for member in variable.members or (variable,) if member.handle]
+    for each in {handle.file.filename: handle.file for handle in handles}.values():
+        each.close()
+    file.close()
 
 
 def _beside(path: Path, variable: Variable, files: Iterable[Path]) -> list[Path]:

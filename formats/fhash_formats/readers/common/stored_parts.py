@@ -6,7 +6,6 @@ they are read. Here they are found from the listing of chunks alone; no value is
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import itertools
 import operator
@@ -671,6 +670,8 @@ async def _stored_chunks(array: zarr.Array[Any], counts: tuple[int, ...]) -> set
 
 async def _exist(array: zarr.Array[Any], indices: Sequence[tuple[int, ...]]) -> list[bool]:
     """Whether the store has each of some chunks."""
+    import asyncio
+
     found: list[bool] = []
     for first in range(0, len(indices), PROBES_AT_ONCE):
         keys = map(array.metadata.encode_chunk_key, indices[first : first + PROBES_AT_ONCE])
@@ -682,6 +683,8 @@ async def _inside_shards(
     array: zarr.Array[Any], shards: Iterable[Sequence[int]]
 ) -> list[tuple[int, ...]] | None:
     """Index of each chunk that some shards hold; None where an index is coded in another way."""
+    import asyncio
+
     from zarr.abc.store import RangeByteRequest, SuffixByteRequest
     from zarr.core.buffer import default_buffer_prototype
 
