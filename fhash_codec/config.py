@@ -310,7 +310,7 @@ class EncodeConfig:
         names = [field.name for field in dataclasses.fields(cls)]
         for name in values:
             if name not in names:
-                raise InputError(f"unknown setting '{name}'; {suggestion(name, names)}")
+                raise InputError(f"unknown setting {name!r}; {suggestion(name, names)}")
         arguments: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in values.items()

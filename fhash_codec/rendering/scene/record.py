@@ -85,7 +85,7 @@ class Record:
         for name in values:
             if name not in names:
                 raise InputError(
-                    f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; "
+                    f"unknown setting {str(name)[:60]!r} of {cls.__name__.lower()}; "
                     f"{suggestion(str(name), names)}"
                 )
         for setting in settings:

@@ -88,6 +88,7 @@ def test_defaults_are_left_out() -> None:
         ),
         ({"count": 1, "lens": {"length": 0}}, r"^lens\.length is 0; allowed: 1 to 1000"),
         ({"count": 1, "bulr": True}, "unknown setting 'bulr' of shot; did you mean 'blur'"),
+        ({"count": 1, "\n": True}, r"unknown setting '\\n' of shot"),
         ([], "shot is .*; a table of settings is needed"),
     ],
 )
