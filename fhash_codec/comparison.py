@@ -163,9 +163,8 @@ class DecodedFrames:
         layer = min(volume.chunks[0], volume.shape[0])
         room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
         parts = -(-room // LAYER_BYTES)
-        self._layer, self._together = layer, -(-layer // parts)
-        if 2 * room <= volume.container.cache_bytes:
-            self._together = 1
+        is_kept = 2 * room <= volume.container.cache_bytes
+        self._layer, self._together = layer, 1 if is_kept else -(-layer // parts)
 
     def read(self, step: int) -> npt.NDArray[Any]:
         """The frame (z, y, x) of a step."""
