@@ -49,7 +49,7 @@ wheels: .venv/.stamp
 
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
 # the choice is made before any other requirement counts. Python compiles what it imports; pip would compile all of torch,
-# scipy and vtk, which takes minutes.
+# and vtk, which takes minutes.
 .venv/.stamp: pyproject.toml constraints.txt | .venv/bin/python
 	$(INSTALL) torch
 	$(INSTALL) -e '.[dev]'

@@ -44,7 +44,6 @@ LIBRARIES = (
     "h5netcdf",
     "PIL.PngImagePlugin",
     "PIL.GifImagePlugin",
-    "scipy.special",
 )
 """Libraries that are imported before the first fork, if they are installed."""
 

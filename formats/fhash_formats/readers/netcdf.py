@@ -1,8 +1,9 @@
 """NetCDF files, read by the CF conventions with xarray.
 
 Packing is undone, fill values become NaN, times stay numbers. NetCDF4 is HDF5 and goes through
-h5netcdf, NetCDF3 ("classic") through scipy. Times are not decoded: float64 hours near 347921 tell
-steps apart, calendars of models need no date, and `units` and `calendar` stay beside the numbers.
+h5netcdf, NetCDF3 ("classic") through common/netcdf3.py. Times are not decoded: float64 hours near
+347921 tell steps apart, calendars of models need no date, and `units` and `calendar` stay beside
+the numbers.
 `valid_range` never hides a value, since it is wrong in files that are in use.
 """
 
@@ -31,7 +32,6 @@ from fhash_formats.readers.common.layout import (
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.netcdf_store import (
     CLASSIC,
-    CLASSIC_64,
     check_filters,
     close_groups,
     declared,
@@ -71,7 +71,7 @@ def matches(head: bytes, path: Path) -> bool:
 
     It claims so by its suffix, by `_NCProperties` or by CF `Conventions`.
     """
-    return head[:4] in (*CLASSIC, CLASSIC_64) or (
+    return head[:4] in CLASSIC or (
         is_hdf5(head) and (_says_netcdf(path) or path.suffix.lower() in SUFFIXES)
     )
 

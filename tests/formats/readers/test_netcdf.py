@@ -230,12 +230,6 @@ def test_classic_netcdf3(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_cdf5_says_how_to_convert(tmp_path: Path) -> None:
-    (tmp_path / "a.nc").write_bytes(b"CDF\x05" + bytes(100))
-    with pytest.raises(InputError, match=r"CDF-5.*nccopy -k nc4"):
-        open_series(tmp_path / "a.nc")
-
-
 @pytest.mark.parametrize("library", ["xarray", "h5netcdf"])
 def test_a_broken_install_ends_in_one_line_that_names_the_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str

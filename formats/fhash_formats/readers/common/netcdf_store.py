@@ -1,11 +1,10 @@
-"""Opening NetCDF files with xarray: NetCDF4 through h5netcdf, classic NetCDF3 through scipy.
+"""Opening NetCDF files with xarray: NetCDF4 through h5netcdf, classic NetCDF3 through netcdf3.py.
 
 Times are not decoded, and nothing is read before it is asked for.
 """
 
 from __future__ import annotations
 
-import gc
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,12 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, packing
-from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.failures import refusing
 from fhash_formats.readers.common.hdf5_tree import require_filters
 from fhash_formats.support.number_types import is_wide_integer
-from fhash_formats.support.plain_json import decoded_text
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,8 +37,8 @@ DEFAULT_FILLS = {
 }
 """NC_FILL_SHORT and so on of netcdf.h; bytes have none that counts."""
 
-CLASSIC = (b"CDF\x01", b"CDF\x02")
-CLASSIC_64 = b"CDF\x05"
+CLASSIC = (b"CDF\x01", b"CDF\x02", b"CDF\x05")
+"""First bytes of classic files."""
 
 
 def magic_of(path: Path) -> bytes:
@@ -69,11 +66,6 @@ def open_groups(
     raw: leave values packed. decoded: whether attributes that name variables are taken out, and
     these made coordinates; if not, everything is as it is stored.
     """
-    if head == CLASSIC_64:
-        raise InputError(
-            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
-            " nccopy -k nc4 IN OUT"
-        )
     import xarray as xr
 
     options: dict[str, Any] = {
@@ -87,67 +79,12 @@ def open_groups(
     if not decoded:
         options |= {"decode_coords": False, "concat_characters": False, "mask_and_scale": False}
     if head in CLASSIC:
-        return {"/": _open_classic(source, path, options)}
+        from fhash_formats.readers.common.netcdf3 import ClassicStore
+
+        with refusing(f"{source} cannot be read as classic NetCDF"):
+            return {"/": xr.open_dataset(ClassicStore(path), engine="store", **options)}
     # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
     return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
-
-
-def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dataset:
-    import xarray as xr
-
-    try:
-        dataset = xr.open_dataset(path, engine="scipy", **options)
-        return _read_again(path, dataset, options) if _is_misread(dataset) else dataset
-    except Exception as error:
-        message = condense(error)
-    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is
-    # dropped, and here nobody hears that
-    gc.collect()
-    raise InputError(
-        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert"
-        " it"
-    )
-
-
-def _is_misread(dataset: xr.Dataset) -> bool:
-    """Whether a classic file has names that are no ASCII, or texts that are no UTF-8."""
-    places: list[Any] = [dataset, *dataset.variables.values()]
-    texts = [text for each in places for text in (*each.attrs.values(), *each.encoding.values())]
-    return any(not str(name).isascii() for name in (*dataset.variables, *dataset.sizes)) or any(
-        isinstance(text, str) and "\ufffd" in text for text in texts
-    )
-
-
-def _read_again(path: Path, dataset: xr.Dataset, options: Mapping[str, Any]) -> xr.Dataset:
-    """The dataset of a classic file with all names and texts as UTF-8, else as Latin-1.
-
-    scipy takes names for Latin-1, and xarray drops the letters of texts that are no UTF-8.
-    """
-    import xarray as xr
-    from scipy.io import netcdf_file
-
-    dataset.close()
-    stored = xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False, chunks=None)
-    with netcdf_file(path) as file:
-        texts = {None: dict(file._attributes)} | {
-            name: dict(variable._attributes) for name, variable in file.variables.items()
-        }
-    for name, attributes in texts.items():
-        target = stored.attrs if name is None else stored.variables[name].attrs
-        target.update(
-            {key: decoded_text(v) for key, v in attributes.items() if isinstance(v, bytes)}
-        )
-    names = {name: decoded_text(str(name).encode("latin-1")) for name in texts if name is not None}
-    names |= {name: decoded_text(str(name).encode("latin-1")) for name in stored.sizes}
-    renamed = stored.rename({old: new for old, new in names.items() if old != new})
-    renamed.set_close(stored.close)
-    keys = ("decode_times", "decode_timedelta", "decode_coords", "mask_and_scale")
-    decoded: xr.Dataset = xr.decode_cf(
-        renamed,
-        concat_characters=options.get("concat_characters", True),
-        **{key: options[key] for key in keys},
-    )
-    return decoded
 
 
 def close_groups(groups: Mapping[str, xr.Dataset]) -> None:
@@ -182,8 +119,6 @@ def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, An
 
     xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
     """
-    import h5py
-
     stored = np.dtype(encoding.get("dtype", np.float32))
     if not is_wide_integer(stored):
         return None
@@ -198,10 +133,20 @@ def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, An
     def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
         if not np.isnan(values).any():
             return values
-        with h5py.File(path, "r") as file:
-            return packed.unpack(np.asarray(file[name][ranges]))
+        return packed.unpack(_stored(path, name, ranges))
 
     return exact
+
+
+def _stored(path: Path, name: str, ranges: tuple[slice, ...]) -> Values:
+    if magic_of(path) in CLASSIC:
+        from fhash_formats.readers.common.netcdf3 import read_header
+
+        return read_header(path).variables[name].read(ranges)
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][ranges])
 
 
 def check_filters(source: str, path: Path, name: str) -> None:
