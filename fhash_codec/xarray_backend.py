@@ -197,10 +197,11 @@ class Shown:
         """Whether every decoded value has a number of the packed type that is no fill value."""
         header = self._volume.container.header
         dtype = np.dtype(packing.get("dtype", self._volume.dtype))
-        scale, offset = (
-            float(np.asarray(packing.get(key, usual)).reshape(-1)[0])
-            for key, usual in (("scale_factor", 1), ("add_offset", 0))
-        )
+        numbers = {key: np.ravel(value) for key, value in packing.items() if key != "dtype"}
+        if any(each.dtype.kind not in "iuf" or not each.size for each in numbers.values()):
+            return False
+        scale = float(numbers.get("scale_factor", [1])[0])
+        offset = float(numbers.get("add_offset", [0])[0])
         ends = [float(end) for end in header["value_range"]]
         with np.errstate(all="ignore"):
             ends = sorted(float((np.float64(end) - offset) / scale) for end in ends)
@@ -211,7 +212,7 @@ class Shown:
             limits, (low, high) = np.iinfo(dtype), (round(low), round(high))
             if low < limits.min or high > limits.max:
                 return False
-        fills = [np.ravel(packing[key]) for key in FILLS if key in packing]
+        fills = [numbers[key] for key in FILLS if key in numbers]
         exact = header["quality"].get("max_abs_error") == 0
         return exact or not any(low <= fill <= high for fill in np.concatenate([[], *fills]))
 

@@ -341,8 +341,10 @@ def _histogram_of(volume: Volume) -> Histogram:
         frames = [volume.read(last // 2)]
     for frame in frames:
         finite = frame[np.isfinite(frame)]
-        scaled = finite if scale == 1 else finite * scale
-        counts += np.histogram(np.clip(scaled, edges[0], edges[-1]), edges)[0]
+        if scale != 1:  # beyond float64 where the values are not those of the range
+            with np.errstate(over="ignore"):
+                finite = finite.astype(np.float64) * scale
+        counts += np.histogram(np.clip(finite, edges[0], edges[-1]), edges)[0]
     return edges / scale, counts
 
 

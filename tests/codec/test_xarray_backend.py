@@ -270,6 +270,14 @@ def packed_part(number: int, **encoding: Any) -> xr.Dataset:
     return data
 
 
+def test_a_missing_value_that_is_a_text_is_no_packing(tmp_path: Path) -> None:
+    values = smooth(2, 4, 5, 6)
+    labelled = xr.DataArray(values, dims=tuple("tzyx"), name="u", attrs={"missing_value": "none"})
+    fhash_codec.encode(labelled, tmp_path / "a.fhz", EncodeConfig(max_error=0.01))
+    with xr.open_dataset(tmp_path / "a.fhz", engine="fhash") as found:
+        assert np.abs(found["u"].values - values).max() <= 0.01
+
+
 @pytest.mark.parametrize("way", ["files", "labelled", "fill"])
 def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: str) -> None:
     # a fill value between the values: one that is coded as it would be missing later

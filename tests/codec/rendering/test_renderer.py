@@ -12,6 +12,7 @@ from forked import ended_well, forked, needs_fork
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume, native
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import renderer as module
 from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
@@ -227,6 +228,15 @@ def test_values_at_the_ends_of_float64_have_a_picture(tmp_path: Path, factor: fl
         assert shown.histogram()[1].sum() == values.size
     assert np.isfinite(image.rgba).all()
     assert image.rgba[..., 3].max() > 0.1
+
+
+def test_values_beyond_the_range_of_a_header_are_counted_at_its_ends(volume: Volume) -> None:
+    shown = Renderer(volume)
+    narrow = ValueRange(1e-320, 2e-320)  # as in a file that was changed
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="raise", under="ignore"):
+        patch.setattr(volume, "value_range", narrow)
+        counts = shown.histogram()[1]
+    assert counts.sum() == counts[0] + counts[-1] > 0
 
 
 def test_counters_are_complete_and_known() -> None:
