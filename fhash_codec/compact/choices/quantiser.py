@@ -22,7 +22,6 @@ from fhash_formats.transform.tile.settings import TileSettings
 __all__ = [
     "allows_trellis",
     "choose_quantiser",
-    "coders_of",
     "is_smaller",
     "off_trellis",
     "on_trellis",
@@ -30,9 +29,6 @@ __all__ = [
     "step_after",
 ]
 
-LINEAR_EFFORT = 8
-"""Least effort that codes magnitudes by linear predictors: decoding takes almost
-four times as long as by contexts."""
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
 SHARE = 0.65
@@ -54,16 +50,6 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
     """
     exact = goal.error == 0 or goal.data_range <= 0
     return effort >= MIN_EFFORT and not exact and not settings.double
-
-
-def coders_of(effort: int) -> tuple[str, str]:
-    """Return the models of coefficients and residual, by the names of their settings.
-
-    Predicted signs cost time at coefficients other than 0 alone.
-    """
-    if effort >= LINEAR_EFFORT:
-        return "linear", "linear"
-    return "signs", "contexts"
 
 
 def choose_quantiser(
@@ -90,9 +76,8 @@ def choose_quantiser(
 
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
     """Return settings and coding with the trellis, at about the same error."""
-    coder = "signs" if settings.coder == "contexts" else settings.coder
     step = settings.step * SHARE
-    settings = replace(settings, trellis=True, coder=coder, step=step, offsets=TRELLIS_OFFSETS)
+    settings = replace(settings, trellis=True, step=step, offsets=TRELLIS_OFFSETS)
     return settings, replace(coding, weight=TRELLIS_WEIGHT)
 
 

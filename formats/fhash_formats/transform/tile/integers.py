@@ -51,9 +51,7 @@ def choose_integers(
     integers, scaled = quantise(coefficients, settings.step)
     if weight <= 0:
         return integers
-    return encode_integers(
-        integers, table, scaled=scaled, weight=weight, coder=settings.coder
-    ).integers
+    return encode_integers(integers, table, scaled=scaled, weight=weight).integers
 
 
 def code_coefficients(
@@ -64,24 +62,22 @@ def code_coefficients(
     The arguments are those of `choose_integers`. Without a trellis, 2 passes code the integers that
     were chosen once more.
     """
-    table, coder = band_table(settings.transform, coefficients.shape), settings.coder
+    table = band_table(settings.transform, coefficients.shape)
     if settings.trellis:
         path = choose_integers(coefficients, settings, weight, passes)
         if path is None:
             return None
-        return encode_integers(path, table, coder=coder, trellis=True).data, path
+        return encode_integers(path, table, trellis=True).data, path
     integers, scaled = quantise(coefficients, settings.step)
     largest = max(-int(integers.min()), int(integers.max()))
     if largest >= LARGEST:
         return None
-    coded = encode_integers(
-        integers, table, scaled=scaled if weight > 0 else None, weight=weight, coder=coder
-    )
+    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
     chosen = coded.integers
     if largest >= MAX_CHOSEN and weight > 0 and settings.double:
         large = np.abs(integers) >= MAX_CHOSEN
         nearest = np.rint(coefficients / settings.step).astype(np.int32)
         chosen = np.where(large, nearest, chosen)
     if (passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table, coder=coder)
+        coded = encode_integers(chosen, table)
     return coded.data, coded.integers

@@ -28,7 +28,6 @@ SETTINGS = TileSettings(
     low=0.0,
     high=1.0,
     offsets=OFFSETS,
-    coder="signs",
 )
 GOAL = Goal(psnr=40.0, data_range=1.0)
 

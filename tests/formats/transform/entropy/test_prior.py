@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from fhash_formats.transform.entropy import prior
-from fhash_formats.transform.entropy.coder import (
-    CODERS,
-    decode_block,
-    encode_block,
-    encode_integers,
-)
-from fhash_formats.transform.entropy.prior import blank_state, pack_prior
+from fhash_formats.transform.entropy.coder import decode_block, encode_block, encode_integers
+from fhash_formats.transform.entropy.prior import blank_state, pack_state, unpack_state
 from fhash_formats.transform.entropy.table import single_band
 
 SHAPE = (3, 3, 20, 30)
@@ -43,12 +36,10 @@ def test_the_prior_stays_as_it_is() -> None:
     )
 
 
-def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    state = blank_state()
+def test_a_packed_state_is_the_state() -> None:
+    state = prior.prior_state().copy()
     encode_integers(make(), single_band(SHAPE), state=state)
-    (tmp_path / "prior.bin").write_bytes(pack_prior(state))
-    monkeypatch.setattr(prior, "_FILE", tmp_path / "prior.bin")
-    again = prior.prior_state.__wrapped__()
+    again = unpack_state(pack_state(state, blank_state()), blank_state())
     assert (again.weights == state.weights).all()
     assert (again.simples[:, 0] == state.simples[:, 0]).all()
     assert again.slots[:, 2].max() == again.simples[:, 1].max() == prior.TRUST
@@ -57,45 +48,21 @@ def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     exact = logit(state.slots[seen, 0].clip(2, 65534))
     off = np.abs(logit(again.slots[seen, 0]) - exact)
     assert off[np.abs(exact) < 10].max() < 1 / 12
-    assert prior.prior_state.__wrapped__().slots.flags.writeable is False
 
 
-def test_packed_priors_of_the_linear_coders_are_their_state() -> None:
-    state = prior.prior_state("linear").copy()
-    encode_integers(make(), single_band(SHAPE), state=state, coder="linear")
-    again = blank_state("linear")
-    prior.unpack_signs(prior.pack_signs(state), again)
-    numbers = prior._unpack_numbers(prior.pack_linear(state))
-    assert (
-        again.weights[prior.BASE_WEIGHTS : prior.SIGN_END]
-        == state.weights[prior.BASE_WEIGHTS : prior.SIGN_END]
-    ).all()
-    assert (numbers == state.weights[prior.SIGN_END :]).all()
-    assert again.slots[prior.SLOTS :, 2].max() == prior.TRUST
-    seen = state.slots[prior.SLOTS :, 2] > 0
-    exact = logit(state.slots[prior.SLOTS :, 0][seen].clip(2, 65534))
-    off = np.abs(logit(again.slots[prior.SLOTS :, 0][seen]) - exact)
-    assert off[np.abs(exact) < 10].max() < 1 / 12
-
-
-@pytest.mark.parametrize("coder", ["signs", "linear"])
-def test_numbers_of_the_linear_coders_are_within_their_types(coder: str) -> None:
-    state = prior.prior_state(coder)
-    weights = state.weights[prior.BASE_WEIGHTS :]
-    assert len(weights) == len(blank_state(coder).weights) - prior.BASE_WEIGHTS
+def test_weights_of_the_prior_are_within_16_bits() -> None:
+    weights = prior.prior_state().weights
     assert weights.min() >= -32767
-    assert weights[: prior.SIGN_END - prior.BASE_WEIGHTS].max() <= 32767
-    assert weights.max() <= 131071
+    assert weights.max() <= 32767
 
 
-@pytest.mark.parametrize("coder", CODERS)
-def test_both_quantisers_begin_alike(coder: str) -> None:
-    plain, two = prior.prior_state(coder), prior.prior_state(coder, trellis=True)
-    assert len(plain.weights) == len(two.weights)
+def test_both_quantisers_begin_alike() -> None:
     contexts = sum(prior.SIZES) * prior.DECISIONS
-    for state in (plain, two):
+    for trellis in (False, True):
+        state = prior.prior_state(trellis)
         slots = state.slots[:contexts].reshape(-1, prior.DECISIONS, 4)
-        assert (slots[:, 14:] == slots[:, :2]).all() == (state is two)
+        assert (slots[:, 14:] == slots[:, :2]).all() == trellis
+        assert state.slots.flags.writeable is False
 
 
 def logit(p: NDArray[Any]) -> NDArray[np.float64]:
