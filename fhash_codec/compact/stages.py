@@ -33,9 +33,10 @@ from fhash_codec.compact.choices.transform import (
 )
 from fhash_codec.compact.tiles.access import Tiling, part_of
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.stage_clock import skip, stage, tell
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [

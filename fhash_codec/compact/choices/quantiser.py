@@ -15,8 +15,15 @@ from dataclasses import replace
 from fhash_codec.compact.choices.octave import octave_gain
 from fhash_codec.compact.choices.search import SLOPE, step_after_gain
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
+from fhash_formats.transform.tile.integers import (
+    OFFSETS,
+    SHARE,
+    TRELLIS_WEIGHT,
+    WEIGHT,
+    with_trellis,
+)
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
@@ -31,15 +38,6 @@ __all__ = [
 
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
-SHARE = 0.65
-"""Step on the trellis as a share of the plain quantiser's of about the same error and bytes."""
-TRELLIS_WEIGHT = 0.27
-"""Squared steps on the trellis that a bit is worth (0.25 to 0.3 are alike in experiments)."""
-TRELLIS_OFFSETS = (17, -10, -5, -3, -2, -1)
-"""Shift, in 1/128 step, of the magnitudes 1 to 4, odd ones from 5 on, and even ones from 6 on.
-
-It is the mean over coefficients of many series, which differ by 3 or less.
-"""
 
 
 def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
@@ -76,9 +74,7 @@ def choose_quantiser(
 
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
     """Return settings and coding with the trellis, at about the same error."""
-    step = settings.step * SHARE
-    settings = replace(settings, trellis=True, step=step, offsets=TRELLIS_OFFSETS)
-    return settings, replace(coding, weight=TRELLIS_WEIGHT)
+    return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)
 
 
 def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:

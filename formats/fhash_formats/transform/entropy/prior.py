@@ -116,7 +116,7 @@ def prior_state(trellis: bool = False) -> State:
 
 
 def pack_state(state: State, blank: State) -> bytes:
-    """What a learned state has beyond a blank one, deflated.
+    """The deflated bytes of what a learned state has beyond a blank one.
 
     These are, one after the other: the counts of the slots, at most TRUST, and their probabilities
     as logits in 8 bits; the low bytes of the differences of the weights, and the high bytes; the
