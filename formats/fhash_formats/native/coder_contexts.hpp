@@ -46,7 +46,7 @@ const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27, KINDS
                                        KINDS * 27, KINDS * 81, KINDS * 54, KINDS * 25};
 
 // Order of the state. Slots: by context, those of the decisions of a context together; then those
-// of the signs. Weights: sets by kind; from SECOND on by level; behind them those of coder_signs.hpp.
+// of the signs. Weights: sets by kind; from SECOND on by level; then those of coder_signs.hpp.
 // Simple estimates: of the escape code; from ROWS on of empty rows; from EMPTIES on of empty bands.
 const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET;
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;

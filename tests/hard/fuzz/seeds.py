@@ -114,8 +114,8 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
 
         labels = blank_label_state(), blank_label_state(wide=True)
         for state in (
-            prior_state(),
-            prior_state(trellis=True),
+            prior_state(False),
+            prior_state(True),
             mask_prior_state(),
             blank_state(),
             *labels,
