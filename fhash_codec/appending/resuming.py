@@ -12,9 +12,8 @@ from typing import Any
 from fhash_codec.appending.figures import Figures
 from fhash_codec.appending.growing import GrowingFile
 from fhash_codec.appending.layers import LayerCoder
-from fhash_codec.compact.choices.quantiser import TRELLIS_WEIGHT
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.tiles.coding import WEIGHT, Coding
+from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
@@ -25,6 +24,7 @@ from fhash_formats.container.source import damage_named
 from fhash_formats.container.variables import is_several
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
+from fhash_formats.transform.tile.integers import TRELLIS_WEIGHT, WEIGHT
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["bound_of_file", "continued"]

@@ -37,7 +37,7 @@ from fhash_codec.compact.stages import (
 )
 from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
@@ -46,6 +46,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Parts, Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 

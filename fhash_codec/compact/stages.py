@@ -20,7 +20,6 @@ from fhash_codec.compact.choices.predictor import choose_predictor
 from fhash_codec.compact.choices.quantiser import (
     allows_trellis,
     choose_quantiser,
-    coders_of,
     off_trellis,
 )
 from fhash_codec.compact.choices.search import step_after_gain
@@ -34,9 +33,10 @@ from fhash_codec.compact.choices.transform import (
 )
 from fhash_codec.compact.tiles.access import Tiling, part_of
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.stage_clock import skip, stage, tell
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
@@ -93,7 +93,6 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         step = goal.data_range * 0.05
     # From effort 2 on the centre is chosen once more, on the chosen tiles.
     plateau = plateau_center(sample, value_range) if task.config.effort == 1 else None
-    coder, residual_coder = coders_of(task.config.effort)
     settings = TileSettings(
         transform=usual_transform(sample.blocks.tile),
         step=1.0,
@@ -102,8 +101,6 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         high=value_range.high,
         offsets=OFFSETS,
         double=True,
-        coder=coder,
-        residual_coder=residual_coder,
     )
     return with_step(settings, step, goal)
 

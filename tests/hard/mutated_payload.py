@@ -304,14 +304,10 @@ def _restreamed(
             integers = decode_predicted(sections[first], shape, settings.predictor)
         else:
             table = band_table(settings.transform, shape)
-            integers = decode_integers(
-                sections[first], shape, table, coder=settings.coder, trellis=settings.trellis
-            )
+            integers = decode_integers(sections[first], shape, table, trellis=settings.trellis)
         digest = zlib.crc32(little_endian(integers))
         if flags & RESIDUAL:
-            residual = decode_integers(
-                sections[first + 1], shape, single_band(shape), coder=settings.residual_coder
-            )
+            residual = decode_integers(sections[first + 1], shape, single_band(shape))
             digest = zlib.crc32(little_endian(residual), digest)
         if parts.masked and settings.mask is not None and sections[-1]:
             sections[-1] = _mask_section(

@@ -15,14 +15,20 @@ from dataclasses import replace
 from fhash_codec.compact.choices.octave import octave_gain
 from fhash_codec.compact.choices.search import SLOPE, step_after_gain
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
+from fhash_formats.transform.tile.integers import (
+    OFFSETS,
+    SHARE,
+    TRELLIS_WEIGHT,
+    WEIGHT,
+    with_trellis,
+)
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
     "allows_trellis",
     "choose_quantiser",
-    "coders_of",
     "is_smaller",
     "off_trellis",
     "on_trellis",
@@ -30,20 +36,8 @@ __all__ = [
     "step_after",
 ]
 
-LINEAR_EFFORT = 8
-"""Least effort that codes magnitudes by linear predictors: decoding takes almost
-four times as long as by contexts."""
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
-SHARE = 0.65
-"""Step on the trellis as a share of the plain quantiser's of about the same error and bytes."""
-TRELLIS_WEIGHT = 0.27
-"""Squared steps on the trellis that a bit is worth (0.25 to 0.3 are alike in experiments)."""
-TRELLIS_OFFSETS = (17, -10, -5, -3, -2, -1)
-"""Shift, in 1/128 step, of the magnitudes 1 to 4, odd ones from 5 on, and even ones from 6 on.
-
-It is the mean over coefficients of many series, which differ by 3 or less.
-"""
 
 
 def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
@@ -54,16 +48,6 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
     """
     exact = goal.error == 0 or goal.data_range <= 0
     return effort >= MIN_EFFORT and not exact and not settings.double
-
-
-def coders_of(effort: int) -> tuple[str, str]:
-    """Return the models of coefficients and residual, by the names of their settings.
-
-    Predicted signs cost time at coefficients other than 0 alone.
-    """
-    if effort >= LINEAR_EFFORT:
-        return "linear", "linear"
-    return "signs", "contexts"
 
 
 def choose_quantiser(
@@ -90,10 +74,7 @@ def choose_quantiser(
 
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
     """Return settings and coding with the trellis, at about the same error."""
-    coder = "signs" if settings.coder == "contexts" else settings.coder
-    step = settings.step * SHARE
-    settings = replace(settings, trellis=True, coder=coder, step=step, offsets=TRELLIS_OFFSETS)
-    return settings, replace(coding, weight=TRELLIS_WEIGHT)
+    return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)
 
 
 def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:

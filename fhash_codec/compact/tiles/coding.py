@@ -14,13 +14,8 @@ from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.transform.tile import encoding
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
+from fhash_formats.transform.tile.integers import WEIGHT
 from fhash_formats.transform.tile.settings import TileSettings
-
-WEIGHT = 0.09
-"""Squared quantiser steps that a bit is worth (best between 0.07 and 0.11 in experiments)."""
-
-OFFSETS = (-5, -1, 0)
-"""Shift, in 1/128 step, of the decoded magnitudes 1, 2 and more after the optimisation."""
 
 MIN_STEP_SHARE = 2.0**-26
 """Smallest quantiser step as a share of the value range: integers beyond 2^30 cannot be coded."""

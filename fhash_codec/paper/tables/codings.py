@@ -26,7 +26,7 @@ from fhash_codec.compact.choices.transform import (
     usual_transform,
 )
 from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS, WEIGHT, Coding, Outcome, code
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, Outcome, code
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.tiles import (
@@ -37,6 +37,7 @@ from fhash_codec.paper.tables.tiles import (
     tile_shape,
 )
 from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
+from fhash_formats.transform.tile.integers import OFFSETS, WEIGHT
 from fhash_formats.transform.tile.settings import TileSettings
 
 MIN_IMPORTANCE = 1e-4

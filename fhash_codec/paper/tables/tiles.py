@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.tiles.coding import WEIGHT
 from fhash_codec.compact.tiles.tiling import even_tile
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.storage import mix_components
@@ -25,6 +24,7 @@ from fhash_formats.container.cache import ChunkCache
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
+from fhash_formats.transform.tile.integers import WEIGHT
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 

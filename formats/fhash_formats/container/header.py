@@ -34,8 +34,6 @@ KNOWN_FEATURES = frozenset(
         AXES_FEATURE,
         "clip",
         "coded-occupancy",
-        "coder-linear",
-        "coder-signs",
         "cross",
         "labels",
         "many-labels",

@@ -13,7 +13,7 @@
 
 namespace {
 
-const int CONTEXTS = 6, SIGN_CONTEXTS = 3;  // estimates of a magnitude, and of a sign
+const int CONTEXTS = 6, SIGN_CONTEXTS = 8;  // estimates of a magnitude, and of a sign
 const int LANES = 12, SET = padded(LANES);  // weights of a set: of the caller, and as kept here
 const int DECISIONS = 16;                   // slots of a context
 const int UNARY = 14;                       // magnitudes from this one on have an escape code
@@ -42,12 +42,13 @@ const int REFERENCE = 62;  // the vertex of a reference; the sum around it has w
 const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
 const int64_t ALL_CONTEXTS =
     int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS);
-const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
+const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27, KINDS * 108,
+                                       KINDS * 27, KINDS * 81, KINDS * 54, KINDS * 25};
 
 // Order of the state. Slots: by context, those of the decisions of a context together; then those
-// of the signs. Weights: sets by kind; from SECOND on by level; from SIGNS on those of the signs.
+// of the signs. Weights: sets by kind; from SECOND on by level; then those of coder_signs.hpp.
 // Simple estimates: of the escape code; from ROWS on of empty rows; from EMPTIES on of empty bands.
-const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * DECISIONS * SET;
+const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET;
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
 
 // The slots of zero flags, those of both classes of a context together: few lines of the cache hold
@@ -72,8 +73,6 @@ struct Flags {
 };
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
-// What predicts, in the order of CODERS in coder.py.
-enum Model { BY_CONTEXTS, BY_SIGNS, BY_LINEAR };
 
 // Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
 FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }

@@ -278,18 +278,6 @@ template <int N, int N_MAX> FHASH_INLINE bool stay_at_one(const Mixed<N_MAX>& no
     return _mm_movemask_epi8(_mm_cmpeq_epi8(moves, _mm_setzero_si128())) == 0xffff;
 }
 
-// Adapt the estimates alone to the bit that came after `mix`.
-template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
-    if (bit) learn_slots_bit<N>(now, 1, limit);
-    else learn_slots_bit<N>(now, 0, limit);
-}
-
-// The inputs of the mixer as numbers, two per estimate; those up to a multiple of eight are 0.
-template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
-    for (int v = 0; 4 * v < N_MAX; v++)
-        _mm_storeu_si128(reinterpret_cast<__m128i*>(to + 8 * v), now.inputs[v]);
-}
-
 // `learn` for a bit that is known where it is called.
 template <int N, bool PAIR, int RATE, int N_MAX>
 FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
@@ -332,17 +320,6 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, i
     return now.p = squashed(dot);
 }
 
-template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
-    const int target = bit ? 65535 : 0;
-    for (int i = 0; i < N; i++) {
-        Slot* s = now.slots[i];
-        const Pace& pace = tables.pace[s->count];
-        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
-        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
-        if (s->count < limit) s->count++;
-    }
-}
-
 template <int N, int N_MAX> FHASH_INLINE bool stay_at_one(const Mixed<N_MAX>& now, int limit) {
     for (int i = 0; i < N; i++) {
         const Slot& s = *now.slots[i];
@@ -353,10 +330,6 @@ template <int N, int N_MAX> FHASH_INLINE bool stay_at_one(const Mixed<N_MAX>& no
     return true;
 }
 
-template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
-    for (int i = 0; i < 2 * N_MAX; i++) to[i] = (int16_t)now.inputs[i];
-}
-
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     const int target = bit ? 65535 : 0, error = ((target - now.p) * RATE) >> 4;
@@ -365,7 +338,13 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
         now.first[i] = (int16_t)min(max(now.first[i] + step, -32767), 32767);
         if (PAIR) now.second[i] = (int16_t)min(max(now.second[i] + step, -32767), 32767);
     }
-    learn_slots<N>(now, bit, limit);
+    for (int i = 0; i < N; i++) {
+        Slot* s = now.slots[i];
+        const Pace& pace = tables.pace[s->count];
+        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
+        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
+        if (s->count < limit) s->count++;
+    }
 }
 
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>

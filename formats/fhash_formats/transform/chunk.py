@@ -1,8 +1,8 @@
 """One chunk of an array to bytes and back, with settings that are chosen for each chunk.
 
-The settings are chosen in closed form and by trials, and stand in the stream. Nothing is trained,
-and the choice depends only on sizes in bytes and on arithmetic in a stated order, so the same chunk
-gives the same bytes on every machine.
+The settings are chosen in closed form and by trials, as the effort asks for, and stand in the
+stream. Nothing is trained, and the choice depends only on sizes in bytes and on arithmetic in a
+stated order, so the same chunk gives the same bytes on every machine.
 """
 
 from __future__ import annotations
@@ -27,18 +27,29 @@ from fhash_formats.transform.tile.encoding import (
     exact_tile,
     labelled_tile,
 )
+from fhash_formats.transform.tile.integers import OFFSETS, TRELLIS_WEIGHT, WEIGHT, with_trellis
 from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import within
 
-__all__ = ["Quality", "decode_chunk", "encode_chunk", "supported", "tile_shape"]
+__all__ = [
+    "DEFAULT_EFFORT",
+    "Quality",
+    "check_effort",
+    "decode_chunk",
+    "encode_chunk",
+    "supported",
+    "tile_shape",
+]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
-_WEIGHT = 0.09
-"""Squared quantiser steps that a bit is worth; measured, the same for all data."""
+DEFAULT_EFFORT = 2
+"""Least effort that makes trials."""
+_MAX_EFFORT = 9
+"""Highest effort, as for containers."""
 _FIRST_RATIO = 2.5
 """Quantiser step under a bound, in units of half the quantum, with which transforms are tried."""
 _OTHER_RATIOS = (4.0, 1.6)
@@ -49,7 +60,8 @@ Small steps pay for loose bounds, large ones for tight bounds.
 _CLEARLY = 4
 """Ratio of a deflated chunk to its labels from which on nothing else is tried."""
 _MAX_WINDOW = 1 << 16
-"""Most values of the window on which transforms and ratios are tried."""
+"""Most values of the window on which settings are tried at effort 2; each further effort has four
+times as many."""
 _QUANTUM_SHARE = 1 - 1e-6
 """Quantum as a share of twice the largest error, so that rounding cannot break the bound."""
 _MAX_STEPS = 2.5e8
@@ -137,6 +149,7 @@ def encode_chunk(
     step: float | None = None,
     transform: TransformSpec | Mapping[str, Any] | None = None,
     fill: Any = 0,
+    effort: int = DEFAULT_EFFORT,
 ) -> bytes:
     """The stream of an array.
 
@@ -152,9 +165,12 @@ def encode_chunk(
         step: as in `Quality`.
         transform: transform along (t, z, y, x); None for the one that codes best in a trial.
         fill: the fill value of the store; None where it has none.
+        effort: 1 tries nothing; 2 to 9 try transforms, steps and two quantisers, on ever larger
+            parts of the array.
 
     Raises InputError.
     """
+    check_effort(effort)
     quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
     values = np.asarray(values)
     tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
@@ -162,7 +178,15 @@ def encode_chunk(
     )
     specs = candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
     fills = _fills(values, fill) if quality.max_error_rel is not None else []
-    return _encode(tile, quality, specs, fills).data if tile.size else b""
+    return _encode(tile, quality, specs, fills, effort).data if tile.size else b""
+
+
+def check_effort(effort: Any) -> None:
+    """Raises InputError for an effort that is no whole number from 1 to 9."""
+    if type(effort) is not int or not 1 <= effort <= _MAX_EFFORT:
+        raise InputError(
+            f"effort is {effort!r:.40}; a whole number from 1 to {_MAX_EFFORT} is needed"
+        )
 
 
 def _fills(values: Values, fill: Any) -> list[Any]:
@@ -237,7 +261,11 @@ class _Task:
 
 
 def _encode(
-    tile: Values, quality: Quality, specs: tuple[TransformSpec, ...], fills: Sequence[Any]
+    tile: Values,
+    quality: Quality,
+    specs: tuple[TransformSpec, ...],
+    fills: Sequence[Any],
+    effort: int,
 ) -> CodedTile:
     """The coded chunk, stored without loss where that takes no more bytes.
 
@@ -252,26 +280,31 @@ def _encode(
     labelled = labelled_tile(tile, many=has_regions(tile)) if task.lossless else None
     if labelled is not None and _CLEARLY * len(labelled.data) < len(exact_tile(tile).data):
         return labelled
-    others = [_transformed(task, specs), labelled]
+    others = [_transformed(task, specs, effort), labelled]
     tiles = [other for other in others if other is not None]
     if not any(2 * len(other.data) < tile.nbytes for other in tiles):
         tiles.insert(0, exact_tile(tile))
     return min(tiles, key=lambda coded: len(coded.data))
 
 
-def _transformed(task: _Task, specs: tuple[TransformSpec, ...]) -> CodedTile | None:
+def _transformed(task: _Task, specs: tuple[TransformSpec, ...], effort: int) -> CodedTile | None:
     """The chunk coded by transform; None where that cannot be."""
-    settings = _first_settings(task, specs[0])
-    if settings is None:
+    first = _first_settings(task, specs[0])
+    if first is None:
         return None
-    settings = _best_settings(task, settings, specs)
-    norms = transform_for(settings, tile_shape(task.tile.shape)).norms
-    gain = [float(norm.max()) for norm in norms]
-    if task.half_range / settings.step * gain[0] * gain[1] > _MAX_STEPS:
-        return None
-    return encode_tile(
-        task.tile, settings, Coding(weight=_WEIGHT, error=task.error, own_settings=True)
+    coding = Coding(
+        weight=WEIGHT, error=task.error, passes=1 if effort < 3 else 2, own_settings=True
     )
+    trial = _Trial(settings=first, coding=coding)
+    if effort > 1:
+        trial = _best_trial(task, trial, specs, _MAX_WINDOW << 2 * (effort - 2))
+    norms = transform_for(trial.settings, tile_shape(task.tile.shape)).norms
+    gain = [float(norm.max()) for norm in norms]
+    if task.half_range / trial.settings.step * gain[0] * gain[1] > _MAX_STEPS:
+        return None
+    if trial.coded is not None and trial.coded.decoded.shape == task.tile.shape:
+        return trial.coded
+    return trial.run(task.tile).coded
 
 
 def _task(tile: Values, quality: Quality, fills: Sequence[Any]) -> _Task | None:
@@ -371,6 +404,7 @@ def _first_settings(task: _Task, transform: TransformSpec) -> TileSettings | Non
         high=exact_number(task.high),
         origin=task.origin,
         clip=True,
+        offsets=OFFSETS,
         double=_double(task.tile.dtype, task.largest, 2 * task.half_range, first),
         quantum=0.0 if task.error is None else 2 * task.reach * _QUANTUM_SHARE,
     )
@@ -385,38 +419,55 @@ def _double(dtype: np.dtype[Any], largest: float, span: float, step: float) -> b
     )
 
 
-def _best_settings(
-    task: _Task, settings: TileSettings, specs: tuple[TransformSpec, ...]
-) -> TileSettings:
-    """The settings with the transform, then the step, with which a window takes the fewest bytes.
+@dataclass(frozen=True, kw_only=True)
+class _Trial:
+    """Settings and options of the encoder, and what they made of a window; None before."""
+
+    settings: TileSettings
+    coding: Coding
+    coded: CodedTile | None = None
+
+    def run(self, values: Values) -> _Trial:
+        """The trial on these values."""
+        return replace(self, coded=encode_tile(values, self.settings, self.coding))
+
+    @property
+    def size(self) -> int:
+        """Bytes of the coded window."""
+        return 0 if self.coded is None else len(self.coded.data)
+
+
+def _best_trial(task: _Task, first: _Trial, specs: tuple[TransformSpec, ...], most: int) -> _Trial:
+    """The trial of the transform, then the step, then the quantiser that takes the fewest bytes.
 
     The first of equals is taken.
+
+    first: with the settings before anything is tried.
+    most: values of the window on which they are tried.
     """
-    trials = [replace(settings, transform=spec) for spec in specs]
-    ratios = () if task.error is None else _OTHER_RATIOS
-    if len(trials) + len(ratios) == 1:
+    bounded = task.error is not None
+    trials = [replace(first, settings=replace(first.settings, transform=spec)) for spec in specs]
+    if len(trials) == 1 and not bounded:
         return trials[0]
-    window = _window(task.tile)
-    coding = Coding(weight=_WEIGHT, error=task.error)
-
-    def size(trial: TileSettings) -> int:
-        return len(encode_tile(window, trial, coding).data)
-
-    sizes = [size(trial) for trial in trials]
-    smallest = min(sizes)
-    best = transformed = trials[sizes.index(smallest)]
-    for ratio in ratios:
-        trial = replace(transformed, step=ratio * task.reach)
-        trial_size = size(trial)
-        if trial_size < smallest:
-            best, smallest = trial, trial_size
-    return best
+    window = _window(task.tile, most)
+    best = min((trial.run(window) for trial in trials), key=lambda trial: trial.size)
+    if not bounded:
+        return best
+    steps = [replace(best.settings, step=ratio * task.reach) for ratio in _OTHER_RATIOS]
+    others = [replace(best, settings=settings).run(window) for settings in steps]
+    best = min([best, *others], key=lambda trial: trial.size)
+    if best.settings.double:
+        return best  # steps so fine come near the finest one that the trellis has
+    other = _Trial(
+        settings=with_trellis(best.settings), coding=replace(best.coding, weight=TRELLIS_WEIGHT)
+    )
+    return min([best, other.run(window)], key=lambda trial: trial.size)
 
 
-def _window(tile: Values) -> Values:
-    """A block of at most `_MAX_WINDOW` values from the middle of a tile."""
+def _window(tile: Values, most: int) -> Values:
+    """A block of at most `most` values from the middle of a tile."""
     lengths = list(tile.shape)
-    while math.prod(lengths) > _MAX_WINDOW:
+    while math.prod(lengths) > most:
         longest = lengths.index(max(lengths))
         lengths[longest] = (lengths[longest] + 1) // 2
     middle = tuple(

@@ -19,7 +19,14 @@ from numcodecs.compat import ensure_bytes, ndarray_copy
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported
+from fhash_formats.transform.chunk import (
+    DEFAULT_EFFORT,
+    Quality,
+    check_effort,
+    decode_chunk,
+    encode_chunk,
+    supported,
+)
 
 __all__ = ["NumcodecsTransform"]
 
@@ -47,6 +54,7 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         step: as in `Quality`.
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             array best.
+        effort: as in `encode_chunk`: 1 is the fastest, 9 tries the most.
 
     Raises InputError.
     """
@@ -60,7 +68,10 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         max_error_rel: float | None = None,
         step: float | None = None,
         transform: TransformSpec | Mapping[str, Any] | None = None,
+        effort: int = DEFAULT_EFFORT,
     ) -> None:
+        check_effort(effort)
+        self.effort = effort
         self.quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
         self.transform = (
             TransformSpec.from_dict(transform) if isinstance(transform, Mapping) else transform
@@ -69,9 +80,11 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
     def get_config(self) -> dict[str, Any]:
         """The JSON values that `from_config` takes."""
         config: dict[str, Any] = {"id": self.codec_id, **self.quality.to_dict()}
-        return (
-            config if self.transform is None else {**config, "transform": self.transform.to_dict()}
-        )
+        if self.transform is not None:
+            config["transform"] = self.transform.to_dict()
+        if self.effort != DEFAULT_EFFORT:
+            config["effort"] = self.effort
+        return config
 
     def encode(self, buf: Any) -> bytes:
         """The bytes of an array. Raises InputError for bytes, which have no number type."""
@@ -86,7 +99,9 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
             + dtype.str[1:].encode("ascii")
             + struct.pack(f"<B{values.ndim}Q", axes, *values.shape)
         )
-        data = encode_chunk(values, **self.quality.to_dict(), transform=self.transform)
+        data = encode_chunk(
+            values, **self.quality.to_dict(), transform=self.transform, effort=self.effort
+        )
         return header + zlib.crc32(header).to_bytes(4, "little") + data
 
     def decode(self, buf: Any, out: Any = None) -> Any:

@@ -30,7 +30,15 @@ from fhash_formats.errors import InputError
 from fhash_formats.transform.apart import apart_message, without_names
 from fhash_formats.transform.array_axes import KEY, ArrayAxes, take_axes
 from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
+from fhash_formats.transform.chunk import (
+    DEFAULT_EFFORT,
+    Quality,
+    check_effort,
+    decode_chunk,
+    encode_chunk,
+    supported,
+    tile_shape,
+)
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -61,6 +69,7 @@ class TransformCodec(ArrayBytesCodec):
         step: as in `Quality`.
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             chunk best.
+        effort: as in `encode_chunk`: 1 is the fastest, 9 tries the most.
         settings: settings that all chunks share, as in containers. In the metadata they are a
             configuration with the key `center`.
         reading: whether the codec only decodes streams with their own settings, as in containers
@@ -80,6 +89,7 @@ class TransformCodec(ArrayBytesCodec):
     max_error_rel: float | None = None
     step: float | None = None
     transform: TransformSpec | Mapping[str, Any] | None = None
+    effort: int = DEFAULT_EFFORT
     settings: TileSettings | None = None
     reading: bool = False
     apart: Mapping[str, Any] | None = None
@@ -92,10 +102,13 @@ class TransformCodec(ArrayBytesCodec):
             TileSettings.from_dict(without_names(self.apart)[0])
         elif self.settings is None and not self.reading:
             Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
+            check_effort(self.effort)
             if isinstance(self.transform, Mapping):
                 object.__setattr__(self, "transform", TransformSpec.from_dict(self.transform))
-        elif (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4 or (
-            self.reading and self.settings
+        elif (
+            (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4
+            or self.effort != DEFAULT_EFFORT
+            or (self.reading and self.settings)
         ):
             raise InputError(
                 "settings that all chunks share, and reading, leave nothing else to be given"
@@ -117,7 +130,7 @@ class TransformCodec(ArrayBytesCodec):
             return cls(settings=TileSettings.from_dict(configuration), axes=axes)
         if not configuration:
             return cls(reading=True, axes=axes)
-        keys = ("max_error", "max_error_rel", "step", "transform")
+        keys = ("max_error", "max_error_rel", "step", "transform", "effort")
         unknown = [key for key in configuration if key not in keys]
         if unknown:
             raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(keys)}")
@@ -140,6 +153,8 @@ class TransformCodec(ArrayBytesCodec):
             configuration = {**quality.to_dict()}
             if isinstance(self.transform, TransformSpec):
                 configuration["transform"] = self.transform.to_dict()
+            if self.effort != DEFAULT_EFFORT:
+                configuration["effort"] = self.effort
         if self.axes is not None:
             configuration[KEY] = list(self.axes)
         return {"name": NAME, "configuration": configuration}
@@ -201,6 +216,7 @@ class TransformCodec(ArrayBytesCodec):
                 step=self.step,
                 transform=self.transform,
                 fill=chunk_spec.fill_value,
+                effort=self.effort,
             )
         else:
             tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(

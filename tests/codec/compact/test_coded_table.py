@@ -29,4 +29,4 @@ def test_the_header_describes_the_table(field: Field, timings: bool) -> None:
     assert header["head"] is None
     assert header["parameters"] == table.outcome.nonzero > 0
     assert all(("seconds" in gain) == timings for gain in header["gains"])
-    assert table.parts.features == ["transform", "mask", "coder-signs"]
+    assert table.parts.features == ["transform", "mask"]

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
 
@@ -33,9 +32,9 @@ def worst(values: npt.NDArray[Any], decoded: npt.NDArray[Any]) -> float:
     return max((abs(int(value) - int(other)) for value, other in pairs), default=0)
 
 
-def check(values: npt.NDArray[Any], error: float, **quality: float) -> bytes:
+def check(values: npt.NDArray[Any], error: float, **quality: Any) -> bytes:
     """The stream of an array, after its error, shape, type and missing values are checked."""
-    data = encode_chunk(values, **quality)  # type: ignore[arg-type]
+    data = encode_chunk(values, **quality)
     decoded = decode_chunk(data, values.shape, values.dtype)
     assert (decoded.shape, decoded.dtype) == (values.shape, values.dtype)
     finite = np.isfinite(values)
@@ -150,22 +149,16 @@ def test_a_given_transform_is_taken() -> None:
     assert data != encode_chunk(values, max_error=0.01)
 
 
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-@pytest.mark.parametrize("quality", [{"max_error": 0.02}, {"step": 0.1}, {"max_error_rel": 1e-6}])
-def test_both_engines_give_the_same_bytes(
-    quality: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chunks = [field((3, 6, 7), 1, "f4"), field((40,), 1, "f8"), field((5, 8), 50, "i2")]
-    chunks[0][1, 2, 3:] = np.nan
-    data = [encode_chunk(chunk, **quality) for chunk in chunks]  # type: ignore[arg-type]
-    values = [
-        decode_chunk(stream, chunk.shape, chunk.dtype)
-        for stream, chunk in zip(data, chunks, strict=True)
-    ]
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert [encode_chunk(chunk, **quality) for chunk in chunks] == data  # type: ignore[arg-type]
-    for stream, chunk, expected in zip(data, chunks, values, strict=True):
-        assert decode_chunk(stream, chunk.shape, chunk.dtype).tobytes() == expected.tobytes()
+def test_more_effort_takes_fewer_bytes() -> None:
+    values = field((4, 16, 32, 48), 1, "f4")
+    sizes = [len(check(values, 0.02, max_error=0.02, effort=effort)) for effort in (1, 2, 3)]
+    assert sizes[0] > sizes[1] > sizes[2]
+
+
+@pytest.mark.parametrize("effort", [0, 10, 1.5, True, "2", None])
+def test_unsuitable_efforts_are_refused(effort: Any) -> None:
+    with pytest.raises(InputError, match="a whole number from 1 to 9"):
+        encode_chunk(np.zeros(3), max_error=1, effort=effort)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ def test_it_is_found_by_its_name_and_configuration() -> None:
     transform = {"t": "none", "z": "none", "y": ["9/7", 1], "x": ["9/7", 1]}
     for config in (
         {"max_error": 0.5},
+        {"max_error": 0.5, "effort": 4},
         {"max_error_rel": 0.01},
         {"step": 2.0, "transform": transform},
     ):

@@ -77,7 +77,7 @@ def test_all_three_qualities_are_kept_in_the_metadata(tmp_path: Path) -> None:
     for n, codec in enumerate(
         (
             TransformCodec(max_error=0.5),
-            TransformCodec(max_error_rel=0.01),
+            TransformCodec(max_error_rel=0.01, effort=1),
             TransformCodec(step=0.1, transform=WAVES),
             TransformCodec(settings=SHARED),
         )
@@ -233,9 +233,12 @@ def test_unsuitable_configurations_are_refused() -> None:
         TransformCodec()
     with pytest.raises(InputError, match="nothing else"):
         TransformCodec(max_error=1, settings=SHARED)
+    with pytest.raises(InputError, match="nothing else"):
+        TransformCodec(effort=3, settings=SHARED)
     for configuration, said in (
         ({"max_eror": 1}, "max_eror"),
         ({"max_error": "a"}, "max_error"),
+        ({"max_error": 1, "effort": 10}, "effort is 10; a whole number from 1 to 9"),
         ({"center": 1}, "transform|missing"),
     ):
         with pytest.raises(InputError, match=said):

@@ -19,7 +19,7 @@ from fhash_formats.container import Container
 from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.coder import CODERS, encode_integers
+from fhash_formats.transform.entropy.coder import encode_integers
 from fhash_formats.transform.entropy.labels import blank_label_state, encode_labels
 from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
@@ -52,8 +52,6 @@ NAMES = (
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
 CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
-TRELLIS = 16
-"""Bit that says in an input of CODER that the integers are those of two quantisers."""
 WITH_SEEDS = (CODER, PREDICTOR)
 """Targets that have seeds of their own only; those of all others are random bytes, too."""
 
@@ -115,8 +113,13 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             file.write(struct.pack("<q", len(data)) + data)
 
         labels = blank_label_state(), blank_label_state(wide=True)
-        coders = [prior_state(coder, trellis) for trellis in (False, True) for coder in CODERS]
-        for state in (*coders, mask_prior_state(), blank_state(), *labels):
+        for state in (
+            prior_state(False),
+            prior_state(True),
+            mask_prior_state(),
+            blank_state(),
+            *labels,
+        ):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))
@@ -158,12 +161,9 @@ def write_seeds(
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
             scaled = (rng.laplace(0, scale, shape)).clip(-9e8, 9e8)
             path = choose_levels(scaled, table, 0.1)
-            for model, coder in enumerate(CODERS):
-                data = encode_integers(integers, table, coder=coder).data
-                put(CODER, struct.pack("<HB", number, model), data)
-                if model:  # a stream by contexts alone has one quantiser
-                    data = encode_integers(path, table, coder=coder, trellis=True).data
-                    put(CODER, struct.pack("<HB", number, model | TRELLIS), data)
+            for coded, trellis in ((integers, False), (path, True)):
+                data = encode_integers(coded, table, trellis=trellis).data
+                put(CODER, struct.pack("<HB", number, trellis), data)
     for number, (shape, predictor) in enumerate(passes):
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
@@ -179,11 +179,10 @@ def write_seeds(
         for number, (shape, table) in reversed(list(enumerate(bands)))
     }
     for stream, settings, shape in golden_streams():
-        for data, table, coder, trellis in coded_sections(stream, settings, shape):
+        for data, table, trellis in coded_sections(stream, settings, shape):
             setup = setup_of_bands.get((shape, table.tobytes()))
             if setup is not None:
-                how = CODERS.index(coder) | TRELLIS * trellis
-                put(CODER, struct.pack("<HB", setup, how), data)
+                put(CODER, struct.pack("<HB", setup, trellis), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):
@@ -237,16 +236,16 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
 
 def coded_sections(
     stream: bytes, settings: TileSettings, shape: tuple[int, ...]
-) -> Iterator[tuple[bytes, Table, str, bool]]:
-    """Yield the coded integers of a tile: bytes, bands, coder, and whether of two quantisers."""
+) -> Iterator[tuple[bytes, Table, bool]]:
+    """Yield the coded integers of a tile: bytes, bands, and whether of two quantisers."""
     parts = parse_stream(stream)
     if parts.coded and not parts.predicted and parts.body is not None:
         table = band_table(settings.transform, shape)
-        yield bytes(parts.body), table, settings.coder, settings.trellis
+        yield bytes(parts.body), table, settings.trellis
     if parts.residual is not None:
-        yield bytes(parts.residual), single_band(shape), settings.residual_coder, False
+        yield bytes(parts.residual), single_band(shape), False
     if parts.missing is not None:
-        yield bytes(parts.missing[4:]), single_band(shape), CODERS[0], False
+        yield bytes(parts.missing[4:]), single_band(shape), False
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:

@@ -32,7 +32,7 @@ struct Passes {
 
 class Setups {
 public:
-    State coders[2][3];  // of one quantiser and of two, by Model
+    State coders[2];  // of one quantiser and of two
     State mask, predictor, labels, wide_labels;
     std::vector<Bands> bands;
     std::vector<Passes> passes;
@@ -43,9 +43,8 @@ public:
             std::fprintf(stderr, "FHASH_FUZZ_SETUPS names no file that can be read\n");
             std::exit(2);
         }
-        for (State* state : {&coders[0][0], &coders[0][1], &coders[0][2], &coders[1][0],
-                             &coders[1][1], &coders[1][2], &mask, &predictor, &labels,
-                             &wide_labels}) {
+        for (State* state :
+             {&coders[0], &coders[1], &mask, &predictor, &labels, &wide_labels}) {
             get(file, state->slots);
             get(file, state->weights);
             get(file, state->simples);

@@ -39,10 +39,9 @@ std::vector<std::int32_t> bounded(Reader& in, int64_t n, std::int32_t most) {
 
 int64_t bands_of(const Bands& with) { return static_cast<int64_t>(with.table.size() / 29); }
 
-// How integers are coded: by which Model, whether as those of two quantisers, and whether the
-// encoder leaves its state adapted.
+// How integers are coded: whether as those of two quantisers, and whether the encoder leaves its
+// state adapted.
 struct How {
-    int64_t model;
     bool trellis, keep;
 };
 
@@ -51,14 +50,14 @@ struct How {
 std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int32_t>& q,
                                          const std::vector<float>& scaled, double lambda,
                                          std::size_t room, How how) {
-    const State& prior = setups().coders[how.trellis][how.model];
+    const State& prior = setups().coders[how.trellis];
     State state = prior;
     const std::vector<std::int32_t> given = q;
     const int64_t bands = bands_of(with);
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
         q = given;
-        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, how.model,
-                            how.trellis, with.shape.data(), with.table.data(), bands,
+        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, how.trellis,
+                            with.shape.data(), with.table.data(), bands,
                             state.slots.data(), static_cast<int64_t>(state.slots.size() / 4),
                             state.weights.data(), static_cast<int64_t>(state.weights.size()),
                             state.simples.data(), static_cast<int64_t>(state.simples.size() / 2),
@@ -67,7 +66,7 @@ std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int
     require(!scaled.empty() || q == given, "integers that the encoder changed");
     std::vector<std::int32_t> decoded(q.size(), 0);
     const int64_t code = fhash_decode(
-        decoded.data(), how.model, how.trellis, with.shape.data(), with.table.data(), bands,
+        decoded.data(), how.trellis, with.shape.data(), with.table.data(), bands,
         prior.slots.data(), static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
         static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
         static_cast<int64_t>(prior.simples.size() / 2), data.data(), length(data));
@@ -81,7 +80,7 @@ const std::vector<std::int32_t>& inside(std::size_t number) {
     if (covered[number].empty()) {
         const Bands& with = setups().bands[number];
         std::vector<std::int32_t> ones(static_cast<std::size_t>(volume(with.shape)), 1);
-        covered[number] = there_and_back(with, ones, {}, 0, 0, {0, false, false});
+        covered[number] = there_and_back(with, ones, {}, 0, 0, {false, false});
     }
     return covered[number];
 }
@@ -101,7 +100,7 @@ void of_integers(Reader& in) {
         scaled[i] =
             static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
     const std::vector<std::int32_t> decoded =
-        there_and_back(with, q, scaled, lambda, room, {(how >> 1) % 3, false, how >= 128});
+        there_and_back(with, q, scaled, lambda, room, {false, how >= 128});
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
 }
@@ -163,14 +162,13 @@ std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vect
 template <class T> void of_path(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
     const std::size_t room = 4U * in.byte();
-    const int64_t model = in.byte() % 3;
     const std::vector<std::int32_t> whole = bounded(in, volume(with.shape), 999999999);
     std::vector<T> scaled;
     for (std::size_t i = 0; i < whole.size(); i++)
         scaled.push_back(static_cast<T>(whole[i]) * static_cast<T>(0.999) +
                          static_cast<T>(i % 15) / 16);
     std::vector<std::int32_t> levels = path_of(in, with, scaled);
-    require(there_and_back(with, levels, {}, 0, room, {model, true, false}) == levels,
+    require(there_and_back(with, levels, {}, 0, room, {true, false}) == levels,
             "other integers of two quantisers");
 }
 

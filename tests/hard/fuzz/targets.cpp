@@ -30,12 +30,11 @@ namespace {
 
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
-    const std::uint8_t how = in.byte();
-    const int64_t model = (how & 15) % 3, trellis = how >> 4 & 1;
-    const State& prior = setups().coders[trellis][model];
+    const int64_t trellis = in.byte() & 1;
+    const State& prior = setups().coders[trellis];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode(q.data(), model, trellis, with.shape.data(), with.table.data(),
+    fhash_decode(q.data(), trellis, with.shape.data(), with.table.data(),
                  static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
                  static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
                  static_cast<int64_t>(prior.weights.size()), prior.simples.data(),

@@ -1,8 +1,8 @@
-"""Integers to bytes and back by the adaptive coder, native (native/coder.cpp) or portable.
+"""Integers to bytes and back by the adaptive coder, native/coder.cpp.
 
-Both write the same bytes. The coder adapts while it works. It begins from a *prior*: estimates and
-mixing weights that were learned from other series (prior.py), so that small tiles need not learn
-from nothing. The prior is part of the format.
+The coder adapts while it works. It begins from a *prior*: estimates and mixing weights that were
+learned from other series (prior.py), so that small tiles need not learn from nothing. The prior is
+part of the format.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.entropy.prior import CODERS, State, prior_state
+from fhash_formats.transform.entropy.prior import State, prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
-from fhash_formats.transform.entropy.two_quantisers import MISPLACED, NO_TRELLIS
 
 __all__ = [
-    "CODERS",
     "MAX_INTEGER",
     "Encoded",
     "array_arguments",
@@ -39,6 +37,10 @@ MAX_INTEGER = 2**30 - 1
 
 NO_MEMORY = -2
 """Code that a native function returns where it had no memory; twin of `NO_MEMORY` in guard.hpp."""
+
+NO_TRELLIS = -3
+"""Code of an encoder that met an integer which its quantiser does not have, as in
+native/coder_contexts.hpp."""
 
 Integers = npt.NDArray[np.int32]
 
@@ -64,7 +66,6 @@ def encode_integers(
     scaled: npt.NDArray[np.float32] | None = None,
     weight: float = 0.0,
     state: State | None = None,
-    coder: str = CODERS[0],
     trellis: bool = False,
 ) -> Encoded:
     """Code integers in the bands of a table; integers outside the bands count as 0.
@@ -77,35 +78,24 @@ def encode_integers(
             steps, plus `weight` per bit.
         weight: squared steps that a bit is worth.
         state: state to begin from, which is adapted in place; None begins from the prior.
-        coder: one of CODERS.
         trellis: whether the integers are those of two quantisers (trellis.py). Raises InputError
             for integers that are not, and does not go with `scaled`.
     """
-    _check_coder(coder)
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
     keep = state is not None
-    state = prior_state(coder, trellis) if state is None else state
+    state = prior_state(trellis) if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import coder_portable
-
-        integers = given.copy()
-        adapted = state if keep else state.copy()
-        data = coder_portable.encode(integers, table, scaled, weight, adapted, coder, trellis)
-        return Encoded(data=data, integers=integers)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
         # The native coder writes to its integers only where it chooses them.
         integers = given if chosen is None else given.copy()
-        size = library.fhash_encode(
+        size = native.library().fhash_encode(
             _pointer(integers),
             _pointer(chosen),
             weight,
-            CODERS.index(coder),
             trellis,
             (ctypes.c_int64 * 4)(*integers.shape),
             *array_arguments(table),
@@ -114,7 +104,7 @@ def encode_integers(
             *array_arguments(buffer),
         )
         if size == NO_TRELLIS:
-            raise InputError(MISPLACED)
+            raise InputError("an integer is not one of the quantiser whose turn it is")
         if checked(size) <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
         # Retry with the original integers. Coding the chosen ones would give other bytes, because
@@ -127,30 +117,20 @@ def decode_integers(
     shape: tuple[int, ...],
     table: Table,
     *,
-    coder: str = CODERS[0],
     trellis: bool = False,
 ) -> Integers:
-    """The integers (t, z, y, x) of a shape, int32; the last two arguments as for the encoder.
+    """The integers (t, z, y, x) of a shape, int32; `trellis` as for the encoder.
 
     Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
     """
-    _check_coder(coder)
     integers = np.zeros(shape, dtype=np.int32)
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import coder_portable
-
-        state = prior_state(coder, trellis).copy()
-        coder_portable.decode(integers, table, bytes(data), state, coder, trellis)
-        return integers
     source = np.frombuffer(data, dtype=np.uint8)
-    code = library.fhash_decode(
+    code = native.library().fhash_decode(
         _pointer(integers),
-        CODERS.index(coder),
         trellis,
         (ctypes.c_int64 * 4)(*shape),
         *array_arguments(table),
-        *state_arguments(prior_state(coder, trellis)),
+        *state_arguments(prior_state(trellis)),
         *array_arguments(source),
     )
     if checked(code) < 0:
@@ -175,11 +155,6 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
     if largest > MAX_INTEGER or encode_block(integers) != bytes(data):
         raise DamagedFileError("the coded integers are damaged")
     return integers
-
-
-def _check_coder(coder: str) -> None:
-    if coder not in CODERS:
-        raise InputError(f"coder is {coder!r:.40}; known: {', '.join(CODERS)}")
 
 
 def checked(code: int) -> int:

@@ -10,7 +10,6 @@ is part of the format.
 from __future__ import annotations
 
 import ctypes
-import zlib
 from functools import cache
 from pathlib import Path
 
@@ -20,9 +19,9 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.transform.entropy.coder import array_arguments, checked, state_arguments
 from fhash_formats.transform.entropy.mask_levels import Levels
-from fhash_formats.transform.entropy.prior import State, pack_state, unpack_state
+from fhash_formats.transform.entropy.prior import State, unpack_state
 
-__all__ = ["blank_mask_state", "decode_mask", "encode_mask", "mask_prior_state", "pack_mask_prior"]
+__all__ = ["blank_mask_state", "decode_mask", "encode_mask", "mask_prior_state"]
 
 Mask = npt.NDArray[np.bool_]
 
@@ -53,12 +52,7 @@ def blank_mask_state() -> State:
 @cache
 def mask_prior_state() -> State:
     """The prior of masks; its arrays are read-only."""
-    return unpack_state(zlib.decompress(_FILE.read_bytes()), blank_mask_state()).frozen()
-
-
-def pack_mask_prior(state: State) -> bytes:
-    """A learned state as the bytes of `mask_prior.bin`."""
-    return zlib.compress(pack_state(state), 9)
+    return unpack_state(_FILE.read_bytes(), blank_mask_state()).frozen()
 
 
 def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | None = None) -> bytes:

@@ -2,7 +2,7 @@
 
 Two quantisers of step 2 delta share the multiples of delta: the first has the even ones, the second
 the odd ones and zero. A trellis of eight states says which of them is next, by the parity of the
-index before (two_quantisers.py, FORMAT.md). The path of least cost is found by the algorithm of
+index before (FORMAT.md). The path of least cost is found by the algorithm of
 Viterbi (Forney 1973), natively (native/trellis.cpp) or by trellis_portable.py. A decoder needs none
 of this: it follows the states.
 """

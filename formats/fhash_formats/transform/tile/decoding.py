@@ -317,12 +317,12 @@ def _integers_and_residual(
 
     def coefficients() -> Integers:
         table = band_table(settings.transform, shape)
-        return decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
+        return decode_integers(body, shape, table, trellis=settings.trellis)
 
     def residual() -> Integers:
         assert stream.residual is not None
         table = single_band(shape)
-        return decode_integers(stream.residual, shape, table, coder=settings.residual_coder)
+        return decode_integers(stream.residual, shape, table)
 
     if stream.residual is None:
         return coefficients(), None

@@ -335,8 +335,7 @@ def _transformed_tile(task: _Task) -> CodedTile:
     decoded = within_range(decoded, settings)
     if error is not None and not within(task.values, decoded, error, task.counted):
         return task.exact()
-    own, coder = task.own_settings, settings.residual_coder
-    stream = build_stream(own, task.missing, data, integers, residual, mask, residual_coder=coder)
+    stream = build_stream(task.own_settings, task.missing, data, integers, residual, mask)
     return task.coded(stream, decoded, int(np.count_nonzero(integers)))
 
 

@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.entropy.coder import CODERS, decode_integers, encode_integers
+from fhash_formats.transform.entropy.coder import decode_integers, encode_integers
 from fhash_formats.transform.entropy.mask import decode_mask, encode_mask
 from fhash_formats.transform.entropy.mask_levels import Levels
 from fhash_formats.transform.entropy.table import single_band
@@ -157,7 +157,6 @@ def build_stream(
     residual: Integers | None,
     mask: bytes | None,
     predicted: bool = False,
-    residual_coder: str = CODERS[0],
 ) -> bytes:
     """The stream of a tile.
 
@@ -169,7 +168,6 @@ def build_stream(
         residual: residual in quanta; None for none.
         mask: section of the mask; None for a stream without one.
         predicted: whether the integers are coded by prediction.
-        residual_coder: model by which the residual is coded.
     """
     numbers = (PREDICTED, PREDICTED_MASKED) if predicted else (FORMAT, MASKED)
     flags = numbers[mask is not None] | (OWN if settings else 0) | (MISSING if missing else 0)
@@ -182,7 +180,7 @@ def build_stream(
         flags |= RESIDUAL
         crc = zlib.crc32(little_endian(residual), crc)
         table = single_band(residual.shape)
-        sections.append(encode_integers(residual, table, coder=residual_coder).data)
+        sections.append(encode_integers(residual, table).data)
     if mask is not None:
         sections.append(mask)
     return bytes([flags]) + crc.to_bytes(4, "little") + b"".join(map(section, sections))

@@ -18,7 +18,6 @@ import numpy as np
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.number_types import is_wide_integer, is_within
 from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.entropy.coder import CODERS
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.head.head import NeighbourHead
@@ -36,8 +35,6 @@ _KEYS = _REQUIRED | {
     "head",
     "mask",
     "predictor",
-    "coder",
-    "residual_coder",
     "origin",
     *_SWITCHES,
 }
@@ -72,11 +69,8 @@ class TileSettings:
             version 1.1 never are.
         labels: whether tiles may be coded as labels, without loss.
         many_labels: whether such tiles may have 65,536 labels instead of 256; needs `labels`.
-        coder: model by which coefficients are coded; see `CODERS` in entropy/coder.py.
-        residual_coder: model by which the residual is coded.
         trellis: whether coefficients are quantised by two quantisers in turn (entropy/trellis.py).
-            Integers are then in steps, of which each quantiser has every other one. Needs a coder
-            other than "contexts".
+            Integers are then in steps, of which each quantiser has every other one.
         origin: integer that is subtracted from the values before anything else, for arrays of
             64-bit integers alone; `center`, `low` and `high` are then those of the differences.
     """
@@ -95,8 +89,6 @@ class TileSettings:
     clip: bool = False
     labels: bool = False
     many_labels: bool = False
-    coder: str = CODERS[0]
-    residual_coder: str = CODERS[0]
     trellis: bool = False
     origin: int = 0
 
@@ -118,12 +110,6 @@ class TileSettings:
                 f"offsets are {self.offsets!r:.60}; {'six' if self.trellis else 'three'} whole "
                 f"numbers within +-{OFFSET_UNIT} are needed"
             )
-        for name in ("coder", "residual_coder"):
-            if getattr(self, name) not in CODERS:
-                known = ", ".join(CODERS)
-                raise InputError(f"{name} is {getattr(self, name)!r:.40}; known: {known}")
-        if self.trellis and self.coder == CODERS[0]:
-            raise InputError(f"trellis needs a coder other than {CODERS[0]}")
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
         if type(self.origin) is not int or not -(1 << 63) <= self.origin < 1 << 64:
@@ -163,8 +149,6 @@ class TileSettings:
             "clip": self.clip,
             "labels": self.labels,
             "many-labels": self.many_labels,
-            "coder-signs": "signs" in (self.coder, self.residual_coder),
-            "coder-linear": "linear" in (self.coder, self.residual_coder),
             "trellis": self.trellis,
             "origin": self.origin != 0,
         }
@@ -196,9 +180,6 @@ class TileSettings:
             result["labels"] = True
         if self.many_labels:
             result["many_labels"] = True
-        for name in ("coder", "residual_coder"):
-            if getattr(self, name) != CODERS[0]:
-                result[name] = getattr(self, name)
         if self.trellis:
             result["trellis"] = True
         if self.origin:
@@ -231,8 +212,6 @@ class TileSettings:
             high=high,
             offsets=tuple(offsets),
             **switches,
-            coder=values.get("coder", CODERS[0]),
-            residual_coder=values.get("residual_coder", CODERS[0]),
             origin=values.get("origin", 0),
             quantum=values.get("quantum", 0.0),
             head=_unpack_head(values.get("head")),

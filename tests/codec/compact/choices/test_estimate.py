@@ -16,7 +16,7 @@ from fhash_codec import native
 from fhash_codec.compact.choices.estimate import estimated_step, magnitudes
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding
+from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
@@ -24,6 +24,7 @@ from fhash_codec.encoding import encode
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 

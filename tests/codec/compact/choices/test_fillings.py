@@ -12,8 +12,9 @@ from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.tiles.blocks import Index, Tile
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding
+from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (3, 12, 16, 20)

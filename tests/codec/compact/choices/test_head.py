@@ -20,9 +20,10 @@ from fhash_codec.compact.choices.head import MIN_BYTES, _coarsened, _side_by_sid
 from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort, Shape
 from fhash_codec.compact.choices.search import step_after_gain
 from fhash_codec.compact.choices.transform import usual_transform
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 

@@ -16,8 +16,9 @@ from fhash_codec.compact.choices.quantiser import (
     step_after,
 )
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 NONE = AxisTransform(kind="none")
@@ -28,7 +29,6 @@ SETTINGS = TileSettings(
     low=0.0,
     high=1.0,
     offsets=OFFSETS,
-    coder="signs",
 )
 GOAL = Goal(psnr=40.0, data_range=1.0)
 

@@ -10,14 +10,8 @@ import pytest
 
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.compact.tiles.coding import (
-    MIN_STEP_SHARE,
-    OFFSETS,
-    Coding,
-    Outcome,
-    code,
-    total,
-)
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, Outcome, code, total
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (2, 8, 12, 16)

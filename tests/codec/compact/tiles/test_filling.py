@@ -11,8 +11,8 @@ import pytest
 
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.compact.tiles.coding import OFFSETS
 from fhash_codec.compact.tiles.filling import fill
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (4, 12, 20, 24)

@@ -14,8 +14,9 @@ from untrained_heads import some_head
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles import sample as sample_module
 from fhash_codec.compact.tiles.blocks import Index, Tile
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding
+from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample, spread_order, strata
+from fhash_formats.transform.tile.integers import OFFSETS
 from fhash_formats.transform.tile.settings import TileSettings
 
 

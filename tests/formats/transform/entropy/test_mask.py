@@ -14,7 +14,6 @@ from fhash_formats.transform.entropy.mask import (
     decode_mask,
     encode_mask,
     mask_prior_state,
-    pack_mask_prior,
 )
 
 SHAPES = [
@@ -93,23 +92,23 @@ def test_every_form_gives_the_same_bytes(form: str) -> None:
 
 PINNED = {
     "none, nothing known": (0, 0),
-    "none, noise": (1, 223),
-    "none, likely": (1, 172),
-    "all, nothing known": (2, 42),
+    "none, noise": (1, 229),
+    "none, likely": (1, 180),
+    "all, nothing known": (2, 212),
     "all, noise": (0, 0),
     "all, likely": (0, 0),
-    "noise, nothing known": (234, 240),
-    "noise, noise": (285, 141),
-    "noise, likely": (114, 72),
-    "few, nothing known": (43, 229),
-    "few, noise": (47, 112),
-    "few, likely": (16, 31),
-    "a ball, nothing known": (22, 172),
-    "a ball, noise": (30, 152),
-    "a ball, likely": (16, 104),
-    "half, nothing known": (6, 94),
-    "half, noise": (14, 156),
-    "half, likely": (8, 176),
+    "noise, nothing known": (234, 160),
+    "noise, noise": (284, 106),
+    "noise, likely": (113, 226),
+    "few, nothing known": (43, 37),
+    "few, noise": (47, 210),
+    "few, likely": (16, 197),
+    "a ball, nothing known": (22, 189),
+    "a ball, noise": (31, 105),
+    "a ball, likely": (16, 74),
+    "half, nothing known": (6, 80),
+    "half, noise": (15, 1),
+    "half, likely": (8, 147),
 }
 
 
@@ -133,8 +132,7 @@ def test_damaged_bytes_give_some_mask(form: str) -> None:
         assert decode_mask(other, levels).shape == mask.shape
 
 
-def test_the_prior_is_what_was_packed() -> None:
+def test_the_prior_follows_the_tile_soon_and_is_not_changed() -> None:
     state = mask_prior_state()
-    assert state.slots[:, 2].max() <= 12
-    assert pack_mask_prior(state) == pack_mask_prior(mask_prior_state())
+    assert 0 < state.slots[:, 2].max() <= 12
     assert not state.slots.flags.writeable

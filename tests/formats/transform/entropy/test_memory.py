@@ -39,8 +39,7 @@ WORK = {
     "decode_predicted": (64, lambda: predict.decode_predicted(b"", shape, predictor)),
     "encode_predicted": (80, lambda: predict.encode_predicted(integers, None, predictor)),
 }
-for state in (coder.prior_state, mask.mask_prior_state, predict.blank_state):
-    state()
+coder.prior_state(False), mask.mask_prior_state(), predict.blank_state()
 with open("/proc/self/status") as status:
     used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
 # The limit leaves room for the result and the coder's state, but not for its notes on each vertex.

@@ -53,8 +53,8 @@ def test_both_engines_choose_the_same(
 def test_the_coder_takes_every_path(shape: tuple[int, ...], spread: float) -> None:
     table = table_of(shape, 2)
     levels = choose_levels(coefficients(shape, spread, np.float32), table, 0.27)
-    data = encode_integers(levels, table, coder="signs", trellis=True).data
-    decoded = decode_integers(data, shape, table, coder="signs", trellis=True)
+    data = encode_integers(levels, table, trellis=True).data
+    decoded = decode_integers(data, shape, table, trellis=True)
     assert decoded.tobytes() == levels.tobytes()
 
 

@@ -16,7 +16,7 @@ from fhash_formats.transform.tile.integers import choose_integers, code_coeffici
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.quantise import LARGEST
 
-TRELLIS = replace(SETTINGS, trellis=True, coder="signs", offsets=(17, -10, -5, -3, -2, -1))
+TRELLIS = replace(SETTINGS, trellis=True, offsets=(17, -10, -5, -3, -2, -1))
 CODINGS = [
     Coding(),
     Coding(weight=0.27, passes=2),

@@ -21,10 +21,8 @@ from fhash_formats.transform.tile.settings import TileSettings
         {"double": True, "offsets": (-5, -1, 0)},
         {"mask": MaskLevels(), "quantum": 0.0},
         {"clip": True},
-        {"coder": "signs"},
-        {"residual_coder": "linear"},
-        {"coder": "linear", "trellis": True, "offsets": (-5, -1, 0, 0, 1, -128)},
-        {"coder": "signs", "trellis": True, "offsets": (0,) * 6},
+        {"trellis": True, "offsets": (-5, -1, 0, 0, 1, -128)},
+        {"trellis": True, "offsets": (0,) * 6},
     ],
 )
 def test_settings_come_back_from_json(changes: dict[str, Any]) -> None:
@@ -50,11 +48,7 @@ def test_defaults_are_left_out_of_json() -> None:
         ({"offsets": (0, 0)}, "three whole numbers"),
         ({"offsets": (0, 0, 129)}, "three whole numbers"),
         ({"offsets": (0,) * 6}, "three whole numbers"),
-        ({"coder": "signs", "trellis": True}, "six whole numbers"),
-        ({"coder": "sign"}, "coder is 'sign'; known: contexts, signs, linear"),
-        ({"coder": 1}, "coder is 1"),
-        ({"residual_coder": "no"}, "residual_coder is 'no'; known: contexts, signs, linear"),
-        ({"trellis": True, "offsets": (0,) * 6}, "trellis needs a coder"),
+        ({"trellis": True}, "six whole numbers"),
         ({"origin": 1.0}, "origin is 1.0; a 64-bit integer"),
         ({"origin": 1 << 64}, "a 64-bit integer is needed"),
         ({"high": 10**400}, "high is 1000"),
@@ -74,7 +68,6 @@ def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str
         ({"double": 1}, "double is true or false"),
         ({"clip": None}, "clip is true or false"),
         ({"trellis": 1}, "trellis is true or false"),
-        ({"coder": ["signs"]}, "coder is "),
         ({"head": "%"}, "not base64"),
     ],
 )
@@ -93,7 +86,4 @@ def test_a_missing_key_is_named() -> None:
 def test_features_name_what_a_reader_must_support() -> None:
     assert SETTINGS.features == ()
     assert replace(SETTINGS, mask=MaskLevels()).features == ("mask",)
-    assert replace(SETTINGS, coder="signs").features == ("coder-signs",)
-    assert replace(SETTINGS, residual_coder="linear").features == ("coder-linear",)
-    two = replace(SETTINGS, coder="linear", trellis=True, offsets=(0,) * 6)
-    assert two.features == ("coder-linear", "trellis")
+    assert replace(SETTINGS, trellis=True, offsets=(0,) * 6).features == ("trellis",)
