@@ -1,6 +1,6 @@
 """The range coder, and adaptive estimates of binary decisions.
 
-A decision is a bit. Its probability of a 1 comes from several *estimates*, each chosen by a context.
+A decision is a bit. Its probability of a 1 comes from several *estimates*, each by a context.
 An estimate keeps two probabilities, a slow and a fast one, and how often it was used. Their logits
 are the inputs of a *mixer*: a weighted sum, whose weights learn from each bit. A *simple* estimate
 is one probability that is used alone. Everything is in integers.
@@ -34,9 +34,7 @@ SQUASH: list[int] = (
     np.clip(np.floor(65536 / (1 + np.exp(-_LOGITS / 256)) + 0.5), 1, 65535).astype(int).tolist()
 )
 """Probability in 1/65536 of each logit, from -LARGEST_LOGIT on."""
-LOG: list[int] = (
-    np.floor(np.log2(np.maximum(np.arange(4096), 1)) * 16 + 0.5).astype(int).tolist()
-)
+LOG: list[int] = np.floor(np.log2(np.maximum(np.arange(4096), 1)) * 16 + 0.5).astype(int).tolist()
 """16 log2 of each number below 4096."""
 RATE = [655360 // (10 * uses + 16) for uses in range(401)]
 """Rate at which an estimate learns, by its uses, in 1/65536."""

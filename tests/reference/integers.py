@@ -124,7 +124,9 @@ class IntegerDecoder:
     def __init__(self, data: bytes | memoryview, coder: str, two_quantisers: bool) -> None:
         prior = prior_state(coder, two_quantisers)
         self.adaptive = Adaptive(data, prior.slots, prior.weights, prior.simples)
-        self.signs = [LinearSigns(self.adaptive, k) for k in range(KINDS)] if coder == "signs" else []
+        self.signs = (
+            [LinearSigns(self.adaptive, k) for k in range(KINDS)] if coder == "signs" else []
+        )
         self.two_quantisers = two_quantisers
         self.state = 0
         self.known: list[BandNumbers] = []
@@ -171,9 +173,7 @@ class IntegerDecoder:
     def _referred(self, reference: Any, at: Sequence[int]) -> tuple[int, ...]:
         """The index in the band of a reference for an index in the present band."""
         n = self.known[reference.band].n
-        return tuple(
-            min(i >> k, m - 1) for i, k, m in zip(at, reference.halvings, n, strict=False)
-        )
+        return tuple(min(i >> k, m - 1) for i, k, m in zip(at, reference.halvings, n, strict=False))
 
     def weight_of_neighbours(self, t: int, z: int, y: int) -> int:
         """Sum of the weights in the expected magnitude of a row's vertices."""

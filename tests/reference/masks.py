@@ -112,7 +112,10 @@ class MaskDecoder:
         """The state of a segment whose flag says that its bits are all the same; else NOTHING."""
         states = self.states
         before = (states[t, z, y, s - 1], states[t, z, y - 1, s] if y else NOTHING)
-        before += (states[t, z - 1, y, s] if z else NOTHING, states[t - 1, z, y, s] if t else NOTHING)
+        before += (
+            states[t, z - 1, y, s] if z else NOTHING,
+            states[t - 1, z, y, s] if t else NOTHING,
+        )
         same, existing = common([int(state) for state in before], NOTHING, MIXED)
         levels = self.first[t, z, y, row.start : row.stop]
         low, high = int(levels.min()), int(levels.max())
@@ -153,7 +156,12 @@ class MaskDecoder:
         pw, pe, pn, ps = (known(0, -1, j, i) for j, i in ((0, -1), (0, 1), (-1, 0), (1, 0)))
         bw, be, bn, bs = (known(-1, 0, j, i) for j, i in ((0, -1), (0, 1), (-1, 0), (1, 0)))
         bp, bf = known(-1, -1, 0, 0), known(-1, 1, 0, 0)
-        w2, n2, p2, b2 = known(0, 0, 0, -2), known(0, 0, -2, 0), known(0, -2, 0, 0), known(-2, 0, 0, 0)
+        w2, n2, p2, b2 = (
+            known(0, 0, 0, -2),
+            known(0, 0, -2, 0),
+            known(0, -2, 0, 0),
+            known(-2, 0, 0, 0),
+        )
         a = int(self.first[t, z, y, x])
         ahead, south, front, later = (level(axis) >> 2 for axis in (3, 2, 1, 0))
         nearest = digits(w, n, p, b)

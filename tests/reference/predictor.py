@@ -53,7 +53,9 @@ def passes_of(settings: dict[str, Any], decode_base64: Any) -> list[Pass]:
     axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
     passes = [Pass(-1, KINDS - 1, first_taps())]
     for i, axis in enumerate(axes):
-        passes.append(Pass(axis, min(len(axes) - 1 - i, KINDS - 2), taps_of(axis, settings["reach"])))
+        passes.append(
+            Pass(axis, min(len(axes) - 1 - i, KINDS - 2), taps_of(axis, settings["reach"]))
+        )
     count = sum(len(one.taps) for one in passes)
     weights = decode_block(decode_base64(settings["weights"]), (1, 1, 1, count)).ravel().tolist()
     result = []

@@ -9,13 +9,14 @@ ends. On a longer axis each band has the norm of its interior.
 
 from __future__ import annotations
 
+import ctypes
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fhash_formats.transform.axes.lifting_portable import inverse_axis
-from fhash_formats.transform.axes.spec import AxisTransform
+from fhash_formats import native
+from fhash_formats.transform.axes.spec import KINDS, AxisTransform
 
 __all__ = ["MAX_EXACT", "axis_norms", "band_lengths", "plane_norms"]
 
@@ -99,12 +100,25 @@ def _synthesis_norms(kind: str, lengths: list[int], bands: NDArray[np.float64]) 
 
     lengths: of the low band after each level.
     """
-    values = inverse_axis(bands, 0, kind)
-    for n in lengths[-3::-1]:
-        padded = np.zeros((n, values.shape[1]))
-        padded[: len(values)] = values
-        values = inverse_axis(padded, 0, kind)
-    total = np.zeros(values.shape[1])
+    (n, depth), columns = (lengths[0], len(lengths) - 1), bands.shape[1]
+    padded = np.zeros((n, columns))
+    padded[: len(bands)] = bands
+    values, ones = np.empty_like(padded), np.ones(max(n, columns))
+    four, pointer = ctypes.c_int64 * 4, ctypes.c_void_p
+    code = native.library().fhash_transform_inverse_f64(
+        pointer(padded.ctypes.data),
+        pointer(values.ctypes.data),
+        four(n, 1, 1, columns),
+        four(KINDS.index(kind), 0, 0, 0),
+        four(depth, 0, 0, 0),
+        four(0, 0, 0, 0),
+        (pointer * 4)(None, None, None, None),
+        pointer(ones.ctypes.data),
+        pointer(ones.ctypes.data),
+    )
+    if code != 0:
+        raise MemoryError("no memory for the norms of a transform")
+    total = np.zeros(columns)
     for row in values:
         total += row * row
     return np.sqrt(total)

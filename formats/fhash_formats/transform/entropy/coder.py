@@ -1,6 +1,6 @@
-"""Integers to bytes and back by the adaptive coder, native (native/coder.cpp) or portable.
+"""Integers to bytes and back by the adaptive coder (native/coder.cpp).
 
-Both write the same bytes. The coder adapts while it works. It begins from a *prior*: estimates and
+The coder adapts while it works. It begins from a *prior*: estimates and
 mixing weights that were learned from other series (prior.py), so that small tiles need not learn
 from nothing. The prior is part of the format.
 """
@@ -19,7 +19,6 @@ from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.prior import CODERS, State, prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
-from fhash_formats.transform.entropy.two_quantisers import MISPLACED, NO_TRELLIS
 
 __all__ = [
     "CODERS",
@@ -39,6 +38,11 @@ MAX_INTEGER = 2**30 - 1
 
 NO_MEMORY = -2
 """Code that a native function returns where it had no memory; twin of `NO_MEMORY` in guard.hpp."""
+
+NO_TRELLIS = -3
+"""Code of a run that met an integer which its quantiser does not have."""
+MISPLACED = "an integer is not one of the quantiser of its place"
+"""Message for such an integer."""
 
 Integers = npt.NDArray[np.int32]
 
@@ -87,21 +91,13 @@ def encode_integers(
     keep = state is not None
     state = prior_state(coder, trellis) if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import coder_portable
-
-        integers = given.copy()
-        adapted = state if keep else state.copy()
-        data = coder_portable.encode(integers, table, scaled, weight, adapted, coder, trellis)
-        return Encoded(data=data, integers=integers)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
         # The native coder writes to its integers only where it chooses them.
         integers = given if chosen is None else given.copy()
-        size = library.fhash_encode(
+        size = native.library().fhash_encode(
             _pointer(integers),
             _pointer(chosen),
             weight,
@@ -136,15 +132,8 @@ def decode_integers(
     """
     _check_coder(coder)
     integers = np.zeros(shape, dtype=np.int32)
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import coder_portable
-
-        state = prior_state(coder, trellis).copy()
-        coder_portable.decode(integers, table, bytes(data), state, coder, trellis)
-        return integers
     source = np.frombuffer(data, dtype=np.uint8)
-    code = library.fhash_decode(
+    code = native.library().fhash_decode(
         _pointer(integers),
         CODERS.index(coder),
         trellis,
