@@ -208,31 +208,14 @@ def _between(pair: Floats, after_weight: Floats) -> Floats:
     return result
 
 
-def _encode(
-    tables: PointTables,
-    points: npt.NDArray[np.float64],
-    inputs: Floats,
-    *,
-    gradient: bool = False,
-) -> Floats:
-    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`.
-
-    Return their derivatives (4, inputs, columns) by the position; with `gradient` unset, none.
-    """
+def _encode(tables: PointTables, points: npt.NDArray[np.float64], inputs: Floats) -> None:
+    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`."""
     size, count = tables.network.embedding_size, points.shape[1]
-    slopes = np.zeros((4 if gradient else 0, len(inputs) - 1, inputs.shape[1]), np.float32)
-    # Tables of one time have no corners after it.
-    first_axis = 1 if tables.still else 0
     for level, (patch, resolution) in enumerate(zip(tables.patches, tables.levels, strict=True)):
-        rows = slice(level * size, (level + 1) * size)
-        before, after_weights, pace = locate(tables.sizes, resolution, points)
+        before, after_weights, _ = locate(tables.sizes, resolution, points)
         corners = _corners(patch, before, resolution)
-        if tables.still:
-            corners = corners[0]
-        inputs[rows, :count], changes = interpolate(corners, after_weights[first_axis:], gradient)
-        for axis, change in enumerate(changes, start=first_axis):
-            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows, :count])
-    return slopes
+        rows = slice(level * size, (level + 1) * size)
+        inputs[rows, :count] = interpolate(corners, after_weights, gradient=False)[0]
 
 
 def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float64]], int]:

@@ -15,7 +15,7 @@ LIBRARIES = (
     "fhash_codec/native/_codec.abi3.so",
     "fhash_codec/native/network/_network.abi3.so",
 )
-HEAVY = ("torch", "vtkmodules", "matplotlib", "numba", "hdf5plugin", "skimage", "dask")
+HEAVY = ("torch", "vtkmodules", "matplotlib", "hdf5plugin", "skimage", "dask")
 """Packages of the extras, which a plain install leaves out."""
 
 

@@ -1,4 +1,4 @@
-"""Lets tests import the reference, and the helpers of the tests of the transform."""
+"""Lets tests import the helpers of the tests of the transform and of the hard cases."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ import sys
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS / "formats" / "transform"), str(TESTS / "hard")]
+sys.path[:0] = [str(TESTS / "formats" / "transform"), str(TESTS / "hard")]

@@ -112,27 +112,30 @@ def apply_head(decoded: Floats, head: Head) -> Floats:
     """Decoded values (t, z, y, x), float32, each corrected and clipped."""
     values = clip(decoded, head.low, head.high)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        inverse = np.float32(0.5) / head.sigma
-        span = head.high - head.low
-        unit = np.float32(1024) / span if span > 0 else np.float32(0)
-        unit = unit if np.isfinite(unit) else np.float32(0)
-        inputs = [compress((moved(values, place) - values) * inverse) for place in OFFSETS]
-        position = (values - head.low) * unit + np.float32(0.5)
-        position = np.where(position < 1024, position, np.float32(1024))
-        inputs.append((position.astype(np.int32) - 512).astype(np.float32))
-        inputs.append(compress((values - head.low) * inverse))
-        activations = np.stack(inputs)
+        activations = np.stack(inputs_of(values, head))
         for number, layer in enumerate(head.layers):
             if head.cross and number == 1:
-                crossed = [[moved(plane, place) for place in CROSS] for plane in activations]
-                activations = np.stack([plane for planes in crossed for plane in planes])
+                crossed = [moved(plane, place) for plane in activations for place in CROSS]
+                activations = np.stack(crossed)
             outputs = np.tensordot(layer.weights, activations, 1) + np.float32(0)
             outputs = outputs * layer.scale + layer.biases.reshape(-1, 1, 1, 1, 1)
-            if number == len(head.layers) - 1:
-                return clip(values + outputs[0], head.low, head.high)
             leaky = np.where(outputs > 0, outputs, np.float32(0.125) * outputs)
             activations = np.rint(clip(leaky, -LIMIT, LIMIT))
-    raise AssertionError("the last layer returns")
+        return clip(values + outputs[0], head.low, head.high)
+
+
+def inputs_of(values: Floats, head: Head) -> list[Floats]:
+    """The 28 inputs of each vertex, from clipped values: differences of its neighbours, its
+    position in the range, and its distance from the lower end."""
+    inverse = np.float32(0.5) / head.sigma
+    inputs = [compress((moved(values, place) - values) * inverse) for place in OFFSETS]
+    span = head.high - head.low
+    unit = np.float32(1024) / span if span > 0 else np.float32(0)
+    unit = unit if np.isfinite(unit) else np.float32(0)
+    position = (values - head.low) * unit + np.float32(0.5)
+    position = np.where(position < 1024, position, np.float32(1024))
+    inputs.append((position.astype(np.int32) - 512).astype(np.float32))
+    return [*inputs, compress((values - head.low) * inverse)]
 
 
 def moved(values: Floats, offset: tuple[int, ...]) -> Floats:

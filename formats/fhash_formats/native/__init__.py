@@ -31,7 +31,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 10
+ABI_VERSION = 11
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -103,6 +103,8 @@ PROTOTYPES: Prototypes = {
     "fhash_trellis_count": _TRELLIS_COUNT,
     **{f"fhash_trellis_guess_{kind}": _TRELLIS_COUNT for kind in _TYPES},
     **{f"fhash_trellis_choose_{kind}": _TRELLIS for kind in _TYPES},
+    # crc32c.cpp
+    "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
     # values.cpp
     **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
     **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
 
@@ -148,24 +147,6 @@ def test_a_given_transform_is_taken() -> None:
     data = encode_chunk(values, max_error=0.01, transform=transform)
     assert worst(values, decode_chunk(data, values.shape, "f4")) <= 0.01
     assert data != encode_chunk(values, max_error=0.01)
-
-
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-@pytest.mark.parametrize("quality", [{"max_error": 0.02}, {"step": 0.1}, {"max_error_rel": 1e-6}])
-def test_both_engines_give_the_same_bytes(
-    quality: dict[str, float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chunks = [field((3, 6, 7), 1, "f4"), field((40,), 1, "f8"), field((5, 8), 50, "i2")]
-    chunks[0][1, 2, 3:] = np.nan
-    data = [encode_chunk(chunk, **quality) for chunk in chunks]  # type: ignore[arg-type]
-    values = [
-        decode_chunk(stream, chunk.shape, chunk.dtype)
-        for stream, chunk in zip(data, chunks, strict=True)
-    ]
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert [encode_chunk(chunk, **quality) for chunk in chunks] == data  # type: ignore[arg-type]
-    for stream, chunk, expected in zip(data, chunks, values, strict=True):
-        assert decode_chunk(stream, chunk.shape, chunk.dtype).tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(

@@ -1,25 +1,21 @@
-"""The adaptive coder: round trips, the same bytes from every engine, damaged and hostile bytes."""
+"""The adaptive coder: round trips, damaged and hostile bytes."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from trellises import of_two_quantisers
 
-from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.coder import (
     CODERS,
     MAX_INTEGER,
-    Encoded,
     decode_block,
     decode_integers,
     encode_block,
@@ -35,30 +31,6 @@ COUPLED = ("haar", "5/3", "9/7", "9/7")
 PACKETS = ("9/7", "haar", "5/3", "9/7")
 BASES = ("klt", "haar", "klt", "klt")
 NONE = ("none", "none", "none", "none")
-
-
-def use(engine: str, patch: pytest.MonkeyPatch) -> None:
-    """Use an engine: native, compiled (portable, by numba) or plain (portable, in Python)."""
-    if engine == "native":
-        if native.library() is None:
-            pytest.skip("the native library is not built or not wanted")
-        return
-    patch.setenv("FHASH_NATIVE", "0")
-    if engine == "plain":
-        patch.setattr(mixing_portable, "_numba", lambda: None)
-    elif mixing_portable._numba() is None:
-        pytest.skip("numba is not installed")
-
-
-@pytest.fixture(params=["native", "compiled", "plain"])
-def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    use(request.param, monkeypatch)
-    return str(request.param)
-
-
-@pytest.fixture(params=["native", "compiled"])
-def fast_engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    use(request.param, monkeypatch)
 
 
 def table_of(kinds: tuple[str, ...], depth: int, shape: Shape, step: float = 8.0) -> Table:
@@ -115,7 +87,6 @@ def nearest(scaled: NDArray[np.float32]) -> Integers:
     "shape",
     [(1, 1, 1, 1), (2, 3, 5, 7), (1, 2, 1, 67), (3, 2, 37, 2), (5, 4, 13, 31), (2, 1, 20, 20)],
 )
-@pytest.mark.usefixtures("fast_engine")
 def test_there_and_back(shape: Shape, kinds: tuple[str, ...], content: str) -> None:
     table, integers = table_of(kinds, 3, shape), make(content, shape)
     given = integers.copy()
@@ -127,7 +98,7 @@ def test_there_and_back(shape: Shape, kinds: tuple[str, ...], content: str) -> N
     assert (again == inside(integers, table)).all()
 
 
-def test_each_way_to_write_a_magnitude(engine: str) -> None:
+def test_each_way_to_write_a_magnitude() -> None:
     magnitudes = [
         *range(1, 19),
         4094,
@@ -141,70 +112,11 @@ def test_each_way_to_write_a_magnitude(engine: str) -> None:
     assert (decode_block(encode_block(integers), integers.shape) == integers).all()
 
 
-@pytest.mark.usefixtures("fast_engine")
 def test_nothing_to_code_takes_no_bytes() -> None:
     table = table_of(("none", "klt", "9/7", "9/7"), 1, (3, 4, 5, 6), 1e9)
     assert len(table) == 0
     assert encode_integers(make("dense", (3, 4, 5, 6)), table).data == b""
     assert not decode_integers(b"", (3, 4, 5, 6), table).any()
-
-
-Results = list[Any]
-
-
-def work(kinds: tuple[str, ...], depth: int, shape: Shape, content: str) -> Results:
-    """Bytes, chosen integers, what they decode to, and the states left behind."""
-    table, scaled = table_of(kinds, depth, shape), coefficients(shape)
-    first, second = blank_state(), blank_state()
-    plain = encode_integers(make(content, shape), table, state=first)
-    chosen = encode_integers(nearest(scaled), table, scaled=scaled, weight=0.09, state=second)
-    prior_used = encode_integers(chosen.integers, table)
-    decoded = decode_integers(prior_used.data, shape, table)
-    assert (decoded == inside(chosen.integers, table)).all()
-    states = [
-        array for state in (first, second) for array in (state.slots, state.weights, state.simples)
-    ]
-    return [plain.data, chosen.data, prior_used.data, chosen.integers, decoded, *states]
-
-
-@pytest.mark.parametrize("engine_name", ["compiled", "plain"])
-@pytest.mark.parametrize(
-    ("kinds", "depth", "shape", "content"),
-    [
-        (COUPLED, 3, (3, 2, 9, 26), "mixed"),
-        (PACKETS, 2, (2, 3, 7, 11), "dense"),
-        (BASES, 1, (3, 2, 6, 9), "huge"),
-        (NONE, 0, (1, 1, 1, 1), "huge"),
-    ],
-)
-def test_every_engine_gives_the_same(
-    engine_name: str,
-    kinds: tuple[str, ...],
-    depth: int,
-    shape: Shape,
-    content: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    reference = {
-        "compiled": "native",
-        "plain": "compiled" if native.library() is None else "native",
-    }[engine_name]
-    results = []
-    for name in (reference, engine_name):
-        with monkeypatch.context() as patch:
-            use(name, patch)
-            results.append(work(kinds, depth, shape, content))
-    for left, right in zip(*results, strict=True):
-        assert np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right
-
-
-def test_compiled_and_native_agree_on_a_larger_tile(monkeypatch: pytest.MonkeyPatch) -> None:
-    use("native", monkeypatch)
-    shape, kinds = (6, 5, 41, 53), COUPLED
-    here = work(kinds, 4, shape, "mixed")
-    use("compiled", monkeypatch)
-    for left, right in zip(here, work(kinds, 4, shape, "mixed"), strict=True):
-        assert np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right
 
 
 def almost_nothing(shape: Shape) -> Integers:
@@ -217,9 +129,7 @@ def almost_nothing(shape: Shape) -> Integers:
 
 @pytest.mark.parametrize("coder", CODERS)
 @pytest.mark.parametrize("mode", ["integers", "trellis", "choice"])
-def test_engines_agree_where_nothing_moves_any_more(
-    coder: str, mode: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimates_stay_where_nothing_moves_any_more(coder: str, mode: str) -> None:
     shape, trellis = (1, 3, 40, 150), mode == "trellis"
     table, integers, scaled = single_band(shape), almost_nothing(shape), None
     if trellis:
@@ -228,18 +138,13 @@ def test_engines_agree_where_nothing_moves_any_more(
         noise = np.random.default_rng(2).uniform(-0.6, 0.6, shape)
         scaled = (integers + np.where(integers == 0, noise, 0.2)).astype(np.float32)
         integers = nearest(scaled)
-    results = []
-    for name in ("native", "compiled"):
-        use(name, monkeypatch)
-        state = blank_state(coder)
-        coded = encode_integers(
-            integers, table, scaled=scaled, weight=0.3, state=state, coder=coder, trellis=trellis
-        )
-        again = encode_integers(coded.integers, table, coder=coder, trellis=trellis)
-        decoded = decode_integers(again.data, shape, table, coder=coder, trellis=trellis)
-        assert np.array_equal(decoded, coded.integers)
-        results.append((coded.data, coded.integers.tobytes(), again.data, state.slots.tobytes()))
-    assert results[0] == results[1]
+    state = blank_state(coder)
+    coded = encode_integers(
+        integers, table, scaled=scaled, weight=0.3, state=state, coder=coder, trellis=trellis
+    )
+    again = encode_integers(coded.integers, table, coder=coder, trellis=trellis)
+    decoded = decode_integers(again.data, shape, table, coder=coder, trellis=trellis)
+    assert np.array_equal(decoded, coded.integers)
     # The estimate of a zero where all around is zero has seen all it counts, and stays.
     slow, fast, count, _ = (int(number) for number in state.slots[0])
     assert count == 400
@@ -265,32 +170,19 @@ def trellis_integers(kind: str, shape: Shape, table: Table) -> Integers:
 @pytest.mark.parametrize("content", ["zero", "sparse", "dense", "mixed", "huge"])
 @pytest.mark.parametrize("kinds", [NONE, PACKETS, BASES])
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 7), (3, 2, 37, 2), (5, 4, 13, 31)])
-def test_each_coder_gives_the_same_from_each_engine(
-    shape: Shape,
-    kinds: tuple[str, ...],
-    content: str,
-    trellis: bool,
-    coder: str,
-    monkeypatch: pytest.MonkeyPatch,
+def test_each_coder_there_and_back(
+    shape: Shape, kinds: tuple[str, ...], content: str, trellis: bool, coder: str
 ) -> None:
     table = table_of(kinds, 3, shape)
     integers = inside(make(content, shape), table)
     if trellis:
         integers = trellis_integers(content, shape, table)
-    coded = []
-    for name in ("native", "compiled"):
-        with monkeypatch.context() as patch:
-            use(name, patch)
-            state = blank_state(coder)
-            encoded = encode_integers(integers, table, state=state, coder=coder, trellis=trellis)
-            coded.append((encoded.data, state.slots.tobytes(), state.weights.tobytes()))
-            encoded = encode_integers(integers, table, coder=coder, trellis=trellis)
-            again = decode_integers(encoded.data, shape, table, coder=coder, trellis=trellis)
-            assert np.array_equal(again, integers)
-    assert coded[0] == coded[1]
+    encoded = encode_integers(integers, table, coder=coder, trellis=trellis)
+    again = decode_integers(encoded.data, shape, table, coder=coder, trellis=trellis)
+    assert np.array_equal(again, integers)
 
 
-def test_integers_of_the_other_quantiser_are_refused(engine: str) -> None:
+def test_integers_of_the_other_quantiser_are_refused() -> None:
     shape = (1, 2, 3, 30)
     integers = trellis_integers("dense", shape, single_band(shape))
     flat = integers.ravel()
@@ -316,30 +208,14 @@ def test_unknown_coders_are_refused(unknown: str) -> None:
 
 
 @pytest.mark.parametrize("choosing", [False, True])
-def test_a_second_try_with_more_room_gives_the_same(
-    choosing: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_try_with_more_room_gives_what_was_chosen_at_first(choosing: bool) -> None:
     scaled = rows_that_are_chosen_away()
-    table, results = single_band(scaled.shape), list[tuple[Encoded, NDArray[np.uint16]]]()
-    for name in ("native", "compiled"):
-        with monkeypatch.context() as patch:
-            use(name, patch)
-            state = blank_state()
-            chosen = scaled if choosing else None
-            results.append(
-                (
-                    encode_integers(nearest(scaled), table, scaled=chosen, weight=0.3, state=state),
-                    state.slots,
-                )
-            )
-    (one, one_state), (other, other_state) = results
-    assert len(one.data) > max(4096, scaled.size // 2)
-    assert one.data == other.data
-    assert np.array_equal(one.integers, other.integers)
-    assert np.array_equal(one_state, other_state)
+    table, chosen = single_band(scaled.shape), scaled if choosing else None
+    coded = encode_integers(nearest(scaled), table, scaled=chosen, weight=0.3)
+    assert len(coded.data) > max(4096, scaled.size // 2)
+    assert np.array_equal(decode_integers(coded.data, scaled.shape, table), coded.integers)
 
 
-@pytest.mark.usefixtures("fast_engine")
 def test_choosing_saves_bytes_for_little_error() -> None:
     shape = (4, 3, 21, 30)
     table, scaled = table_of(COUPLED, 2, shape), coefficients(shape)
@@ -361,7 +237,7 @@ def test_choosing_saves_bytes_for_little_error() -> None:
     assert len(chosen.data) < 0.95 * len(plain.data)
 
 
-def test_a_state_is_left_behind_and_helps(engine: str) -> None:
+def test_a_state_is_left_behind_and_helps() -> None:
     shape = (2, 2, 8, 20)
     table, integers, state = single_band(shape), make("dense", shape), blank_state()
     first = encode_integers(integers, table, state=state)
@@ -403,19 +279,12 @@ def survives(count: int, shape: Shape, table: Table) -> int:
 
 
 @pytest.mark.parametrize("kinds", [NONE, COUPLED, BASES])
-@pytest.mark.usefixtures("fast_engine")
 def test_damage_is_refused_or_gives_other_integers(kinds: tuple[str, ...]) -> None:
     shape = (3, 2, 9, 26)
     survives(60, shape, table_of(kinds, 2, shape))
 
 
-def test_damage_in_plain_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    use("plain", monkeypatch)
-    survives(2, (1, 2, 3, 8), single_band((1, 2, 3, 8)))
-
-
-@pytest.mark.usefixtures("fast_engine")
-def test_an_endless_magnitude_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endless_magnitude_is_refused() -> None:
     # The flags of the largest exponent end with a 0. A 1 lies below it in the range, so a somewhat
     # smaller number says that the exponent goes on.
     table = single_band((1, 1, 1, 1))
@@ -429,12 +298,8 @@ def test_an_endless_magnitude_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
         except DamagedFileError:
             endless.append(data)
     assert endless
-    use("plain", monkeypatch)
-    with pytest.raises(DamagedFileError):
-        decode_integers(endless[0], (1, 1, 1, 1), table)
 
 
-@pytest.mark.usefixtures("fast_engine")
 def test_zeros_at_the_end_go_without_saying() -> None:
     shape = (2, 2, 9, 26)
     for seed in range(30):
@@ -446,13 +311,13 @@ def test_zeros_at_the_end_go_without_saying() -> None:
             decode_block(data + b"\0", shape)
 
 
-def test_a_block_has_one_way_to_be_written(engine: str) -> None:
+def test_a_block_has_one_way_to_be_written() -> None:
     shape = (1, 2, 3, 4)
     integers = make("mixed", shape)
     data = encode_block(integers)
     assert (decode_block(memoryview(data), shape) == integers).all()
     refused = 0
-    for damaged in tries(data, 1 if engine == "plain" else 60):
+    for damaged in tries(data, 60):
         try:
             other = decode_block(damaged, shape)
         except DamagedFileError:
@@ -462,7 +327,6 @@ def test_a_block_has_one_way_to_be_written(engine: str) -> None:
     assert refused > 0
 
 
-@pytest.mark.usefixtures("fast_engine")
 def test_a_magnitude_beyond_the_largest_is_no_block() -> None:
     for value in (MAX_INTEGER + 1, -MAX_INTEGER - 1):
         integers = np.full((1, 1, 1, 2), value, dtype=np.int32)
@@ -472,7 +336,6 @@ def test_a_magnitude_beyond_the_largest_is_no_block() -> None:
 
 
 @pytest.mark.parametrize("shape", [(0, 1, 1, 1), (1, 1, 0, 3), (2, 2, 2, 0)])
-@pytest.mark.usefixtures("fast_engine")
 def test_a_block_of_nothing(shape: Shape) -> None:
     assert encode_block(np.zeros(shape, dtype=np.int32)) == b""
     assert decode_block(b"", shape).shape == shape
@@ -480,7 +343,6 @@ def test_a_block_of_nothing(shape: Shape) -> None:
         decode_block(b"\xff", shape)
 
 
-@pytest.mark.usefixtures("fast_engine")
 def test_threads_do_not_meet() -> None:
     shape = (3, 2, 9, 26)
     alone = [encode_block(make("mixed", shape, seed)) for seed in range(8)]
