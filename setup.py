@@ -1,7 +1,7 @@
 """The native extensions: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
 
-The rest of the build is described in pyproject.toml. Without a C++17 compiler the installation fails
-in one line.
+The rest of the build is described in pyproject.toml. Without a C++17 compiler the installation
+fails in one line.
 """
 
 import os

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.train.clock import now
-from fhash_codec.native import network as native
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import ArrayTable, Layer, Network
 from fhash_codec.paper.points import sample_points

@@ -61,6 +61,7 @@ _CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
 _FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
 _RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
 _CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
 _TYPES = ("f32", "f64")
 _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
@@ -82,6 +83,8 @@ PROTOTYPES: Prototypes = {
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
+    # mask_levels.cpp
+    **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
     # labels.cpp
     "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
     "fhash_encode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
