@@ -20,7 +20,7 @@ class Reference:
     """An earlier band, and how often an index along t, z, y, x is halved on the way to it."""
 
     band: int
-    halvings: tuple[int, int, int, int]
+    halvings: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -64,34 +64,26 @@ def bands_of(axes: Sequence[Any], shape: Sequence[int]) -> list[Band]:
     t, z, y, x = (_spans(axis, n) for axis, n in zip(axes, shape, strict=True))
     coupled = axes[2].kind in WAVELETS and axes[2][:2] == axes[3][:2]
     klt = "klt" in (axes[2].kind, axes[3].kind)
-    groups = _coupled(y, x) if coupled else [list(product(y, x))]
     bands: list[Band] = []
     numbers: dict[Key, int] = {}
 
     def reference(key: Key, *halvings: int) -> Reference | None:
-        return Reference(numbers[key], halvings) if key in numbers else None  # type: ignore[arg-type]
+        return Reference(numbers[key], halvings) if key in numbers else None
 
-    for group in groups:
-        for (nt, st), (nz, sz) in product(enumerate(t), enumerate(z)):
-            for sy, sx in group:
-                spans = (st, sz, sy, sx)
-                key = (nt, nz, sy[0], sx[0])
-                parent = _coupled_parent(key, numbers) if coupled else _parent(key, y, x)
-                before_t = reference((nt - 1, *key[1:]), int(nt > 1), 0, 0, 0)
-                before_z = reference((nt, nz - 1, *key[2:]), 0, int(nz > 1), 0, 0)
-                band = Band(
-                    tuple(span[1] for span in spans),
-                    tuple(span[2] for span in spans),
-                    4 * _plane_kind(key, klt) + 2 * (st[0] > 0) + (sz[0] > 0),
-                    (
-                        reference(*parent) if parent else None,
-                        before_t,
-                        before_z,
-                        reference(_sibling(key), 0, 0, 0, 0) if coupled else None,
-                    ),
-                )
-                numbers[key] = len(bands)
-                bands.append(band)
+    for group in _coupled(y, x) if coupled else [list(product(y, x))]:
+        for (nt, st), (nz, sz), (sy, sx) in product(enumerate(t), enumerate(z), group):
+            spans, key = (st, sz, sy, sx), (nt, nz, sy[0], sx[0])
+            parent = _coupled_parent(key, numbers) if coupled else _parent(key, y, x)
+            references = (
+                reference(*parent) if parent else None,
+                reference((nt - 1, *key[1:]), int(nt > 1), 0, 0, 0),
+                reference((nt, nz - 1, *key[2:]), 0, int(nz > 1), 0, 0),
+                reference(_sibling(key), 0, 0, 0, 0) if coupled else None,
+            )
+            kind = 4 * _plane_kind(key, klt) + 2 * (st[0] > 0) + (sz[0] > 0)
+            numbers[key] = len(bands)
+            low, high = (tuple(span[end] for span in spans) for end in (1, 2))
+            bands.append(Band(low, high, kind, references))
     return bands
 
 
@@ -110,14 +102,9 @@ def _coupled(y: list[Span], x: list[Span]) -> list[list[tuple[Span, Span]]]:
     groups = [[(by_y[0], by_x[0])]]
     for level in range(max([*by_y, *by_x]), 0, -1):
         low_y, low_x = (-level, 0, _low_end(by_y, level)), (-level, 0, _low_end(by_x, level))
-        group = []
-        if level in by_x:
-            group.append((low_y, by_x[level]))
-        if level in by_y:
-            group.append((by_y[level], low_x))
-        if level in by_x and level in by_y:
-            group.append((by_y[level], by_x[level]))
-        groups.append(group)
+        high_y, high_x = by_y.get(level), by_x.get(level)
+        pairs = ((low_y, high_x), (high_y, low_x), (high_y, high_x))
+        groups.append([(a, b) for a, b in pairs if a is not None and b is not None])
     return groups
 
 

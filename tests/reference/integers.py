@@ -71,6 +71,11 @@ in 1/1024."""
 REFERENCE = 62
 """Weight of the vertex of a reference; the sum around it has 20."""
 
+CONSISTENT = (
+    *((3, 0, 0, 0, -1), (6, 0, 0, -1, 0), (13, 0, -1, 0, 0)),
+    *((25, -1, 0, 0, 0), (5, 0, 0, -1, -1), (7, 0, 0, -1, 1)),
+)
+"""Inputs of a sign that are compared with what a reference has at the same offset."""
 PAD = 4
 """Zeros around a band on each side, for vertices that do not exist."""
 
@@ -86,13 +91,13 @@ class BandNumbers:
         self.numbers = [0] * int(np.prod(padded))
         self.filled = np.zeros(self.n[:3], bool)
 
-    def place(self, t: int, z: int, y: int, x: int) -> int:
-        """Place of a vertex in `numbers`."""
-        return sum((i + PAD) * s for i, s in zip((t, z, y, x), self.strides, strict=True))
+    def offset(self, *moves: int) -> int:
+        """Distance in `numbers` between two vertices, some vertices apart along t, z, y, x."""
+        return sum(i * stride for i, stride in zip(moves, self.strides, strict=True))
 
-    def offset(self, t: int, z: int, y: int, x: int) -> int:
-        """Distance between the places of two vertices."""
-        return sum(i * s for i, s in zip((t, z, y, x), self.strides, strict=True))
+    def place(self, *index: int) -> int:
+        """Place of a vertex in `numbers`."""
+        return PAD * sum(self.strides) + self.offset(*index)
 
 
 def decode_block(data: bytes | memoryview, shape: Sequence[int]) -> npt.NDArray[np.int32]:
@@ -177,10 +182,8 @@ class IntegerDecoder:
 
     def weight_of_neighbours(self, t: int, z: int, y: int) -> int:
         """Sum of the weights in the expected magnitude of a row's vertices."""
-        groups = [LEFT]
-        groups += [ABOVE] * (y > 0) + [ABOVE2] * (y > 1)
-        groups += [BEFORE] * (t > 0) + [BEFORE2] * (t > 1)
-        groups += [BELOW] * (z > 0) + [BELOW2] * (z > 1)
+        groups = [LEFT, *[ABOVE] * (y > 0), *[ABOVE2] * (y > 1), *[BEFORE] * (t > 0)]
+        groups += [*[BEFORE2] * (t > 1), *[BELOW] * (z > 0), *[BELOW2] * (z > 1)]
         weight = sum(sum(group.values()) for group in groups)
         references = sum(r is not None for r in self.present.band.references)
         return weight + references * (REFERENCE + 2 * 20)
@@ -281,21 +284,17 @@ class IntegerDecoder:
         if self.signs:
             inputs = self.sign_inputs(t, z, y, x, at)
             return self.signs[self.kind].decode(inputs, t, y, x)
-        numbers, by = self.present.numbers, self.present.offset
         left, left2, up, up2, below, before = (
-            sign_class(numbers[at + by(*place)])
-            for place in (
-                *((0, 0, 0, -1), (0, 0, 0, -2), (0, 0, -1, 0)),
-                *((0, 0, -2, 0), (0, -1, 0, 0), (-1, 0, 0, 0)),
-            )
+            sign_class(self.present.numbers[at + self.present.offset(*by)])
+            for by in (*LEFT, (0, 0, -1, 0), *ABOVE2, (0, -1, 0, 0), (-1, 0, 0, 0))
         )
-        slots = [
-            SIGN_STARTS[0] + self.kind * 27 + in_threes(left, up, before),
-            SIGN_STARTS[1] + self.kind * 81 + in_threes(left, left2, up, up2),
-            SIGN_STARTS[2] + self.kind * 27 + in_threes(before, below, left),
-        ]
-        sets = (PLAIN_SIGNS + self.kind * LANES,)
-        return self.adaptive.mixed(slots, sets, most_uses=255)
+        contexts = (
+            self.kind * 27 + in_threes(left, up, before),
+            self.kind * 81 + in_threes(left, left2, up, up2),
+            self.kind * 27 + in_threes(before, below, left),
+        )
+        slots = [start + context for start, context in zip(SIGN_STARTS, contexts, strict=False)]
+        return self.adaptive.mixed(slots, (PLAIN_SIGNS + self.kind * LANES,), most_uses=255)
 
     def sign_inputs(self, t: int, z: int, y: int, x: int, at: int) -> list[int]:
         """The 96 inputs of a linear predictor of a sign: logarithms with signs."""
@@ -328,13 +327,8 @@ class IntegerDecoder:
                 to[38] = centre if x & 1 else -centre
                 to[39] = centre if y & 1 else -centre
             if reference.halvings[3] == 0:  # a neighbour here, the same there, and the centre there
-                pairs = (
-                    *((to[3], there(0, 0, 0, -1)), (to[6], there(0, 0, -1, 0))),
-                    *((to[13], there(0, -1, 0, 0)), (to[25], there(-1, 0, 0, 0))),
-                    *((to[5], there(0, 0, -1, -1)), (to[7], there(0, 0, -1, 1))),
-                )
-                for i, (here, same) in enumerate(pairs):
-                    to[72 + 6 * k + i] = consistent(here, same, centre)
+                for i, (number, *by) in enumerate(CONSISTENT):
+                    to[72 + 6 * k + i] = consistent(to[number], there(*by), centre)
         return to
 
 

@@ -112,46 +112,30 @@ def decode_predicted(
     """The integers (t, z, y, x) of a tile."""
     weights = [4096] * (KINDS * DECISIONS * LANES) + [0] * (48 * DECISIONS * LANES)
     adaptive = Adaptive(data, sum(SIZES) * DECISIONS, weights, 200)
-    result = np.zeros(tuple(shape), np.int64)
-    shift = list(levels)
-    known = errors = np.zeros((0, 0, 0, 0), np.int64)
+    result, shift = np.zeros(tuple(shape), np.int64), list(levels)
+    errors = np.zeros_like(result)  # differences of all known integers from their predictions
     for one in passes:
+        known = tuple(slice(None, None, 1 << s) for s in shift)
+        where = list(known)
         if one.axis >= 0:
             shift[one.axis] -= 1
-        where = [slice(None, None, 1 << s) for s in shift]
-        fine = result[tuple(where)].shape
-        if one.axis >= 0:
-            where[one.axis] = slice(1 << shift[one.axis], None, 2 << shift[one.axis])
-        lattice = result[tuple(where)]
-        if not lattice.size:
-            continue
-        coder = PassDecoder(adaptive, one, known, errors, lattice.shape)
+            step = 1 << shift[one.axis]
+            where[one.axis] = slice(step, None, 2 * step)
+        new = tuple(where)
+        coder = PassDecoder(adaptive, one, (result[known], errors[known]), result[new].shape)
         coder.run()
-        lattice[...] = coder.values
-        if one.axis < 0:
-            known, errors = coder.values, coder.errors
-        else:
-            known = interleaved(known, coder.values, one.axis, fine)
-            errors = interleaved(errors, coder.errors, one.axis, fine)
+        result[new], errors[new] = coder.values, coder.errors
     return result.astype(np.int32)
-
-
-def interleaved(even: Lattice, odd: Lattice, axis: int, shape: Place) -> Lattice:
-    """Two lattices as one, their vertices by turns along an axis."""
-    both = np.zeros(shape, np.int64)
-    np.moveaxis(both, axis, 0)[0::2] = np.moveaxis(even, axis, 0)
-    np.moveaxis(both, axis, 0)[1::2] = np.moveaxis(odd, axis, 0)
-    return both
 
 
 class PassDecoder:
     """One pass: the known lattice and its own, each as values and as differences (`errors`)."""
 
     def __init__(
-        self, adaptive: Adaptive, one: Pass, known: Lattice, known_errors: Lattice, shape: Place
+        self, adaptive: Adaptive, one: Pass, known: tuple[Lattice, Lattice], shape: Place
     ) -> None:
         self.adaptive, self.one = adaptive, one
-        self.known, self.known_errors = known, known_errors
+        self.known, self.known_errors = known
         self.values, self.errors = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
 
     def run(self) -> None:
@@ -160,10 +144,9 @@ class PassDecoder:
         for row in product(*map(range, self.values.shape[:3])):
             near, weight = self.errors_near(row)
             vertices = [(*row, x) for x in range(n)]
-            if not near.any():
+            if not near.any() and n:  # a decision tells whether the row differs at all
                 lively = self.one.axis >= 0 and any(self.is_lively(place) for place in vertices)
-                number = ROWS + lively + 2 * any(row) + 4 * (n > 16)
-                if not self.adaptive.simple(number):
+                if not self.adaptive.simple(ROWS + lively + 2 * any(row) + 4 * (n > 16)):
                     for place in vertices:
                         self.values[place] = rounded(self.predict(place)[0])
                     continue
@@ -175,7 +158,6 @@ class PassDecoder:
         """Weighted sums of the differences known before a row; and the sum of the weights."""
         t, z, y = row
         axis, n = self.one.axis, self.values.shape[3]
-        near, weight = np.zeros(n, np.int64), 0
         terms: list[tuple[Lattice, Place, int, int]] = []  # lattice, row, offset along x, weight
         if axis >= 0:
             terms.append((self.known_errors, row, 0, 4))
@@ -183,33 +165,29 @@ class PassDecoder:
             if axis == 3 or beyond[axis] < self.known.shape[axis]:
                 terms.append((self.known_errors, beyond, int(axis == 3), 4))
         if y:
-            above = (t, z, y - 1)
-            terms += [(self.errors, above, x, weight) for x, weight in ((0, 20), (-1, 7), (1, 7))]
+            terms += [(self.errors, (t, z, y - 1), x, w) for x, w in ((0, 20), (-1, 7), (1, 7))]
         if z:
             terms.append((self.errors, (t, z - 1, y), 0, 15))
         if t:
             terms += [(self.errors, (t - 1, z, y), 0, 15), (self.errors, (t - 1, z, y), 1, 7)]
             if y + 1 < self.values.shape[2]:
                 terms.append((self.errors, (t - 1, z, y + 1), 0, 7))
-        for lattice, place, offset, factor in terms:
+        near = np.zeros(n, np.int64)
+        for lattice, place, offset, weight in terms:
             line = np.minimum(np.abs(lattice[place]), 4095)
             first, last = max(0, -offset), min(n, len(line) - offset)
-            near[first:last] += factor * line[first + offset : last + offset]
-            weight += factor
-        return near, weight
+            near[first:last] += weight * line[first + offset : last + offset]
+        return near, sum(weight for *_, weight in terms)
 
     def base(self, place: Place) -> tuple[int, int]:
         """Twice the base, and how far the two vertices of it differ."""
         axis = self.one.axis
         if axis < 0:
-            for k in (3, 2, 1, 0):
-                if place[k]:
-                    return 2 * int(self.values[moved(place, k, -1)]), 0
-            return 0, 0
-        first = int(self.known[place])
-        if place[axis] + 1 >= self.known.shape[axis]:
-            return 2 * first, 0
-        second = int(self.known[moved(place, axis, 1)])
+            before = next((moved(place, k, -1) for k in (3, 2, 1, 0) if place[k]), None)
+            return (2 * int(self.values[before]) if before else 0), 0
+        first = second = int(self.known[place])
+        if place[axis] + 1 < self.known.shape[axis]:
+            second = int(self.known[moved(place, axis, 1)])
         return first + second, abs(first - second)
 
     def taps(self, place: Place, with_row: bool) -> tuple[int, int]:
@@ -218,19 +196,17 @@ class PassDecoder:
         with_row: whether taps in the row itself count.
         """
         base, total, activity = self.base(place)[0], 0, 0
-        for k, ((own, offset), weight) in enumerate(
-            zip(self.one.taps, self.one.weights, strict=True)
-        ):
+        taps = zip(self.one.taps, self.one.weights, strict=True)
+        for k, ((own, offset), weight) in enumerate(taps):
             lattice = self.values if own else self.known
             there = tuple(i + by for i, by in zip(place, offset, strict=True))
             in_row = own and not any(offset[:3])
             exists = all(0 <= i < n for i, n in zip(there, lattice.shape, strict=True))
-            if not exists or (in_row and not with_row):
-                continue
-            difference = 2 * int(lattice[there]) - base
-            total += weight * difference
-            if k < 14 and (not in_row or self.one.axis < 0):
-                activity += min(abs(difference), 1 << 24)
+            if exists and (with_row or not in_row):
+                difference = 2 * int(lattice[there]) - base
+                total += weight * difference
+                if k < 14 and (not in_row or self.one.axis < 0):
+                    activity += min(abs(difference), 1 << 24)
         return total, activity
 
     def is_lively(self, place: Place) -> bool:
@@ -253,67 +229,52 @@ class PassDecoder:
         whole = rounded(prediction)
         fraction = prediction - (whole << 13)
         sign = -1 if fraction < 0 else 1  # of the likelier difference
-        tenths = min((fraction * sign * 10) >> 13, 4)
         around = [
             int(self.errors[moved(place, axis, -1)]) if place[axis] else 0 for axis in (3, 2, 1, 0)
         ]
-        expected = near + 20 * min(abs(around[0]), 4095)
         low, level = 0, 0
-        if expected:
+        if expected := near + 20 * min(abs(around[0]), 4095):
             octaves = log16(expected) - log_weight
             level = clamp(1 + (octaves + 80) * 3 // 16, 1, 47)
             low = (octaves - 26) // 16 + 1 if octaves > 25 else 0
-        self.contexts(place, prediction, activity, sign, tenths, level, around)
-        error = self.difference(sign, low, level)
+        sides = [side(gap * sign) for gap in self.other_predictions(place, prediction)]
+        # The contexts of the seven estimates.
+        sizes = signs = 0
+        for error in (*around, 0 if self.one.axis < 0 else int(self.known_errors[place])):
+            sizes = sizes * 5 + sum(abs(error) >= bound for bound in (1, 2, 4, 9))
+        for error in around:
+            signs = signs * 3 + (error * sign > 0) - (error * sign < 0) + 1
+        tenths, half = min((fraction * sign * 10) >> 13, 4), level // 2
+        lively, steep = half_octaves(activity, 31), half_octaves(self.base(place)[1], 26)
+        context = (
+            level * 5 + tenths,
+            lively * 27 + steep,
+            (self.one.kind * 24 + half) * 5 + tenths,
+            sizes,
+            ((sides[0] * 9 + sides[1]) * 5 + tenths) * 8 + half // 3,
+            signs * 24 + half,
+            (lively * 24 + half) * 5 + tenths,
+        )
+        error = self.difference(sign, low, level, context)
         if abs(whole + error) > LARGEST:
             raise ValueError("a predicted integer is too large")
         self.values[place] = whole + error
         self.errors[place] = clamp(error, -LARGEST, LARGEST)
 
-    def contexts(
-        self,
-        place: Place,
-        prediction: int,
-        activity: int,
-        sign: int,
-        tenths: int,
-        level: int,
-        around: list[int],
-    ) -> None:
-        """Choose the contexts of the seven estimates."""
-        axis, half = self.one.axis, level // 2
-        base, slope = self.base(place)
-        step = 0  # how far the prediction is from one with the error of the base a step before
-        if axis > 0 and place[0]:
-            before = moved(place, 0, -1)
-            change = 2 * int(self.values[before]) - self.base(before)[0]
-            step = side(((base + change) * 4096 - prediction) * sign)
-        else:
-            step = side(0)
-        sizes = 0
-        for error in (*around, 0 if axis < 0 else int(self.known_errors[place])):
-            sizes = sizes * 5 + sum(abs(error) >= bound for bound in (1, 2, 4, 9))
-        signs = 0
-        for error in around:
-            signs = signs * 3 + (error * sign > 0) - (error * sign < 0) + 1
-        lively, steep = half_octaves(activity, 31), half_octaves(slope, 26)
-        base_side = side((base * 4096 - prediction) * sign)
-        self.context = (
-            level * 5 + tenths,
-            lively * 27 + steep,
-            (self.one.kind * 24 + half) * 5 + tenths,
-            sizes,
-            ((base_side * 9 + step) * 5 + tenths) * 8 + half // 3,
-            signs * 24 + half,
-            (lively * 24 + half) * 5 + tenths,
-        )
+    def other_predictions(self, place: Place, prediction: int) -> tuple[int, int]:
+        """How far the base lies from the prediction, and the base with its error a step before."""
+        base = self.base(place)[0]
+        if self.one.axis <= 0 or not place[0]:
+            return base * 4096 - prediction, 0
+        before = moved(place, 0, -1)
+        change = 2 * int(self.values[before]) - self.base(before)[0]
+        return base * 4096 - prediction, (base + change) * 4096 - prediction
 
-    def difference(self, sign: int, low: int, level: int) -> int:
+    def difference(self, sign: int, low: int, level: int, context: Sequence[int]) -> int:
         """Decode a difference: zero flag, sign, magnitude; then its `low` lowest bits."""
 
         def decision(k: int) -> int:
-            pairs = zip(STARTS, self.context, strict=True)
-            slots = [(start + context) * DECISIONS + k for start, context in pairs]
+            slots = [(a + b) * DECISIONS + k for a, b in zip(STARTS, context, strict=True)]
             sets = (self.one.kind * DECISIONS + k, (KINDS + level) * DECISIONS + k)
             return self.adaptive.mixed(slots, [number * LANES for number in sets])
 
@@ -365,7 +326,7 @@ def half_octaves(value: int, most: int) -> int:
     return min(1 + log16(value) // 8, most) if value else 0
 
 
-def side(difference: int) -> int:
+def side(gap: int) -> int:
     """How far, and on which side, another prediction lies: 0 to 8; in 1/8192."""
-    size = sum(abs(difference) >= bound for bound in (1229, 4096, 9830, 24576))
-    return 4 - size if difference < 0 else 4 + size
+    size = sum(abs(gap) >= bound for bound in (1229, 4096, 9830, 24576))
+    return 4 - size if gap < 0 else 4 + size

@@ -33,49 +33,39 @@ PLAIN, MASKED, PREDICTED, PREDICTED_MASKED, LABELS, LABELS_MASKED = range(1, 7)
 """Numbers in the upper three bits of the flags."""
 
 
-def decode_tile(
-    data: bytes, shape: Sequence[int], dtype: Any, settings: Settings | None = None
-) -> tuple[Values, Values | None]:
-    """The values (t, z, y, x) of a stream, and which are occupied; None without a mask.
+class Stream:
+    """The parts of a stream.
 
-    Args:
-        data: the stream.
-        shape: lengths of the tile along t, z, y, x.
-        dtype: type of the array.
-        settings: settings that all tiles of the array share; a stream's own replace them.
+    Attributes:
+        flags: the first byte; its upper three bits are `number`.
+        sections: the sections by name.
+        digest: CRC-32 of the coded integers, where there are some.
+        settings: its own settings, or those that it shares.
+        shape, kind: of the tile (t, z, y, x), less the origin.
     """
-    flags, sections, digest = split(memoryview(data))
-    if "settings" in sections:
-        settings = json.loads(zlib.decompress(sections["settings"]))
-    settings = settings or {}
-    kind, origin = np.dtype(dtype), settings.get("origin", 0)
-    coded = np.dtype(np.int64) if origin else kind
-    values, mask = decode_sections(flags, sections, digest, tuple(shape), coded, settings)
-    if origin:
-        limits = np.iinfo(kind)
-        sums = [min(max(int(v) + origin, limits.min), limits.max) for v in values.flat]
-        values = np.array(sums, kind).reshape(shape)
-    return values, mask
 
-
-def split(data: memoryview) -> tuple[int, dict[str, memoryview], int]:
-    """The flags of a stream, its sections by name, and the digest of its integers."""
-    flags = data[0]
-    number = flags >> 5
-    labelled = number in (LABELS, LABELS_MASKED)
-    coded = not labelled and not flags & (EXACT | EMPTY)
-    names = ["settings"] * bool(flags & OWN)
-    if labelled:
-        names.append("labels")
-    else:
-        empty = bool(flags & EMPTY)
-        names += ["missing"] * bool(flags & MISSING)
-        names += ["coefficients"] * coded + ["residual"] * bool(coded and flags & RESIDUAL)
-        names += ["exact"] * bool(flags & EXACT)
-        names += ["mask"] * (number in (MASKED, PREDICTED_MASKED) and not empty)
-    digest = int.from_bytes(data[1:5], "little")
-    found = list(sections_in(data[5 if coded else 1 :]))
-    return flags, dict(zip(names, found, strict=True)), digest
+    def __init__(self, data: memoryview, shape: Sequence[int], dtype: Any, shared: Any) -> None:
+        self.flags, self.number = data[0], data[0] >> 5
+        self.labelled = self.number in (LABELS, LABELS_MASKED)
+        self.predicted = self.number in (PREDICTED, PREDICTED_MASKED)
+        self.masked = self.number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
+        coded = not self.labelled and not self.flags & (EXACT | EMPTY)
+        names = ["settings"] * bool(self.flags & OWN)
+        if self.labelled:
+            names.append("labels")
+        else:
+            names += ["missing"] * bool(self.flags & MISSING)
+            names += ["coefficients"] * coded + ["residual"] * bool(coded and self.flags & RESIDUAL)
+            names += ["exact"] * bool(self.flags & EXACT)
+            names += ["mask"] * (self.masked and not self.flags & EMPTY)
+        found = sections_in(data[5 if coded else 1 :])
+        self.sections = dict(zip(names, found, strict=True))
+        self.digest = int.from_bytes(data[1:5], "little")
+        own = self.sections.get("settings")
+        self.settings: Settings = shared or {} if own is None else json.loads(zlib.decompress(own))
+        self.shape, self.origin = tuple(shape), self.settings.get("origin", 0)
+        self.kind = np.dtype(np.int64 if self.origin else dtype)
+        self.working = np.dtype(np.float64 if self.settings.get("double") else np.float32)
 
 
 def sections_in(data: memoryview) -> Iterator[memoryview]:
@@ -92,100 +82,93 @@ def sections_in(data: memoryview) -> Iterator[memoryview]:
         data = data[size:]
 
 
-def decode_sections(
-    flags: int,
-    sections: dict[str, memoryview],
-    digest: int,
-    shape: tuple[int, ...],
-    kind: np.dtype[Any],
-    settings: Settings,
+def decode_tile(
+    data: bytes, shape: Sequence[int], dtype: Any, settings: Settings | None = None
 ) -> tuple[Values, Values | None]:
+    """The values (t, z, y, x) of a stream, and which are occupied; None without a mask.
+
+    Args:
+        data: the stream.
+        shape: lengths of the tile along t, z, y, x.
+        dtype: type of the array.
+        settings: settings that all tiles of the array share; a stream's own replace them.
+    """
+    stream = Stream(memoryview(data), shape, dtype, settings)
+    values, mask = decode_stream(stream)
+    if stream.origin:
+        limits = np.iinfo(dtype)
+        sums = [min(max(int(v) + stream.origin, limits.min), limits.max) for v in values.flat]
+        values = np.array(sums, dtype).reshape(stream.shape)
+    return values, mask
+
+
+def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
     """The values of a stream less the origin, and its mask."""
-    number = flags >> 5
-    masked = number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
-    nothing = np.zeros(shape, int)
-    if number in (LABELS, LABELS_MASKED):
-        values, mask = unpack_labelled(sections["labels"], shape, kind, masked, bool(flags & MANY))
-        values = values.astype(kind).reshape(shape)
-        return blanked(values, mask, settings), mask
-    if flags & EXACT:
+    sections, kind, settings = stream.sections, stream.kind, stream.settings
+    nothing = np.zeros(stream.shape, int)
+    if stream.labelled:
+        many = bool(stream.flags & MANY)
+        values, mask = unpack_labelled(sections["labels"], stream.shape, kind, stream.masked, many)
+        return blanked(values.astype(kind), mask, settings), mask
+    if stream.flags & EXACT:
         plain = np.frombuffer(zlib.decompress(sections["exact"]), np.uint8)
         planes = np.ascontiguousarray(plain.reshape(kind.itemsize, -1).T)
-        values = planes.view(kind.newbyteorder("<")).reshape(shape).astype(kind)
-        return values, unpack_mask(sections["mask"], (nothing, nothing)) if masked else None
-    working = np.dtype(np.float64 if settings.get("double") else np.float32)
-    if flags & EMPTY:
-        values = cast(np.full(shape, float(settings["center"])), kind)
-        mask = np.zeros(shape, bool) if masked else None
+        values = planes.view(kind.newbyteorder("<")).reshape(stream.shape).astype(kind)
+        return values, unpack_mask(sections["mask"], (nothing, nothing)) if stream.masked else None
+    if stream.flags & EMPTY:
+        values = cast(np.full(stream.shape, float(settings["center"])), kind)
+        mask = np.zeros(stream.shape, bool) if stream.masked else None
     else:
-        if number in (PREDICTED, PREDICTED_MASKED):
-            before, values = predicted(sections, digest, shape, kind, settings)
-        else:
-            before, values = transformed(sections, digest, shape, kind, settings, working)
-        levels = mask_levels(before.astype(working), settings["mask"]) if masked else None
-        mask = None if levels is None else unpack_mask(sections["mask"], levels)
+        before, values = predicted(stream) if stream.predicted else transformed(stream)
+        mask = None
+        if stream.masked:
+            levels = mask_levels(before.astype(stream.working), settings["mask"])
+            mask = unpack_mask(sections["mask"], levels)
         if settings.get("clip"):
             low, high = (in_type(end, kind) for end in settings["range"])
             values = np.where(values < low, low, np.where(values > high, high, values))
     values = blanked(values, mask, settings)
     if "missing" in sections:
-        marks = decode_block(sections["missing"][4:], shape)
+        marks = decode_block(sections["missing"][4:], stream.shape)
         check(marks, int.from_bytes(sections["missing"][:4], "little"))
         for mark, value in ((1, np.nan), (2, np.inf), (3, -np.inf)):
             values[marks == mark] = value
     return values, mask
 
 
-def predicted(
-    sections: dict[str, memoryview],
-    digest: int,
-    shape: tuple[int, ...],
-    kind: np.dtype[Any],
-    settings: Settings,
-) -> tuple[Values, Values]:
+def predicted(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by prediction: in float64, and in their type."""
-    predictor = settings["predictor"]
+    predictor = stream.settings["predictor"]
     passes = passes_of(predictor, base64.b64decode)
-    integers = decode_predicted(sections["coefficients"], shape, predictor["levels"], passes)
-    check(integers, digest)
+    coded = stream.sections["coefficients"]
+    integers = decode_predicted(coded, stream.shape, predictor["levels"], passes)
+    check(integers, stream.digest)
     values = integers * np.float64(predictor["step"]) + np.float64(predictor["origin"])
-    values = np.clip(values, *map(np.float64, settings["range"]))
-    return values, cast(values, kind)
+    values = np.clip(values, *map(np.float64, stream.settings["range"]))
+    return values, cast(values, stream.kind)
 
 
-def transformed(
-    sections: dict[str, memoryview],
-    digest: int,
-    shape: tuple[int, ...],
-    kind: np.dtype[Any],
-    settings: Settings,
-    working: np.dtype[Any],
-) -> tuple[Values, Values]:
+def transformed(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by transform: before head and residual, and in their type."""
+    settings, shape, number = stream.settings, stream.shape, stream.working.type
     axes = [axis_of(settings["transform"][name], base64.b64decode) for name in "tzyx"]
-    integers = decode_integers(
-        sections["coefficients"],
-        shape,
-        bands_of(axes, shape),
-        settings.get("coder", "contexts"),
-        settings.get("trellis", False),
-    )
+    coded, coder = stream.sections["coefficients"], settings.get("coder", "contexts")
+    bands, trellis = bands_of(axes, shape), settings.get("trellis", False)
+    integers = decode_integers(coded, shape, bands, coder, trellis)
     residual = None
-    if "residual" in sections:
+    if "residual" in stream.sections:
         coder = settings.get("residual_coder", "contexts")
-        residual = decode_integers(sections["residual"], shape, single_band(shape), coder)
-    check(integers, digest, residual)
+        residual = decode_integers(stream.sections["residual"], shape, single_band(shape), coder)
+    check(integers, stream.digest, residual)
     with np.errstate(all="ignore"):
-        coefficients = dequantised(integers, settings, working)
-        number = working.type
+        coefficients = dequantised(integers, settings, stream.working)
         values = inverse(coefficients, axes) + number(settings["center"])
-        before = np.clip(values, *(number(end) for end in settings["range"]))
-        after = before
+        before = after = np.clip(values, *(number(end) for end in settings["range"]))
         if "head" in settings:
             after = apply_head(before, unpack_head(base64.b64decode(settings["head"])))
         if residual is not None:
             after = after.astype(np.float64) + residual * np.float64(settings["quantum"])
-    return before, cast(after, kind)
+    return before, cast(after, stream.kind)
 
 
 def dequantised(integers: Values, settings: Settings, working: np.dtype[Any]) -> Values:
