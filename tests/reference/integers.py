@@ -31,7 +31,7 @@ SIGN_SIZES = tuple(KINDS * n for n in (27, 81, 27, 108, 27, 81, 54, 25))
 
 
 def starts(sizes: Sequence[int], first: int = 0) -> list[int]:
-    """Where each of some runs begins."""
+    """The beginnings of some runs that follow each other."""
     return [first + sum(sizes[:i]) for i in range(len(sizes))]
 
 
@@ -124,7 +124,7 @@ def decode_integers(
 
 
 class IntegerDecoder:
-    """What is known of all bands so far, and what was learned from them."""
+    """The decoder of a tile: the bands known so far, and what was learned from them."""
 
     def __init__(self, data: bytes | memoryview, coder: str, two_quantisers: bool) -> None:
         prior = prior_state(coder, two_quantisers)

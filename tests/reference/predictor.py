@@ -262,7 +262,7 @@ class PassDecoder:
         self.errors[place] = clamp(error, -LARGEST, LARGEST)
 
     def other_predictions(self, place: Place, prediction: int) -> tuple[int, int]:
-        """How far the base lies from the prediction, and the base with its error a step before."""
+        """Distances to the base, and to the base with its error of the step before."""
         base = self.base(place)[0]
         if self.one.axis <= 0 or not place[0]:
             return base * 4096 - prediction, 0
@@ -327,6 +327,6 @@ def half_octaves(value: int, most: int) -> int:
 
 
 def side(gap: int) -> int:
-    """How far, and on which side, another prediction lies: 0 to 8; in 1/8192."""
+    """The class, 0 to 8, of the distance to another prediction, in 1/8192, and of its side."""
     size = sum(abs(gap) >= bound for bound in (1229, 4096, 9830, 24576))
     return 4 - size if gap < 0 else 4 + size

@@ -52,7 +52,7 @@ def equal(one: tuple[Any, Any], other: tuple[Any, Any]) -> bool:
 
 
 def differing(path: Path) -> Iterator[str | None]:
-    """For each tile of a container that is compared, its name if the decoders differ."""
+    """Names of the compared tiles where the decoders differ; None for each one that is equal."""
     with Container.open(path) as container:
         for name, array in container.arrays.items():
             shared = None if array.settings is None else array.settings.to_dict()

@@ -1,4 +1,4 @@
-"""The bulk: percentiles found in one or two passes, with or without the native library."""
+"""The bulk: percentiles found in one or two passes."""
 
 from __future__ import annotations
 
