@@ -112,16 +112,31 @@ def merge(bands: Values, axis: int, kind: str) -> Values:
     return np.moveaxis(result, 0, axis)
 
 
+@cache
+def wavelet_norms(kind: str, depth: int, n: int) -> Values:
+    """Norms of the synthesis vectors of a wavelet, float64 (n,).
+
+    Up to 512 vertices each vector has its own; on longer axes a band has that of one in the middle.
+    """
+    if n <= 512:
+        return column_norms(inverse_along(np.eye(n), 0, Axis(kind, depth)))
+    norms, ends = np.empty(n), lengths(n, depth)
+    for level in range(1, depth + 1):
+        inner = lengths(32 << level, level)
+        vectors = np.zeros((inner[0], 2))
+        vectors[16, 0] = vectors[inner[level] + 16, 1] = 1
+        low, high = column_norms(inverse_along(vectors, 0, Axis(kind, level)))
+        norms[: ends[level]], norms[ends[level] : ends[level - 1]] = low, high
+    return norms
+
+
 def axis_norms(axis: Axis, n: int) -> Values:
-    """Norms of the synthesis vectors of an axis on its own, float64 (n,)."""
+    """Norms of the synthesis vectors of an axis on its own, float64 (n,); 1 without a vector."""
+    if axis.kind in WAVELETS:
+        return wavelet_norms(axis.kind, axis.depth, n)
     norms = np.ones(n)
     if axis.basis is not None:
         norms[: axis.basis.shape[1]] = column_norms(axis.basis.astype(np.float64))
-    elif axis.kind in WAVELETS:
-        ends, (low, high) = lengths(n, axis.depth), level_norms(axis.kind, axis.depth, n)
-        norms[: ends[-1]] = low[-1]
-        for level in range(1, axis.depth + 1):
-            norms[ends[level] : ends[level - 1]] = high[level]
     return norms
 
 
@@ -130,49 +145,12 @@ def plane_norms(y: Axis, x: Axis, rows: int, columns: int) -> Values:
     if not is_coupled(y, x):
         return axis_norms(y, rows)[:, None] * axis_norms(x, columns)
     ys, xs = lengths(rows, y.depth), lengths(columns, x.depth)
-    low_y, high_y = level_norms(y.kind, y.depth, rows)
-    low_x, high_x = level_norms(x.kind, x.depth, columns)
-    norms = np.ones((rows, columns))
-    for level in range(1, y.depth + 1):
-        low = slice(0, ys[level]), slice(0, xs[level])
-        high = slice(ys[level], ys[level - 1]), slice(xs[level], xs[level - 1])
-        norms[low[0], high[1]] = low_y[level][:, None] * high_x[level]
-        norms[high[0], low[1]] = high_y[level][:, None] * low_x[level]
-        norms[high[0], high[1]] = high_y[level][:, None] * high_x[level]
-    norms[: ys[-1], : xs[-1]] = low_y[-1][:, None] * low_x[-1]
+    norms = np.empty((rows, columns))
+    for level in range(1, y.depth + 1):  # each overwrites the low-low quarter of the one before
+        along_y, along_x = (wavelet_norms(y.kind, level, n) for n in (rows, columns))
+        quarter = slice(0, ys[level - 1]), slice(0, xs[level - 1])
+        norms[quarter] = along_y[quarter[0], None] * along_x[quarter[1]]
     return norms
-
-
-@cache
-def level_norms(kind: str, depth: int, n: int) -> tuple[list[Values], list[Values]]:
-    """Norms of the low and of the high band after 0 to `depth` levels.
-
-    Up to 512 vertices each vector has its own; on longer axes all have that of one in the middle.
-    """
-    low, high = [np.ones(n)], [np.ones(0)]
-    ends = lengths(n, depth)
-    for level in range(1, depth + 1):
-        m = ends[level]
-        if n <= 512:
-            norms = synthesis_norms(kind, ends[: level + 1], np.eye(ends[level - 1]))
-            low.append(norms[:m])
-            high.append(norms[m:])
-        else:
-            inner = lengths(32 << level, level)
-            vectors = np.zeros((inner[level - 1], 2))
-            vectors[16, 0] = vectors[inner[level] + 16, 1] = 1
-            norms = synthesis_norms(kind, inner, vectors)
-            low.append(np.full(m, norms[0]))
-            high.append(np.full(ends[level - 1] - m, norms[1]))
-    return low, high
-
-
-def synthesis_norms(kind: str, ends: list[int], vectors: Values) -> Values:
-    """Norms of what becomes of columns of both bands of the deepest level."""
-    values = merge(vectors, 0, kind)
-    for n in ends[-3::-1]:
-        values = merge(np.pad(values, ((0, n - len(values)), (0, 0))), 0, kind)
-    return column_norms(values)
 
 
 def column_norms(matrix: Values) -> Values:

@@ -52,7 +52,7 @@ def test_the_bulk_scales_with_the_values(factor, offset) -> None:
     assert scaled.high / factor == pytest.approx(plain.high, abs=0.01)
 
 
-def test_it_does_not_depend_on_the_order_the_pieces_or_the_library() -> None:
+def test_it_does_not_depend_on_the_order_or_the_pieces() -> None:
     values = heavy(300.0).astype(np.float32)
     expected = bulk_of(values)
     assert bulk_of(values[::-1], pieces=7) == expected
