@@ -34,13 +34,19 @@ constexpr std::int64_t FHASH_NO_PATH = -3;
 
 #if defined(__x86_64__) && (defined(__clang__) || (defined(__GNUC__) && __GNUC__ >= 12))
 #define FHASH_THREE_PATHS 1
+#if defined(__clang__)  // which knows no prefer-vector-width
+#define FHASH_TARGET_V4 "arch=x86-64-v4,tune=icelake-server"
+#else
 #define FHASH_TARGET_V4 "arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"
+#endif
 #define FHASH_TARGET_V3 "arch=x86-64-v3,tune=haswell"
-#if defined(FHASH_ONLY) && defined(__clang__)
+#if defined(FHASH_ONLY) && defined(__clang__)  // FHASH_END takes it back
 #if FHASH_ONLY == 4
 #pragma clang attribute push(__attribute__((target("arch=x86-64-v4"))), apply_to = function)
+#define FHASH_END _Pragma("clang attribute pop")
 #elif FHASH_ONLY == 2
 #pragma clang attribute push(__attribute__((target("arch=x86-64-v3"))), apply_to = function)
+#define FHASH_END _Pragma("clang attribute pop")
 #endif
 #elif defined(FHASH_ONLY)
 #if FHASH_ONLY == 4
@@ -49,6 +55,11 @@ constexpr std::int64_t FHASH_NO_PATH = -3;
 #pragma GCC target("arch=x86-64-v3,tune=haswell")
 #endif
 #endif
+#endif
+
+// The end of a source file for a path.
+#if !defined(FHASH_END)
+#define FHASH_END
 #endif
 
 #if defined(FHASH_VECTORS)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Mapping
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
@@ -138,8 +137,8 @@ def load_library(
     library is loaded once; the environment is read at each call. Safe to call from several threads.
 
     Args:
-        folder: folder of the Python package to which the extension belongs.
-        name: file name of the extension without its suffix.
+        folder: folder of the Python package to which the library belongs.
+        name: file name of the library without its suffix.
         abi_version: number that the library's function `version_symbol` must return.
         prototypes: argument types of the functions that will be called.
         version_symbol: exported function without arguments that returns the library's ABI number.
@@ -154,16 +153,11 @@ def load_library(
     if key not in _LOADED:
         with _LOCK:
             if key not in _LOADED:
-                path = _find(folder, name)
+                path = folder / f"{name}.so"  # on every system: ctypes asks for no other name
                 _LOADED[key] = (
-                    None if path is None else _load(path, abi_version, prototypes, version_symbol)
+                    _load(path, abi_version, prototypes, version_symbol) if path.is_file() else None
                 )
     return _LOADED[key]
-
-
-def _find(folder: Path, name: str) -> Path | None:
-    candidates = (folder / f"{name}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:
