@@ -7,7 +7,7 @@ namespace {
 
 // A constraint of a register that holds a vector.
 #if defined(__x86_64__) || defined(__i386__)
-#define REGISTER "+x"
+#define REGISTER "+v"
 #elif defined(__aarch64__)
 #define REGISTER "+w"
 #else
@@ -22,8 +22,8 @@ constexpr int CHAINS = 12;
 // keep each round.
 #define FMA(TARGET, NAME, P)                                                                       \
     TARGET std::int64_t NAME(std::int64_t rounds) {                                                \
-        P::F chain[CHAINS], factor = all<P>(0.999f), summand = all<P>(0.001f);                     \
-        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = all<P>(1.0f + c);               \
+        P::F chain[CHAINS], factor = P::F{} + 0.999f, summand = P::F{} + 0.001f;                   \
+        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = P::F{} + (1.0f + c);            \
         asm volatile("" : REGISTER(factor), REGISTER(summand));                                    \
         for (std::int64_t round = 0; round < rounds; round++) {                                    \
             FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = chain[c] * factor + summand; \
