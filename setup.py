@@ -1,16 +1,21 @@
-"""The native extensions: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
+"""The native libraries: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
 
-The rest of the build is described in pyproject.toml. Without a C++17 compiler the installation
-fails in one line.
+They are plain shared libraries for ctypes, without Python's headers: one wheel serves every Python.
+The rest of the build is described in pyproject.toml. Where the machine has no C++ compiler, that of
+the package ziglang is used (build_backend.py); it also compiles for other machines, where
+FHASH_TARGET names one by zig's words, such as aarch64-linux-musl (`make wheels`).
 """
 
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 from setuptools import Extension, setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 from setuptools.errors import BaseError, CCompilerError, CompileError
 
@@ -20,6 +25,8 @@ CODEC = Path("fhash_codec/native")
 """Sources of the codec's library."""
 NETWORK = CODEC / "network"
 """Sources of the library that trains and evaluates the paper's network."""
+TARGET = os.environ.get("FHASH_TARGET", "")
+"""Machine to compile for, in zig's words; empty for this one."""
 
 # No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on
 # every machine. That nothing traps, and loops marked as independent, change no bit; without them
@@ -34,15 +41,32 @@ GNU_FLAGS = [
     "-fvisibility=hidden",
     "-g0",
 ]
-GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if sys.platform == "linux" else []
+GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if sys.platform == "linux" and not TARGET else []
 """Debug records and symbol tables would make the libraries five times as large."""
 NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
 """Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
+def use_zig() -> None:
+    """Set the variables by which setuptools finds the compiler to that of ziglang."""
+    if find_spec("ziglang") is None:
+        sys.exit("fhash needs a C++17 compiler: install g++ or clang++, or `pip install ziglang`")
+    # -fno-sanitize: zig adds checks that trap, unless it is told otherwise
+    compiler = f"{sys.executable} -m ziglang c++ -fno-sanitize=all -s"
+    compiler += f" -target {TARGET}" if TARGET else ""
+    shared = f"{compiler} -shared"
+    os.environ |= {"CC": compiler, "CXX": compiler, "LDSHARED": shared, "LDCXXSHARED": shared}
+
+
 class BuildNative(build_ext):
-    """`build_ext` with the flags of the compiler that is there, for all files side by side."""
+    """`build_ext` of plain libraries with the compiler that is there, for all files side by side."""
+
+    def get_ext_filename(self, fullname: str) -> str:
+        return os.path.join(*fullname.split(".")) + ".so"
+
+    def get_export_symbols(self, ext: Extension) -> list[str]:
+        return []  # not that of a Python module
 
     def build_extensions(self) -> None:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -77,10 +101,17 @@ class BuildNative(build_ext):
         super().build_extensions()
 
 
-def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
-    """The extension of all C++ sources in a folder, for the limited API of Python 3.11.
+class PlainWheel(bdist_wheel):
+    """A wheel for every Python 3 of a platform."""
 
-    `flags` are added to those of every extension, where the compiler is GCC or Clang.
+    def get_tag(self) -> tuple[str, str, str]:
+        return "py3", "none", super().get_tag()[2]
+
+
+def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension:
+    """The library of all C++ sources in a folder.
+
+    `flags` are added to those of every library, where the compiler is GCC or Clang.
     """
     headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp")}
     return Extension(
@@ -89,18 +120,18 @@ def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension
         depends=sorted(path.as_posix() for path in headers),
         include_dirs=[FORMATS.as_posix()],
         extra_compile_args=list(flags),
-        define_macros=[("Py_LIMITED_API", "0x030B0000")],
-        py_limited_api=True,
         language="c++",
     )
 
 
+if TARGET or (os.name != "nt" and not os.environ.get("CXX") and not (which("c++") or which("g++"))):
+    use_zig()
 setup(
     ext_modules=[
         native("fhash_formats.native._core", FORMATS),
         native("fhash_codec.native._codec", CODEC),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
-    cmdclass={"build_ext": BuildNative},
-    options={"bdist_wheel": {"py_limited_api": "cp311"}, "build_ext": {"parallel": 3}},
+    cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel},
+    options={"build_ext": {"parallel": 3}},
 )

@@ -218,8 +218,9 @@ FHASH_INLINE void tiles(const FhashMarch& m, int64_t first, int64_t stop, Counte
     }                                                                                              \
     void NAME##_v1(FHASH_PARAMETERS) { tiles<FLAGS>(m, first, stop, counted); }                    \
     void NAME(FHASH_PARAMETERS) {                                                                  \
-        const bool v4 = m.path < 1 && __builtin_cpu_supports("x86-64-v4") && m.shape[2] > 1;       \
-        const bool v3 = m.path < 2 && __builtin_cpu_supports("x86-64-v3");                         \
+        const unsigned has = fhash_instructions();                                                 \
+        const bool v4 = m.path < 1 && (has & FHASH_HAS_V4) && m.shape[2] > 1;                      \
+        const bool v3 = m.path < 2 && (has & FHASH_HAS_V3);                                        \
         (v4 ? NAME##_v4 : v3 ? NAME##_v3 : NAME##_v1)(m, first, stop, counted);                    \
     }
 #else

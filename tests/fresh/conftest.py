@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = (
-    "formats/fhash_formats/native/_core.abi3.so",
-    "fhash_codec/native/_codec.abi3.so",
-    "fhash_codec/native/network/_network.abi3.so",
+    "formats/fhash_formats/native/_core.so",
+    "fhash_codec/native/_codec.so",
+    "fhash_codec/native/network/_network.so",
 )
 
 

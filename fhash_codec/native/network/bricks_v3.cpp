@@ -5,3 +5,4 @@
 #if defined(FHASH_THREE_PATHS)
 FHASH_DEFINE_KERNELS(v3, Path2)
 #endif
+FHASH_END

@@ -5,3 +5,4 @@
 #if defined(FHASH_THREE_PATHS)
 FHASH_DEFINE_KERNELS(v4, Path4)
 #endif
+FHASH_END

@@ -1,12 +1,9 @@
-// The module's shell: an empty Python module, so that the library is a legal extension, and the
-// ABI number that the loader checks.
+// The ABI number that the loader checks.
 //
 // This library computes with the paper's network: training, evaluation, points. The rules of
 // fhash_formats/native/core.hpp hold, but for one: the build allows contraction into fused
 // multiply-adds here, which makes the products faster by a quarter. No stream of bits depends on
 // these sources, so machines may differ in the last bits.
-#include <Python.h>
-
 #include "core.hpp"
 
 // Raise it whenever an exported signature or its meaning changes; __init__.py holds the same
@@ -14,8 +11,3 @@
 constexpr std::int64_t FHASH_NETWORK_ABI = 3;
 
 FHASH_EXPORT std::int64_t fhash_network_abi_version() { return FHASH_NETWORK_ABI; }
-
-static PyModuleDef module_definition = {
-    PyModuleDef_HEAD_INIT, "_network", nullptr, 0, nullptr, nullptr, nullptr, nullptr, nullptr};
-
-PyMODINIT_FUNC PyInit__network() { return PyModuleDef_Init(&module_definition); }

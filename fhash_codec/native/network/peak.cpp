@@ -7,7 +7,7 @@ namespace {
 
 // A constraint of a register that holds a vector.
 #if defined(__x86_64__) || defined(__i386__)
-#define REGISTER "+x"
+#define REGISTER "+v"
 #elif defined(__aarch64__)
 #define REGISTER "+w"
 #else
@@ -17,19 +17,33 @@ namespace {
 // Chains of multiply-adds that do not wait for each other: more than latency times ports.
 constexpr int CHAINS = 12;
 
-template <class P> FHASH_INLINE std::int64_t fma_kernel(std::int64_t rounds) {
-    typename P::F chain[CHAINS];
-    typename P::F factor = all<P>(0.999f), summand = all<P>(0.001f);
-    FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = all<P>(1.0f + c);
-    // The compiler may know nothing of the numbers, and must keep each round.
-    asm volatile("" : REGISTER(factor), REGISTER(summand));
-    for (std::int64_t round = 0; round < rounds; round++) {
-        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = chain[c] * factor + summand;
-        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) asm volatile("" : REGISTER(chain[c]));
+// A function for each path, not a template: Clang holds the operands of assembly to the target of
+// the function in which they are written. The compiler may know nothing of the numbers, and must
+// keep each round.
+#define FMA(TARGET, NAME, P)                                                                       \
+    TARGET std::int64_t NAME(std::int64_t rounds) {                                                \
+        P::F chain[CHAINS], factor = P::F{} + 0.999f, summand = P::F{} + 0.001f;                   \
+        FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = P::F{} + (1.0f + c);            \
+        asm volatile("" : REGISTER(factor), REGISTER(summand));                                    \
+        for (std::int64_t round = 0; round < rounds; round++) {                                    \
+            FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = chain[c] * factor + summand; \
+            FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) asm volatile("" : REGISTER(chain[c])); \
+        }                                                                                          \
+        return 2 * CHAINS * P::N * rounds;                                                         \
     }
-    return 2 * CHAINS * P::N * rounds;
+FMA(, fma_v1, Path1)
+#if defined(FHASH_THREE_PATHS)
+FMA(FHASH_V3, fma_v3, Path2)
+FMA(FHASH_V4, fma_v4, Path4)
+#endif
+
+std::int64_t fma(std::int64_t path, std::int64_t rounds) {
+#if defined(FHASH_THREE_PATHS)
+    if (path == FHASH_PATH_V4) return fma_v4(rounds);
+    if (path == FHASH_PATH_V3) return fma_v3(rounds);
+#endif
+    return fma_v1(rounds);
 }
-FHASH_PATHS(std::int64_t, fma, (std::int64_t rounds), (rounds))
 
 }  // namespace
 #endif
@@ -42,7 +56,7 @@ FHASH_EXPORT int64_t fhash_network_paths() { return machine_paths(); }
 FHASH_EXPORT int64_t fhash_network_fma(int64_t path, int64_t rounds) {
     if (!has_path(path)) return FHASH_NO_PATH;
 #if defined(FHASH_VECTORS)
-    return fma(path)(rounds);
+    return fma(path, rounds);
 #else
     return FHASH_NO_PATH;
 #endif

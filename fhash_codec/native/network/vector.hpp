@@ -34,13 +34,20 @@ constexpr std::int64_t FHASH_NO_PATH = -3;
 
 #if defined(__x86_64__) && (defined(__clang__) || (defined(__GNUC__) && __GNUC__ >= 12))
 #define FHASH_THREE_PATHS 1
-#define FHASH_TARGET_V4 "arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"
+#if defined(__clang__)  // zig takes away by name what "arch" would give
+#define FHASH_TARGET_V3 "avx2,fma,bmi,bmi2,f16c,lzcnt,movbe"
+#define FHASH_TARGET_V4 FHASH_TARGET_V3 ",avx512f,avx512bw,avx512cd,avx512dq,avx512vl"
+#else
 #define FHASH_TARGET_V3 "arch=x86-64-v3,tune=haswell"
-#if defined(FHASH_ONLY) && defined(__clang__)
+#define FHASH_TARGET_V4 "arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"
+#endif
+#if defined(FHASH_ONLY) && defined(__clang__)  // FHASH_END takes it back
 #if FHASH_ONLY == 4
-#pragma clang attribute push(__attribute__((target("arch=x86-64-v4"))), apply_to = function)
+#pragma clang attribute push(__attribute__((target(FHASH_TARGET_V4))), apply_to = function)
+#define FHASH_END _Pragma("clang attribute pop")
 #elif FHASH_ONLY == 2
-#pragma clang attribute push(__attribute__((target("arch=x86-64-v3"))), apply_to = function)
+#pragma clang attribute push(__attribute__((target(FHASH_TARGET_V3))), apply_to = function)
+#define FHASH_END _Pragma("clang attribute pop")
 #endif
 #elif defined(FHASH_ONLY)
 #if FHASH_ONLY == 4
@@ -49,6 +56,11 @@ constexpr std::int64_t FHASH_NO_PATH = -3;
 #pragma GCC target("arch=x86-64-v3,tune=haswell")
 #endif
 #endif
+#endif
+
+// The end of a source file for a path.
+#if !defined(FHASH_END)
+#define FHASH_END
 #endif
 
 #if defined(FHASH_VECTORS)
@@ -106,8 +118,8 @@ template <class P> FHASH_INLINE typename P::F all(float number) {
 static inline std::int64_t machine_paths() {
 #if defined(FHASH_THREE_PATHS)
     std::int64_t paths = FHASH_PATH_BASELINE;
-    if (__builtin_cpu_supports("x86-64-v3")) paths |= FHASH_PATH_V3;
-    if (__builtin_cpu_supports("x86-64-v4")) paths |= FHASH_PATH_V4;
+    if (fhash_instructions() & FHASH_HAS_V3) paths |= FHASH_PATH_V3;
+    if (fhash_instructions() & FHASH_HAS_V4) paths |= FHASH_PATH_V4;
     return paths;
 #elif defined(FHASH_VECTORS)
     return FHASH_PATH_BASELINE;

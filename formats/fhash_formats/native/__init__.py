@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
@@ -140,8 +139,8 @@ def load_library(
     A library is loaded once. Safe to call from several threads.
 
     Args:
-        folder: folder of the Python package to which the extension belongs.
-        name: file name of the extension without its suffix.
+        folder: folder of the Python package to which the library belongs.
+        name: file name of the library without its suffix.
         abi_version: number that the library's function `version_symbol` must return.
         prototypes: argument types of the functions that will be called.
         version_symbol: exported function without arguments that returns the library's ABI number.
@@ -154,17 +153,11 @@ def load_library(
     if key not in _LOADED:
         with _LOCK:
             if key not in _LOADED:
-                path = _find(folder, name)
+                path = folder / f"{name}.so"  # on every system: ctypes asks for no other name
+                if not path.is_file():
+                    raise MissingDependencyError(f"there is no native library {path}: {_ADVICE}")
                 _LOADED[key] = _load(path, abi_version, prototypes, version_symbol)
     return _LOADED[key]
-
-
-def _find(folder: Path, name: str) -> Path:
-    candidates = (folder / f"{name}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise MissingDependencyError(f"there is no native library {folder / name}.*: {_ADVICE}")
 
 
 def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:

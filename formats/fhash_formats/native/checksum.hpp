@@ -85,7 +85,7 @@ FHASH_CLMUL inline std::uint32_t crc32_folded(const std::int32_t* in, std::int64
 inline std::uint32_t crc32_of(const std::int32_t* in, std::int64_t n, std::uint32_t crc) {
     crc = ~crc;
 #if defined(FHASH_FOLDED_CRC)
-    if (n >= 16 && __builtin_cpu_supports("pclmul") && __builtin_cpu_supports("sse4.1")) {
+    if (n >= 16 && fhash_instructions() & FHASH_HAS_CLMUL) {
         const std::int64_t whole = n / 4 * 4;
         crc = crc32_folded(in, whole, crc);
         in += whole;

@@ -48,14 +48,54 @@ constexpr std::int64_t FHASH_ABI = 11;
 // FHASH_CLONES before a function: compiled for AVX-512, AVX2 and the baseline; one is chosen when
 // the library is loaded. It works on plain functions only, neither templates nor inlines: put the
 // body into a FHASH_INLINE template and call that from a small cloned function per type. Elsewhere
-// it is empty: ARM (where NEON is the baseline), musl, macOS, Windows, older compilers.
+// it is empty: ARM (where NEON is the baseline), musl, macOS, Windows, older compilers, and Clang,
+// whose clones leave out a constructor that they inline, so that the library cannot be loaded.
 // FHASH_TWO_CLONES: the same without AVX-512, for large functions that gain nothing by it.
-#if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && \
-    ((defined(__clang__) && __clang_major__ >= 18) ||                  \
-     (!defined(__clang__) && defined(__GNUC__) && __GNUC__ >= 12))
+#if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(__clang__) && \
+    defined(__GNUC__) && __GNUC__ >= 12
 #define FHASH_CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
 #define FHASH_TWO_CLONES __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
 #define FHASH_CLONES
 #define FHASH_TWO_CLONES
+#endif
+
+#if (defined(__x86_64__) || defined(__i386__)) && defined(__GNUC__)
+#include <cpuid.h>
+
+// Instructions that kernels ask for.
+constexpr unsigned FHASH_HAS_CLMUL = 1;   // PCLMULQDQ and SSE4.1
+constexpr unsigned FHASH_HAS_CRC32 = 2;   // SSE4.2
+constexpr unsigned FHASH_HAS_V3 = 4;      // x86-64-v3: AVX2, FMA, BMI and more
+constexpr unsigned FHASH_HAS_V4 = 8;      // x86-64-v4: AVX-512 F, BW, CD, DQ, VL
+constexpr unsigned FHASH_HAS_VNNI = 16;   // these, and AVX-512 VNNI
+
+// The instructions of this processor that the system lets be used. __builtin_cpu_supports says so,
+// too, but for the compiler of ziglang, where it has no answer.
+static inline unsigned fhash_instructions() {
+    static const unsigned found = [] {
+        unsigned a, b, c, d, wide = 0, extended = 0, saved = 0, has = 0;
+        if (!__get_cpuid(1, &a, &b, &c, &d)) return has;
+        const auto all = [](unsigned word, unsigned bits) { return (word & bits) == bits; };
+        if (all(c, 1u << 1 | 1u << 19)) has |= FHASH_HAS_CLMUL;
+        if (all(c, 1u << 20)) has |= FHASH_HAS_CRC32;
+        const unsigned first = c;
+        if (!all(first, 1u << 27)) return has;  // the system does not say what it saves
+        __asm__(".byte 0x0f, 0x01, 0xd0" : "=a"(saved), "=d"(d) : "c"(0));  // xgetbv
+        if (!__get_cpuid_count(7, 0, &a, &wide, &extended, &d)) return has;
+        if (!__get_cpuid(0x80000001u, &a, &b, &c, &d)) return has;
+        // MOVBE, POPCNT, FMA, AVX, F16C; BMI, AVX2, BMI2; LZCNT; registers of 256 bits
+        const bool v3 = all(first, 1u << 22 | 1u << 23 | 1u << 12 | 1u << 28 | 1u << 29) &&
+                        all(wide, 1u << 3 | 1u << 5 | 1u << 8) && all(c, 1u << 5) && all(saved, 6);
+        if (v3) has |= FHASH_HAS_V3;
+        // F, DQ, CD, BW, VL; registers of 512 bits
+        if (v3 && all(wide, 1u << 16 | 1u << 17 | 1u << 28 | 1u << 30 | 1u << 31) &&
+            all(saved, 0xe6)) {
+            has |= FHASH_HAS_V4;
+            if (all(extended, 1u << 11)) has |= FHASH_HAS_VNNI;
+        }
+        return has;
+    }();
+    return found;
+}
 #endif

@@ -10,7 +10,7 @@
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(FHASH_PLAIN)
 #include <nmmintrin.h>
 #define FHASH_CRC_TARGET __attribute__((target("sse4.2")))
-#define FHASH_HAS_CRC() __builtin_cpu_supports("sse4.2")
+#define FHASH_HAS_CRC() (fhash_instructions() & FHASH_HAS_CRC32)
 #define FHASH_CRC_8(crc, value) _mm_crc32_u64(crc, value)
 #define FHASH_CRC_1(crc, value) _mm_crc32_u8((std::uint32_t)(crc), value)
 #elif defined(__aarch64__) && defined(__ARM_FEATURE_CRC32) && !defined(FHASH_PLAIN)

@@ -69,12 +69,9 @@ namespace avx512 {
 // compiler's vectors, 3 SSE2, 4 AVX2, 5 AVX-512 with VNNI. 0: the fastest that this machine has.
 inline const Kernels* kernels_of(std::int64_t lanes) {
 #if defined(FHASH_HEAD_WIDE)
-    __builtin_cpu_init();
-    const bool avx512 = __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
-                        __builtin_cpu_supports("avx512dq") &&
-                        __builtin_cpu_supports("avx512vnni");
-    if ((lanes == 0 || lanes == 5) && avx512) return &avx512::kernels;
-    if ((lanes == 0 || lanes == 4) && __builtin_cpu_supports("avx2")) return &avx2::kernels;
+    const unsigned has = fhash_instructions();
+    if ((lanes == 0 || lanes == 5) && has & FHASH_HAS_VNNI) return &avx512::kernels;
+    if ((lanes == 0 || lanes == 4) && has & FHASH_HAS_V3) return &avx2::kernels;
 #endif
 #if defined(FHASH_HEAD_SSE2)
     if (lanes == 0 || lanes == 3) return &sse2::kernels;

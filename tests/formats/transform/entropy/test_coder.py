@@ -13,7 +13,6 @@ from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import coder
 from fhash_formats.transform.entropy.coder import (
     MAX_INTEGER,
     decode_block,

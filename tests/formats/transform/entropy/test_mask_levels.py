@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference.masks import BOUNDS, mask_levels
 
 from fhash_formats.errors import InputError
 from fhash_formats.transform.entropy.mask_levels import MAX_SCORE, MaskLevels
-from reference.masks import BOUNDS, mask_levels
 
 
 def test_levels_rise_with_the_value_and_reach_as_far_as_the_feature_grew() -> None:

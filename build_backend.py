@@ -1,0 +1,26 @@
+"""setuptools as the build backend; where a machine has no C++ compiler, that of `ziglang` is asked for.
+
+pip installs what the hooks name into the environment of the build; setup.py then finds it there.
+"""
+
+import os
+import shutil
+
+from setuptools import build_meta
+from setuptools.build_meta import *  # noqa: F403  # the hooks that stay as they are
+
+
+def _compiler() -> list[str]:
+    """The requirement of a compiler, unless there is one; on Windows setuptools finds its own."""
+    found = os.name == "nt" or os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++")))
+    return [] if found else ["ziglang>=0.15"]
+
+
+def get_requires_for_build_wheel(config_settings: object = None) -> list[str]:
+    """What a wheel needs to be built."""
+    return build_meta.get_requires_for_build_wheel(config_settings) + _compiler()
+
+
+def get_requires_for_build_editable(config_settings: object = None) -> list[str]:
+    """What an editable installation needs to be built."""
+    return build_meta.get_requires_for_build_editable(config_settings) + _compiler()
