@@ -1,4 +1,4 @@
-"""setuptools as the build backend; where a machine has no C++ compiler, that of `ziglang` is asked for.
+"""setuptools as the build backend; it asks for `ziglang` where there is no C++ compiler.
 
 pip installs what the hooks name into the environment of the build; setup.py then finds it there.
 """

@@ -60,7 +60,7 @@ def use_zig() -> None:
 
 
 class BuildNative(build_ext):
-    """`build_ext` of plain libraries with the compiler that is there, for all files side by side."""
+    """`build_ext` of plain libraries, with the compiler that is there, all files side by side."""
 
     def get_ext_filename(self, fullname: str) -> str:
         return os.path.join(*fullname.split(".")) + ".so"

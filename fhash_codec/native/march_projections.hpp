@@ -32,7 +32,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::project() {
             const float length = k[l] == last[l] ? (float)rest[l] : 1.f;
             const float weight = counts ? length : 0.f;
             const float above = counts ? value[l] - least : 0.f;
-            where[l] = counts & (best[l] < 0) ? k[l] : where[l];
+            where[l] = (counts & (best[l] < 0)) ? k[l] : where[l];
             best[l] = counts ? 0.f : best[l];
             r[l] += weight * above;
             g[l] += weight;
