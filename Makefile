@@ -42,8 +42,8 @@ every: .venv/.stamp
 # A source archive and a wheel for every Python 3 of each platform in dist/, by the compiler of ziglang: ten minutes on
 # 2 processors.
 PLATFORMS := x86_64-linux-gnu.2.17/manylinux_2_17_x86_64 aarch64-linux-gnu.2.17/manylinux_2_17_aarch64 \
-	x86_64-linux-musl/musllinux_1_2_x86_64 aarch64-linux-musl/musllinux_1_2_aarch64 x86_64-macos.11/macosx_11_0_x86_64 \
-	aarch64-macos.11/macosx_11_0_arm64 x86_64-windows-gnu/win_amd64 aarch64-windows-gnu/win_arm64
+	x86_64-linux-musl/musllinux_1_2_x86_64 aarch64-linux-musl/musllinux_1_2_aarch64 x86_64-macos.11.0/macosx_11_0_x86_64 \
+	aarch64-macos.11.0/macosx_11_0_arm64 x86_64-windows-gnu/win_amd64 aarch64-windows-gnu/win_arm64
 wheels: .venv/.stamp .venv/.zig $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	ls -l dist
