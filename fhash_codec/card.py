@@ -21,7 +21,7 @@ from fhash_codec.paper.model import PaperModel
 from fhash_codec.provenance import metadata_of
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
-from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY, TABLE
+from fhash_formats.container.header import MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import SourceMetadata
@@ -57,7 +57,7 @@ class Card:
     def metadata(self) -> SourceMetadata | None:
         """All that belongs to the variable in its source, with a line of history for the encoding.
 
-        None where the file says nothing of it: arrays, formats without such things, older files.
+        None where the file says nothing of it: arrays, formats without such things.
         """
         return metadata_of(self.container, self.coords)
 
@@ -129,7 +129,7 @@ class Card:
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
                 **self._place(
-                    HEAD_ARRAY if HEAD_ARRAY in self.container.arrays else f"mlp/weight_{number}",
+                    f"mlp/weight_{number}",
                     f"packed in the codec of {self._table_path}",
                 ),
             }

@@ -29,8 +29,7 @@ from fhash_formats.container import (
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import MISSING, NOT_STORED
-from fhash_formats.container.named import Names
+from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
@@ -100,31 +99,39 @@ def describe_source(
     }
 
 
+def begin_variable(writer: ContainerWriter, variable: Mapping[str, Any]) -> None:
+    """Begin the variable of a header entry, in a file of its own."""
+    units = {"units": variable["units"]} if variable["units"] else {}
+    writer.begin(variable["name"], {**variable["attributes"], **units})
+
+
 def write_series(
     writer: ContainerWriter,
     series: Series,
     scanned: Scan,
     key_frames: Sequence[int],
     *,
-    variable: Mapping[str, Any] | None = None,
+    variable: Mapping[str, Any],
     brief: bool = False,
     everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
-    variable: header entry after which the table is named, and the coordinates after those of the
-        series; None for the names that the format has for them.
+    variable: header entry after which the table is named, unless the writer has begun it.
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
     allows, but for the coordinates of one of several variables, which share their arrays.
     everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
     coords = _storable_coords(series)
-    if variable is not None:
-        writer.names = Names.of(variable, (coords[axis].name for axis in AXES), series.shape)
+    if not writer.begun:
+        begin_variable(writer, variable)
+    described = {}
+    if not writer.one_of_several:
+        names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
+        described = describe_coordinates(coords, names) if brief else {}
     for name, array in source_parts(series, coords, {})[1].items():
         writer.add_whole(name, array)
-    described = describe_coordinates(coords) if brief and not writer.one_of_several else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -235,50 +242,30 @@ def brief_quality(
 
 def brief_history(
     history: Sequence[Mapping[str, float | None]], *, timings: bool, most: int = MAX_POINTS
-) -> list[dict[str, float]]:
-    """A training history as a header has it: at most so many points, the last point included.
+) -> dict[str, list[float | None]]:
+    """A training history as a header has it: lists by name, of at most so many points.
 
-    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. Figures without a finite value,
-    such as the PSNR of exact values, are left out. timings: keep the seconds.
+    The last point is one of them. Seconds are rounded to milliseconds, PSNR to hundredths of a dB.
+    Figures without a finite value, such as the PSNR of exact values, are None; a list of such
+    figures alone is left out. timings: keep the seconds.
     """
     count = min(len(history), most)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
-    points = [
-        {
-            "seconds": _rounded(point["seconds"], 3) if timings else None,
-            "epoch": point["epoch"],
-            "psnr": _rounded(point["psnr"], 2),
-        }
-        for point in chosen
-    ]
-    return [{name: value for name, value in point.items() if value is not None} for point in points]
+    lists: dict[str, list[float | None]] = {
+        "epoch": [point["epoch"] for point in chosen],
+        "seconds": [_rounded(point["seconds"], 3) if timings else None for point in chosen],
+        "psnr": [_rounded(point["psnr"], 2) for point in chosen],
+    }
+    return {
+        name: values for name, values in lists.items() if any(value is not None for value in values)
+    }
 
 
-def history_columns(points: Sequence[Mapping[str, Any]]) -> Any:
-    """A brief history as lists of numbers by name, which take fewer bytes than a list of points.
-
-    Where a figure of some point is missing, the points themselves are returned.
-    """
-    names = points[0].keys() if points else ()
-    if any(point.keys() != names for point in points):
-        return list(points)
-    return {name: [point[name] for point in points] for name in names}
-
-
-def history_points(
-    history: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
-) -> list[dict[str, Any]]:
-    """The points of a header's training history, each with seconds, epoch and psnr.
-
-    history: a list of points (profile paper), or a list of values by name (profile compact). What
-        is no list, by another writer, is left out.
-    """
-    if isinstance(history, Mapping):
-        lists = {name: values for name, values in history.items() if isinstance(values, list)}
-        history = [
-            dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=False)
-        ]
-    return [{"seconds": None, "psnr": None, **point} for point in history]
+def history_points(history: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The points of a header's training history, each with seconds, epoch and psnr."""
+    lists = {name: history[name] for name in HISTORY if name in history}
+    points = [dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=True)]
+    return [{"seconds": None, "psnr": None, **point} for point in points]
 
 
 def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
@@ -289,7 +276,7 @@ def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
     filled up.
     """
     header = lean_header.full(header)
-    full = {**header, "history": history_points(header.get("history", ()))}
+    full = {**header, "history": history_points(header.get("history", {}))}
     full["config"] = full_config(header)
     quality = header.get("quality", {})
     low, high = header.get("value_range", (0.0, 0.0))

@@ -33,7 +33,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("axes", "head"),
         ("tile",),
         ("chunk", "parts", "stream"),
-        ("numcodecs_codec", "zarr_codec", "zarr_parts"),
+        ("numcodecs_codec", "zarr_codec"),
     ),
     "fhash_codec": (
         ("config", "container_name", "lean_header", "native", "progress", "stage_clock"),
