@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
-from fhash_codec.header import full_config
 from fhash_codec.model_parts import Mlp, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.provenance import metadata_of
@@ -64,7 +63,7 @@ class Card:
     @property
     def config(self) -> dict[str, Any]:
         """Every setting that the file was made with, by the names of `EncodeConfig`."""
-        return full_config(self.container.header)
+        return dict(self.container.header["config"])
 
     @property
     def tables(self) -> list[Table]:

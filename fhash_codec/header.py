@@ -10,26 +10,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
-from itertools import zip_longest
 from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.provenance import date_of, source_parts
+from fhash_codec.step_figures import read_steps, write_steps
 from fhash_formats.container import (
     SOURCE,
     Container,
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED
+from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED, STEP_FIGURES
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
@@ -48,6 +47,9 @@ DIGITS = 6
 
 OUTSIDE = MISSING[0]
 """Value of the header's `missing`: the vertices outside the coreset are those without a value."""
+
+GAIN = ("what", "bytes", "seconds")
+"""Entries of a list in `model.gains`, in this order; the last one is left out with the times."""
 
 STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
@@ -204,33 +206,37 @@ def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray
 
 
 def brief_quality(
-    quality: Mapping[str, Any], data_range: float, steps_of_series: int
+    writer: ContainerWriter, quality: Mapping[str, Any], data_range: float, steps_of_series: int
 ) -> dict[str, Any]:
-    """Figures as a header has them: rounded to the worse side, figures of single steps as lists.
+    """Figures as a file has them: rounded to the worse side, those of single steps in decibels.
 
     What follows from other entries of the header is left out, and `full_header` puts it back: the
     PSNR of a step, and the range and the steps of the SSIM where they are those of the series.
 
-    quality: `metrics.Quality` as JSON values. data_range: width of the header's value range.
+    Args:
+        writer: of the container; it gets an array for the figures of many steps.
+        quality: `metrics.Quality` as JSON values.
+        data_range: width of the header's value range.
+        steps_of_series: number of its steps.
     """
     brief: dict[str, Any] = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
         for name, value in quality.items()
+        if name not in ("per_step", "between")
     }
     bulk = quality.get("bulk")
     if bulk is not None:
         # The RMSE follows from the two others.
         brief["bulk"] = {"psnr": _figure("psnr", bulk["psnr"], DIGITS), "range": bulk["range"]}
-    between = brief.pop("between", None)
+    between = quality.get("between")
     if between is not None:
         brief["between"] = {
             name: _figure(name, value, STEP_DIGITS) for name, value in between.items()
         }
-    steps = quality["per_step"]
-    brief["per_step"] = {
-        name: [_figure(name, step[name], STEP_DIGITS) for step in steps]
-        for name in ("rmse", "max_abs_error")
-    }
+    figures = {name: [step[name] for step in quality["per_step"]] for name in STEP_FIGURES}
+    steps = write_steps(writer, figures, data_range)
+    if steps:
+        brief["steps"] = steps
     usual = {"data_range": data_range, "steps": list(range(steps_of_series))}
     brief["ssim_window"] = {
         name: value
@@ -268,62 +274,33 @@ def history_points(history: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [{"seconds": None, "psnr": None, **point} for point in points]
 
 
-def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
-    """A header with the figures of steps and of the training in one shape, whatever the file has.
+def full_header(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """A header as a report has it, with all that follows from the file.
 
-    `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, and `history`
-    a list of points, both as a report has them. `config` has every setting, and lean headers are
-    filled up.
+    `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, `history` a
+    list of points, and `model.gains` a list of objects.
+
+    Args:
+        header: of a variable.
+        arrays: its StoredArray by name.
     """
-    header = lean_header.full(header)
-    full = {**header, "history": history_points(header.get("history", {}))}
-    full["config"] = full_config(header)
-    quality = header.get("quality", {})
-    low, high = header.get("value_range", (0.0, 0.0))
-    if "per_step" in quality:
-        full["quality"] = quality = {**quality, "per_step": _steps(quality["per_step"], high - low)}
-    if isinstance(quality.get("ssim_window"), Mapping) and "domain" in header:
+    low, high = header["value_range"]
+    quality = {name: value for name, value in header["quality"].items() if name != "steps"}
+    steps = read_steps(header, arrays)
+    if steps:
+        quality["per_step"] = [
+            {"step": step, "psnr": _psnr(figures["rmse"], high - low), **figures}
+            for step, figures in enumerate(steps)
+        ]
+    if isinstance(quality.get("ssim_window"), Mapping):
         usual = {"data_range": high - low, "steps": list(range(header["domain"]["shape"][0]))}
-        full["quality"] = {**quality, "ssim_window": {**usual, **quality["ssim_window"]}}
-    return full
-
-
-def full_config(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Every setting that a file was made with.
-
-    Files of the profile compact before version 1.3 hold only what differs from the defaults, the
-    promise included. The other settings had their defaults. Those of lean headers are in the
-    format.
-    """
-    config = header.get("config", {})
-    profile = header.get("model", {}).get("profile", "compact")
-    defaults = EncodeConfig(profile=profile).to_dict()
-    if lean_header.may_be_lean(header):
-        defaults |= lean_header.CONFIG_DEFAULTS
-    return {**defaults, **config}
-
-
-def _steps(per_step: Any, data_range: float) -> list[dict[str, Any]]:
-    """The figures of each step, from lists by name; what another writer misshaped is left out.
-
-    A PSNR that is not there follows from the root of the mean squared error.
-    """
-    if isinstance(per_step, list):
-        return [dict(step) for step in per_step if isinstance(step, Mapping)]
-    if not isinstance(per_step, Mapping):
-        return []
-    names = [name for name in ("psnr", "rmse", "max_abs_error") if name in per_step]
-    lists: list[Any] = [per_step[name] for name in names]
-    if not all(isinstance(values, list) for values in lists):
-        return []
-    steps = [
-        {"step": step, **dict(zip(names, figures, strict=True))}
-        for step, figures in enumerate(zip_longest(*lists))
-    ]
-    if "psnr" not in names and "rmse" in names:
-        for entry in steps:
-            entry["psnr"] = _psnr(entry["rmse"], data_range)
-    return steps
+        quality["ssim_window"] = {**usual, **quality["ssim_window"]}
+    model = dict(header["model"])
+    if isinstance(model.get("gains"), list):
+        gains = [gain for gain in model["gains"] if isinstance(gain, list)]
+        model["gains"] = [dict(zip(GAIN, gain, strict=False)) for gain in gains]
+    history = history_points(header["history"])
+    return {**header, "model": model, "quality": quality, "history": history}
 
 
 def _psnr(rmse: Any, data_range: float) -> float | None:
@@ -359,7 +336,7 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         for array in container.arrays.values()
     }
     return {
-        **full_header(header),
+        **full_header(header, container.arrays),
         "path": str(path),
         "bytes": container.size,
         "overhead_bytes": container.overhead(),

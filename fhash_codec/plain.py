@@ -28,7 +28,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
-from fhash_formats.container.header import MASK_ARRAY, PLAIN_FEATURE
+from fhash_formats.container.header import MASK_ARRAY, PLAIN_FEATURE, STEPS
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
@@ -257,8 +257,8 @@ class _Export:
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
         for name, array in self._arrays.items():
-            # the mask of missing values, and what belongs to the variable in its source
-            if name == "missing/bits" or name.startswith(AUXILIARY):
+            # masks, figures of steps, and what belongs to the variable in its source
+            if name in ("missing/bits", STEPS) or name.startswith(AUXILIARY):
                 self._total += prod(array.grid)
                 self._copy(name, array)
 

@@ -13,7 +13,6 @@ import numpy as np
 from fhash_codec.appending.figures import Figures
 from fhash_codec.appending.layers import CodedLayer, LayerCoder
 from fhash_codec.header import begin_variable
-from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import StoredArray, describe_coordinates
 from fhash_formats.container.coding import transform_codecs
@@ -190,7 +189,7 @@ class GrowingFile:
         settings = self.coder.settings
         shape = [self.steps, *self._array.frame]
         weights = 0 if settings.head is None else settings.head.size
-        header = {
+        return {
             **self._header,
             "required_features": ["transform"],
             "domain": {"shape": shape},
@@ -201,6 +200,5 @@ class GrowingFile:
                 "levels": [shape],
                 "parameters": self._nonzero + weights,
             },
-            "quality": self.figures.header(self._range.high - self._range.low),
+            "quality": self.figures.header(self._container, self._range.high - self._range.low),
         }
-        return lean(header)

@@ -19,7 +19,6 @@ from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.header import begin_variable, brief_quality, write_series
-from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparer
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -317,12 +316,8 @@ class _Whole:
         header["coordinates"] = described["coordinates"]
         header["domain"] = {"shape": list(self.shape)}
         header["model"] = self._model(table)
-        gains = header["model"].pop("gains")
         quality = self._quality(ValueRange(low, high), header["background"])
-        header["quality"] = brief_quality(quality, high - low, self.shape[0])
-        header = lean({**header, "model": {**header["model"], "gains": []}})
-        # They are in the lean form already.
-        header["model"]["gains"] = gains
+        header["quality"] = brief_quality(writer, quality, high - low, self.shape[0])
         return header, quality
 
     def _variable(self) -> dict[str, Any]:
@@ -363,7 +358,7 @@ class _Whole:
         model["levels"] = [list(table.shape)]
         model["parameters"] = sum(part.nonzero for part in self._parts) + weights
         last = all_tiles(sum(part.size for part in self._parts))
-        model["gains"] = [*model["gains"][:-1], [last["what"], last["bytes"]]]
+        model["gains"] = [*model["gains"][:-1], last]
         return model
 
     def _quality(self, value_range: ValueRange, background: float) -> dict[str, Any]:

@@ -38,7 +38,6 @@ from fhash_codec.header import (
     describe_variable,
     write_series,
 )
-from fhash_codec.lean_header import lean
 from fhash_codec.measure.metrics import Comparison
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.sums import ErrorSums
@@ -211,8 +210,7 @@ class _Job:
             quality, errors, whole = self._measured(writer, header, progress)
             writer.add_whole(ERRORS, errors)
             low, high = header["value_range"]
-            header["quality"] = brief_quality(quality, high - low, len(self.steps))
-            header = lean(header)
+            header["quality"] = brief_quality(writer, quality, high - low, len(self.steps))
             header[PART] |= {
                 "number": self.part.number,
                 "of": self.part.of,

@@ -19,7 +19,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import SOURCE, Container, StoredArray
-from fhash_formats.container.header import COMPACT, PLAIN_FEATURE, TABLE
+from fhash_formats.container.header import COMPACT, PLAIN_FEATURE, STEPS, TABLE
 from fhash_formats.container.source import damage_named
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
@@ -42,7 +42,7 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
         assert state is not None
         if container.variables:
             raise InputError(f"{path} has several variables; only a file of one can grow")
-        header = full_header(container.header)
+        header = full_header(container.header, container.arrays)
         settings = _settings(container, header)
         kept = _kept_steps(container, steps)
         value_range = ValueRange(*header["value_range"])
@@ -171,7 +171,7 @@ def _figures(path: Path, header: Mapping[str, Any], value_range: ValueRange, kep
 def _keep(growing: GrowingFile, container: Container, kept: int, value_range: ValueRange) -> None:
     """Write what is kept of a file: arrays that do not depend on time, and layers of tiles."""
     for name, array in container.arrays.items():
-        if name == TABLE or name.startswith("coords/"):
+        if name in (TABLE, STEPS) or name.startswith("coords/"):
             continue
         if _follows_time(array, container):
             raise InputError(

@@ -25,7 +25,6 @@ from fhash_codec.header import (
     write_missing,
     write_series,
 )
-from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.provenance import PACKED
@@ -235,7 +234,7 @@ def _header(
     masked = facts.occupied < prod(array.shape)
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
-    header = {
+    return {
         **source,
         **described,
         **({"missing": OUTSIDE} if masked else {}),
@@ -259,7 +258,6 @@ def _header(
         "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
         "history": {},
     }
-    return lean(header)
 
 
 def _in_type(value: float, dtype: np.dtype[Any]) -> float:

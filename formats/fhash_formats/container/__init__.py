@@ -22,6 +22,7 @@ The tests prove that the zarr library reads every array equal.
     hierarchy        members of the ZIP -> header and arrays
     record           checked access to a JSON object
     header           checks of the header
+    defaults         what a header leaves out
     expected_arrays  arrays that a header asks for
     coordinates      positions in the header
     source_described what belongs to the variable in its source -> header and arrays

@@ -21,11 +21,16 @@ from fhash_formats.container.header import (
     COMPACT,
     HEAD_CROSS,
     HEAD_INPUTS,
+    LOWEST,
     MASK_ARRAY,
+    MAX_LEVEL,
     PAPER,
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
+    STEP_BYTES,
+    STEP_FIGURES,
+    STEPS,
     TRANSFORM_FEATURE,
 )
 from fhash_formats.container.record import Record
@@ -61,6 +66,9 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     for name, shape, dtypes in _optional_arrays(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
+    if STEPS in arrays:
+        attributes = Record(arrays[STEPS].attributes, f"array {STEPS} attribute ")
+        attributes.integers(LOWEST, len(STEP_FIGURES), -MAX_LEVEL, MAX_LEVEL)
     for axis in POSITIONS:
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
@@ -159,6 +167,7 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         for number in range(1, len(header["features"]) + 1):
             yield f"occupancy/feature_{number}", bits, ("uint8",)
         yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
+    yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 

@@ -31,6 +31,14 @@ TABLE = "tables/level_1"
 """Name of the array of the finest table."""
 MASK_ARRAY = "occupancy/mask"
 """Name of the array of an occupancy that is coded, in place of bits."""
+STEPS = "steps/figures"
+"""Name of the array of the figures of single steps, where they are not in the header."""
+STEP_FIGURES = ("rmse", "max_abs_error")
+"""Lists of `quality.steps`, and rows of this array."""
+STEP_BYTES = 3
+"""Bytes of a number in this array, the lowest first, each in a plane of its own."""
+LOWEST = "lowest"
+"""Attribute of this array: the first number of each list."""
 POSITIONS = ("time", "z", "y", "x")
 """Names of the coordinates in a container, in the order of the axes."""
 QUALITY = (
@@ -63,6 +71,8 @@ MAX_HEAD_LAYERS = 3
 """Hidden layers of a head."""
 MAX_HEAD_WIDTH = 64
 """Outputs of a hidden layer of a head."""
+MAX_LEVEL = 2**31 - 1
+"""Hundredths of a dB that a figure of a step may lie below or above the range."""
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
 """Numbers of an embedding."""
@@ -105,6 +115,9 @@ def validate_header(header: Mapping[str, Any]) -> None:
     for key in QUALITY:
         quality.number_or_null(key)
     _check_bulk(quality)
+    if quality.has("steps"):
+        for key in STEP_FIGURES:
+            quality.record("steps").integers(key, shape[0] + 1, -MAX_LEVEL, MAX_LEVEL)
     _check_history(top.record("history"))
 
 

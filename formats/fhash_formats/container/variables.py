@@ -14,6 +14,7 @@ from typing import Any
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.defaults import complete
 from fhash_formats.container.header import POSITIONS, TABLE, check_format, validate_header
 from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError
@@ -202,7 +203,7 @@ def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         key = "name" if record.has("name") else "variable"
         record.need(name not in headers, key, "a name that no other has")
         with variable_named(name, len(entries)):
-            header = {**entry, **of_root}
+            header = complete(entry) | of_root
             validate_header(header)
             _check_names(Record(header, "header key "), nodes)
             nodes.update({header[ARRAY]} if ARRAY in header else ())

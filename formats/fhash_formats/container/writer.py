@@ -20,6 +20,7 @@ from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.chunks import Coded, coded_chunk, cut, expect_end, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
+from fhash_formats.container.defaults import brief
 from fhash_formats.container.header import FORMAT, POSITIONS, TABLE
 from fhash_formats.container.hierarchy import GROUP
 from fhash_formats.container.layout import (
@@ -147,7 +148,7 @@ class ContainerWriter:
         self._nodes: dict[str, str] = {}
         for name in variables:
             self._nodes[name] = free_node(name, self._nodes.values())
-        self._taken = set(self._nodes.values())
+        self._names_taken = set(self._nodes.values())
         self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], int] = {}
 
@@ -170,7 +171,7 @@ class ContainerWriter:
             )
             return
         self._variable = _Variable(name=None, number=0, node=free_node(name, ()), attributes=shown)
-        self._taken = {self._variable.node}
+        self._names_taken = {self._variable.node}
 
     @property
     def begun(self) -> bool:
@@ -424,7 +425,7 @@ class ContainerWriter:
                 variable.dimensions[axis] = node
                 return True
         wish = free_node(name, ())
-        node = self._free(f"{wish}_of_{variable.node}" if wish in self._taken else wish)
+        node = self._free(f"{wish}_of_{variable.node}" if wish in self._names_taken else wish)
         variable.dimensions[axis] = node
         self._coordinates[node] = content
         return False
@@ -440,8 +441,8 @@ class ContainerWriter:
 
     def _free(self, wish: str) -> str:
         """A name at the root that nothing has, which is taken from now on."""
-        node = free_node(wish, self._taken)
-        self._taken.add(node)
+        node = free_node(wish, self._names_taken)
+        self._names_taken.add(node)
         return node
 
     def _node_of(self, axis: str) -> str:
@@ -555,7 +556,8 @@ class ContainerWriter:
             "required_features": list(dict.fromkeys(features)),
         }
         variables = [
-            {key: value for key, value in entry.items() if key not in of_root} for entry in entries
+            brief({key: value for key, value in entry.items() if key not in of_root})
+            for entry in entries
         ]
         attributes = {**plain_json(self.attributes), "fhash": {**of_root, VARIABLES: variables}}
         root: dict[str, Any] = {**GROUP, "attributes": attributes}
