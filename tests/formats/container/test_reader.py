@@ -11,13 +11,14 @@ from hostile_files import refused, replaced
 
 from fhash_formats.container import FORMAT_VERSION, Container, is_container
 from fhash_formats.container.coding import crc32c
+from fhash_formats.container.defaults import complete
 from fhash_formats.errors import DamagedFileError
 
 
 def test_header_comes_back(sample, samples) -> None:
     with Container.open(sample) as container:
         assert container.header == {
-            **samples.header(),
+            **complete(samples.header()),
             "dimensions": ["time", "z", "y", "x"],
             "format": "fhash",
             "format_version": list(FORMAT_VERSION),
