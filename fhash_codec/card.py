@@ -165,14 +165,15 @@ class Card:
     def _place(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""
         stored = self.container.arrays
-        arrays = [stored[key] for key in stored if key == name or key.startswith(f"{name}/")]
+        found = [key for key in stored if key == name or key.startswith(f"{name}/")]
+        arrays = [stored[key] for key in found]
         bias = stored.get(name.replace("weight_", "bias_")) if name.startswith("mlp/") else None
         if not arrays:
             return {"path": "", "coding": otherwise, "bytes": 0}
-        size = sum(array.nbytes_stored for array in arrays)
+        first, size = arrays[0], sum(array.nbytes_stored for array in arrays)
         return {
-            "path": name if name not in stored else stored[name].name,
-            "coding": arrays[0].coding,
+            "path": first.name[: len(first.name) - len(found[0]) + len(name)],
+            "coding": first.coding,
             "bytes": size + (0 if bias is None else bias.nbytes_stored),
         }
 

@@ -16,8 +16,8 @@ from fhash_codec import EncodeConfig, InputError, Volume
 from fhash_codec.coreset.occupancy import morton_index, pack
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
-PAPER = ["paper-1.0-feature", "paper-1.0-linear-uint8", "paper-1.1-transform"]
-COMPACT = ["compact-1.1-psnr", "compact-1.1-mask", "compact-1.2-clip", "compact-1.2-labels"]
+PAPER = ["paper-feature", "paper-linear-uint8", "paper-transform"]
+COMPACT = ["compact-psnr", "compact-mask", "compact-clip", "compact-labels"]
 
 
 @pytest.fixture(params=[*PAPER, *COMPACT])
@@ -45,7 +45,7 @@ def test_the_paper_shows_the_arrays_of_its_file(name: str) -> None:
         for table in volume.tables:
             path = f"tables/level_{table.level}"
             assert table.ndim == 5
-            if name == "paper-1.1-transform":
+            if name == "paper-transform":
                 components = [plain[f"{path}/component_{n + 1}"] for n in range(table.shape[4])]
                 mixed = sum(
                     values[..., None] * np.float32(attributes["mixing"])
