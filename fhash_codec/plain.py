@@ -96,6 +96,8 @@ class _Export:
         self._arrays = volume.container.arrays
         self._header = volume.container.header
         begin_variable(writer, self._header["variable"])
+        names = [coordinate.name for coordinate in volume.coords.values()]
+        writer.name_axes(names, volume.shape)
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:

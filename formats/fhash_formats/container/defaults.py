@@ -1,4 +1,4 @@
-"""What a header leaves out: values that follow from FORMAT.md or from the rest.
+"""Values that a header leaves out, because they follow from FORMAT.md or from the rest.
 
 In a small file the header costs as much as the coefficients. The defaults belong to the format: a
 default of the encoder that changes is from then on written.

@@ -1,4 +1,4 @@
-"""What a header leaves out comes back, and nothing else."""
+"""Values that a header leaves out come back, and nothing else."""
 
 from __future__ import annotations
 
