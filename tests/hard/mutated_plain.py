@@ -146,6 +146,7 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     shape = [1, 1, 1, 1]
     while prod(shape) < vertices:
         shape[chance.randrange(4)] *= 2
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = shape
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["variable"]["dtype"] = header["model"]["values"] = kind = chance.choice(list(DTYPES))
@@ -250,7 +251,7 @@ def _occupancy(chance: random.Random, parts: Parts) -> Parts:
         return replaced(parts, {DOCUMENT: dumped(root)})
     if turn == 3:
         header["features"] = chance.choice(
-            (header["features"][:1], header["features"] * 2, [], ["all"], ["interval:1:2"] * 40)
+            ([], ["all"], ["all"] * 2, ["interval:1:2"], ["interval:1:2"] * 40)
         )
         return replaced(parts, {DOCUMENT: dumped(root)})
     if coding(document) != "bytes":

@@ -274,6 +274,7 @@ def _giant_shapes(
     ]
     domain = [max(n, chance.choice((1, n, 2**20))) for n in shape]
     domain[0] = shape[0]
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = domain
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["model"]["levels"] = [shape]

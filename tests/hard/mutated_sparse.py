@@ -84,6 +84,7 @@ def _giant_sparse(chance: random.Random, parts: Parts) -> Parts:
     vertices = 1 << chance.choice((16, 18, 20, 22, 24))
     while prod(shape) < vertices:
         shape[chance.randrange(1, 4)] *= 2
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = shape
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["model"].update(levels=[shape], embedding_size=1, hidden_layers=0, tables="float16")

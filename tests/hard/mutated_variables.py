@@ -127,7 +127,7 @@ def _shares(chance: random.Random, parts: Parts) -> Parts:
     numbers = range(-1, len(listed) + 1)
     if chance.random() < 0.6:
         header["shares"] = {
-            chance.choice(SHARED): chance.choice((*numbers, *numbers, *NODES, None, 1.0, True, []))
+            chance.choice(SHARED): chance.choice((*[*numbers] * 20, *NODES, None, 1.0, True, []))
             for _ in range(chance.choice((1, 1, 2)))
         }
     else:
@@ -238,6 +238,8 @@ def _large(chance: random.Random, parts: Parts) -> Parts:
     axis = chance.randrange(4)
     old = chance.choice(listed)["domain"]["shape"][axis]
     new = chance.choice((1, old + 1, 2 * old, 100, *LARGE[:8]))
+    for header in listed:
+        header["quality"].pop("steps", None)
     changed = {}
     for name, data in parts:
         values = root if name == DOCUMENT else json.loads(data) if name.endswith(DOCUMENT) else None

@@ -67,7 +67,8 @@ class Container:
             "fhash" of the root.
         attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
-        arrays: StoredArray by name, in the order of the file; of several variables, by path.
+        arrays: StoredArray by name, in the order of the file; "/" and the path for those that the
+            format does not know. Of several variables, by path.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
         variable: name of the variable where the container is one of those; else None.
@@ -117,7 +118,7 @@ class Container:
                 names = {place: name for name, place in only.places.items()}
                 self.header, self._name = only.header, only.name
                 self.arrays = MappingProxyType(
-                    {names.get(place, place): array for place, array in stored.items()}
+                    {names.get(place, f"/{place}"): array for place, array in stored.items()}
                 )
                 _check_key_frames(self)
             else:

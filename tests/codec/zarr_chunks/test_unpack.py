@@ -129,7 +129,6 @@ def test_plain_files_and_integers_with_gaps_are_refused(tmp_path: Path) -> None:
     for name, what in (
         ("compact-plain-head", "tables of plain numbers"),
         ("compact-counts", "integers of which some have no value"),
-        ("compact-bound", "its features beside its tiles"),
     ):
         with pytest.raises(InputError, match=what):
             fhash_codec.unpack(golden / f"{name}.fhz", tmp_path / "out.zarr")

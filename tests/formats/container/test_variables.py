@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hostile_files import ROOT, edited, read_everything, refused
+from numcodecs.zstd import compress
 from several_files import write_several
-from table_files import PLAIN, table_parts
+from table_files import PLAIN, table_parts, write_table
 
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import CRC32C, plain_codecs
+from fhash_formats.container.coding import CRC32C, plain_codecs, with_crc32c
 from fhash_formats.container.variables import free_node, part_place, shows_values
 from fhash_formats.errors import UnsupportedFileError
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
@@ -101,6 +102,21 @@ def test_other_arrays_lie_with_the_parts(tmp_path, samples) -> None:
     assert paths["occupancy/bits"] == "parts/0.occupancy.bits"
     assert paths["coords/x"] == "x"
     assert "array" not in container.header
+
+
+def test_an_array_at_the_root_never_stands_for_one_of_the_format(tmp_path, samples) -> None:
+    """Its path is the name of another one, and it is of another shape."""
+    path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())
+    parts = samples.unpack(path.read_bytes())
+    document = json.loads(dict(parts)["values/zarr.json"])
+    document |= {"shape": [1, 2], "codecs": plain_codecs(np.dtype("f4"))}
+    document["chunk_grid"]["configuration"]["chunk_shape"] = [1, 2]
+    coded = with_crc32c(compress(np.zeros((1, 2), "<f4"), 1))
+    added = [("key_frames/zarr.json", json.dumps(document).encode()), ("key_frames/c/0/0", coded)]
+    path.write_bytes(samples.pack([*added, *parts]))
+    with Container.open(path) as container:
+        assert set(container.arrays) == {"/key_frames", "tables/level_1"}
+        assert container.verify() == 2
 
 
 def change_first(key, value):
