@@ -86,8 +86,10 @@ def _levels(figures: Sequence[float | None], data_range: float) -> list[int]:
     width = math.log10(data_range or 1.0)
     levels: list[int | None] = []
     for figure in figures:
-        known = figure is not None and 0 < figure < math.inf
-        levels.append(math.floor(HUNDREDTHS * (width - math.log10(figure))) if known else None)
+        if figure is not None and 0 < figure < math.inf:
+            levels.append(math.floor(HUNDREDTHS * (width - math.log10(figure))))
+        else:
+            levels.append(None)
     lowest = min((level for level in levels if level is not None), default=0)
     result = [lowest]
     for figure, level in zip(figures, levels, strict=True):

@@ -536,7 +536,7 @@ class ContainerWriter:
     def _entry(self, header: Mapping[str, Any]) -> dict[str, Any]:
         """The header of the variable as the root has it, and features that it requires."""
         variable = self._current()
-        entry = plain_json(header)
+        entry: dict[str, Any] = plain_json(header)
         if variable.name not in (None, entry.get("variable", {}).get("name")):
             entry["name"] = variable.name
         entry.pop(ARRAY, None)
