@@ -88,12 +88,3 @@ def test_a_missing_key_is_named() -> None:
     del values["center"]
     with pytest.raises(InputError, match="setting center is missing"):
         TileSettings.from_dict(values)
-
-
-def test_features_name_what_a_reader_must_support() -> None:
-    assert SETTINGS.features == ()
-    assert replace(SETTINGS, mask=MaskLevels()).features == ("mask",)
-    assert replace(SETTINGS, coder="signs").features == ("coder-signs",)
-    assert replace(SETTINGS, residual_coder="linear").features == ("coder-linear",)
-    two = replace(SETTINGS, coder="linear", trellis=True, offsets=(0,) * 6)
-    assert two.features == ("coder-linear", "trellis")
