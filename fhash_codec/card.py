@@ -15,13 +15,12 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
-from fhash_codec.header import full_config
 from fhash_codec.model_parts import Mlp, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.provenance import metadata_of
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
-from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY, TABLE
+from fhash_formats.container.header import MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import SourceMetadata
@@ -57,14 +56,14 @@ class Card:
     def metadata(self) -> SourceMetadata | None:
         """All that belongs to the variable in its source, with a line of history for the encoding.
 
-        None where the file says nothing of it: arrays, formats without such things, older files.
+        None where the file says nothing of it: arrays, formats without such things.
         """
         return metadata_of(self.container, self.coords)
 
     @property
     def config(self) -> dict[str, Any]:
         """Every setting that the file was made with, by the names of `EncodeConfig`."""
-        return full_config(self.container.header)
+        return dict(self.container.header["config"])
 
     @property
     def tables(self) -> list[Table]:
@@ -129,7 +128,7 @@ class Card:
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
                 **self._place(
-                    HEAD_ARRAY if HEAD_ARRAY in self.container.arrays else f"mlp/weight_{number}",
+                    f"mlp/weight_{number}",
                     f"packed in the codec of {self._table_path}",
                 ),
             }
@@ -166,14 +165,15 @@ class Card:
     def _place(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""
         stored = self.container.arrays
-        arrays = [stored[key] for key in stored if key == name or key.startswith(f"{name}/")]
+        found = [key for key in stored if key == name or key.startswith(f"{name}/")]
+        arrays = [stored[key] for key in found]
         bias = stored.get(name.replace("weight_", "bias_")) if name.startswith("mlp/") else None
         if not arrays:
             return {"path": "", "coding": otherwise, "bytes": 0}
-        size = sum(array.nbytes_stored for array in arrays)
+        first, size = arrays[0], sum(array.nbytes_stored for array in arrays)
         return {
-            "path": name if name not in stored else stored[name].name,
-            "coding": arrays[0].coding,
+            "path": first.name[: len(first.name) - len(found[0]) + len(name)],
+            "coding": first.coding,
             "bytes": size + (0 if bias is None else bias.nbytes_stored),
         }
 

@@ -70,26 +70,26 @@ class Dataset(Mapping[str, Volume]):
         Raises KeyError that lists the names for no such variable, and for several.
         """
         if name not in self._volumes:
-            found = meant(name, self.container.variables)
+            found = meant(name, self.container.names)
             if len(found) != 1:
-                listed = ", ".join(self.container.variables)[:400]
+                listed = ", ".join(self.container.names)[:400]
                 what = f"{len(found)} variables named" if found else "no variable"
                 raise KeyError(f"{self.path} has {what} {name!r:.80}; it holds {listed}")
             if found != [name]:
                 return self[found[0]]
-            volume = Volume(self.container.variables[name], fill=self._fill)
+            volume = Volume(self.container.variables.get(name, self.container), fill=self._fill)
             # Another thread may have made it meanwhile.
             return self._volumes.setdefault(name, volume)
         return self._volumes[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.container.variables)
+        return iter(self.container.names)
 
     def __len__(self) -> int:
-        return len(self.container.variables)
+        return len(self.container.names)
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and len(meant(name, self.container.variables)) == 1
+        return isinstance(name, str) and len(meant(name, self.container.names)) == 1
 
     def verify(self, progress: Progress = silent) -> int:
         """Read and check every array; return their number. Raises DamagedFileError."""

@@ -26,7 +26,7 @@ from fhash_codec.report import report
 from fhash_codec.stage_clock import recording
 from fhash_codec.training.devices import choose_device, need_torch
 from fhash_formats import list_variables, open_series
-from fhash_formats.container import Container, ContainerWriter, SeveralWriter, VariableWriter
+from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.readers.common.listing import Listed
 from fhash_formats.series import Series
@@ -81,20 +81,19 @@ def encode_dataset(
     check_output(path, force, sources=files)
     encoded: dict[str, EncodedVariable] = {}
     stages: dict[str, list[dict[str, Any]]] = {}
-    with ContainerWriter(path, force=force) as writer:
+    with ContainerWriter(path, force=force, variables=names) as writer:
         writer.attributes = json_attributes(getattr(source, "attrs", {}))
-        several = SeveralWriter(writer, names)
         for number, name in enumerate(names):
             told = _of_variable(progress, f"{name}, {number + 1} of {len(names)}")
-            own = several.variable(name, labels[name])
+            writer.begin(name, labels[name])
             # A function of its own, so that nothing of a variable is held with the next one.
-            encoded[name], stages[name] = _encoded(sources, own, configs[name], path, told)
+            encoded[name], stages[name] = _encoded(sources, name, writer, configs[name], path, told)
         missed = [name for name in names if encoded[name].missed is not None]
         if missed and os.path.lexists(path):
             writer.divert(missed_path(path))
         written = writer.path
         progress("writing", 0, 1, "")
-        several.commit()
+        writer.commit()
         progress("writing", 1, 1, "")
     for variable in encoded.values():
         variable.remove_checkpoint()
@@ -144,10 +143,15 @@ class _Sources:
 
 
 def _encoded(
-    sources: _Sources, writer: VariableWriter, config: EncodeConfig, path: Path, progress: Progress
+    sources: _Sources,
+    name: str,
+    writer: ContainerWriter,
+    config: EncodeConfig,
+    path: Path,
+    progress: Progress,
 ) -> tuple[EncodedVariable, list[dict[str, Any]]]:
     """Write one variable; what is known of it, and what the stages took."""
-    with recording() as clock, _named(writer.name), sources.opened(writer.name) as series:
+    with recording() as clock, _named(name), sources.opened(name) as series:
         encoded = encode_variable(writer, series, config, None, path, progress)
         writer.finish(encoded.header)
     return encoded, clock.to_list()

@@ -22,7 +22,6 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import brief_quality
-from fhash_codec.lean_header import lean
 from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
 from fhash_codec.promises import missed_promise, remarks
@@ -248,8 +247,8 @@ class _Measured:
             self.quality = measure(self._series, volume, self._progress, ssim_budget=vertices)
         low, high = header["value_range"]
         steps = header["domain"]["shape"][0]
-        header = {**header, "quality": brief_quality(self.quality, high - low, steps)}
-        return lean(header) if self._config.profile == "compact" else header
+        quality = brief_quality(self._writer, self.quality, high - low, steps)
+        return {**header, "quality": quality}
 
     def figures(self, header: dict[str, Any]) -> dict[str, Any]:
         """Figures that a promise is checked by; see `report`."""

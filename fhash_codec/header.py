@@ -10,27 +10,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
-from itertools import zip_longest
 from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.provenance import date_of, source_parts
+from fhash_codec.step_figures import read_steps, write_steps
 from fhash_formats.container import (
     SOURCE,
     Container,
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import MISSING, NOT_STORED
-from fhash_formats.container.named import Names
+from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED, STEP_FIGURES
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
@@ -49,6 +47,9 @@ DIGITS = 6
 
 OUTSIDE = MISSING[0]
 """Value of the header's `missing`: the vertices outside the coreset are those without a value."""
+
+GAIN = ("what", "bytes", "seconds")
+"""Entries of a list in `model.gains`, in this order; the last one is left out with the times."""
 
 STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
@@ -100,31 +101,39 @@ def describe_source(
     }
 
 
+def begin_variable(writer: ContainerWriter, variable: Mapping[str, Any]) -> None:
+    """Begin the variable of a header entry, in a file of its own."""
+    units = {"units": variable["units"]} if variable["units"] else {}
+    writer.begin(variable["name"], {**variable["attributes"], **units})
+
+
 def write_series(
     writer: ContainerWriter,
     series: Series,
     scanned: Scan,
     key_frames: Sequence[int],
     *,
-    variable: Mapping[str, Any] | None = None,
+    variable: Mapping[str, Any],
     brief: bool = False,
     everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
-    variable: header entry after which the table is named, and the coordinates after those of the
-        series; None for the names that the format has for them.
+    variable: header entry after which the table is named, unless the writer has begun it.
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
     allows, but for the coordinates of one of several variables, which share their arrays.
     everything: all finite values are in the coreset of every step, so that its mask says
     which are missing. Returns the header entries that then stand for the arrays.
     """
     coords = _storable_coords(series)
-    if variable is not None:
-        writer.names = Names.of(variable, (coords[axis].name for axis in AXES), series.shape)
+    if not writer.begun:
+        begin_variable(writer, variable)
+    described = {}
+    if not writer.one_of_several:
+        names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
+        described = describe_coordinates(coords, names) if brief else {}
     for name, array in source_parts(series, coords, {})[1].items():
         writer.add_whole(name, array)
-    described = describe_coordinates(coords) if brief and not writer.one_of_several else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -197,33 +206,37 @@ def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray
 
 
 def brief_quality(
-    quality: Mapping[str, Any], data_range: float, steps_of_series: int
+    writer: ContainerWriter, quality: Mapping[str, Any], data_range: float, steps_of_series: int
 ) -> dict[str, Any]:
-    """Figures as a header has them: rounded to the worse side, figures of single steps as lists.
+    """Figures as a file has them: rounded to the worse side, those of single steps in decibels.
 
     What follows from other entries of the header is left out, and `full_header` puts it back: the
     PSNR of a step, and the range and the steps of the SSIM where they are those of the series.
 
-    quality: `metrics.Quality` as JSON values. data_range: width of the header's value range.
+    Args:
+        writer: of the container; it gets an array for the figures of many steps.
+        quality: `metrics.Quality` as JSON values.
+        data_range: width of the header's value range.
+        steps_of_series: number of its steps.
     """
     brief: dict[str, Any] = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
         for name, value in quality.items()
+        if name not in ("per_step", "between")
     }
     bulk = quality.get("bulk")
     if bulk is not None:
         # The RMSE follows from the two others.
         brief["bulk"] = {"psnr": _figure("psnr", bulk["psnr"], DIGITS), "range": bulk["range"]}
-    between = brief.pop("between", None)
+    between = quality.get("between")
     if between is not None:
         brief["between"] = {
             name: _figure(name, value, STEP_DIGITS) for name, value in between.items()
         }
-    steps = quality["per_step"]
-    brief["per_step"] = {
-        name: [_figure(name, step[name], STEP_DIGITS) for step in steps]
-        for name in ("rmse", "max_abs_error")
-    }
+    figures = {name: [step[name] for step in quality["per_step"]] for name in STEP_FIGURES}
+    steps = write_steps(writer, figures, data_range)
+    if steps:
+        brief["steps"] = steps
     usual = {"data_range": data_range, "steps": list(range(steps_of_series))}
     brief["ssim_window"] = {
         name: value
@@ -235,108 +248,59 @@ def brief_quality(
 
 def brief_history(
     history: Sequence[Mapping[str, float | None]], *, timings: bool, most: int = MAX_POINTS
-) -> list[dict[str, float]]:
-    """A training history as a header has it: at most so many points, the last point included.
+) -> dict[str, list[float | None]]:
+    """A training history as a header has it: lists by name, of at most so many points.
 
-    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. Figures without a finite value,
-    such as the PSNR of exact values, are left out. timings: keep the seconds.
+    The last point is one of them. Seconds are rounded to milliseconds, PSNR to hundredths of a dB.
+    Figures without a finite value, such as the PSNR of exact values, are None; a list of such
+    figures alone is left out. timings: keep the seconds.
     """
     count = min(len(history), most)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
-    points = [
-        {
-            "seconds": _rounded(point["seconds"], 3) if timings else None,
-            "epoch": point["epoch"],
-            "psnr": _rounded(point["psnr"], 2),
-        }
-        for point in chosen
-    ]
-    return [{name: value for name, value in point.items() if value is not None} for point in points]
+    lists: dict[str, list[float | None]] = {
+        "epoch": [point["epoch"] for point in chosen],
+        "seconds": [_rounded(point["seconds"], 3) if timings else None for point in chosen],
+        "psnr": [_rounded(point["psnr"], 2) for point in chosen],
+    }
+    return {
+        name: values for name, values in lists.items() if any(value is not None for value in values)
+    }
 
 
-def history_columns(points: Sequence[Mapping[str, Any]]) -> Any:
-    """A brief history as lists of numbers by name, which take fewer bytes than a list of points.
+def history_points(history: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The points of a header's training history, each with seconds, epoch and psnr."""
+    lists = {name: history[name] for name in HISTORY if name in history}
+    points = [dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=True)]
+    return [{"seconds": None, "psnr": None, **point} for point in points]
 
-    Where a figure of some point is missing, the points themselves are returned.
+
+def full_header(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """A header as a report has it, with all that follows from the file.
+
+    `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, `history` a
+    list of points, and `model.gains` a list of objects.
+
+    Args:
+        header: of a variable.
+        arrays: its StoredArray by name.
     """
-    names = points[0].keys() if points else ()
-    if any(point.keys() != names for point in points):
-        return list(points)
-    return {name: [point[name] for point in points] for name in names}
-
-
-def history_points(
-    history: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
-) -> list[dict[str, Any]]:
-    """The points of a header's training history, each with seconds, epoch and psnr.
-
-    history: a list of points (profile paper), or a list of values by name (profile compact). What
-        is no list, by another writer, is left out.
-    """
-    if isinstance(history, Mapping):
-        lists = {name: values for name, values in history.items() if isinstance(values, list)}
-        history = [
-            dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=False)
+    low, high = header["value_range"]
+    quality = {name: value for name, value in header["quality"].items() if name != "steps"}
+    steps = read_steps(header, arrays)
+    if steps:
+        quality["per_step"] = [
+            {"step": step, "psnr": _psnr(figures["rmse"], high - low), **figures}
+            for step, figures in enumerate(steps)
         ]
-    return [{"seconds": None, "psnr": None, **point} for point in history]
-
-
-def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
-    """A header with the figures of steps and of the training in one shape, whatever the file has.
-
-    `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, and `history`
-    a list of points, both as a report has them. `config` has every setting, and lean headers are
-    filled up.
-    """
-    header = lean_header.full(header)
-    full = {**header, "history": history_points(header.get("history", ()))}
-    full["config"] = full_config(header)
-    quality = header.get("quality", {})
-    low, high = header.get("value_range", (0.0, 0.0))
-    if "per_step" in quality:
-        full["quality"] = quality = {**quality, "per_step": _steps(quality["per_step"], high - low)}
-    if isinstance(quality.get("ssim_window"), Mapping) and "domain" in header:
+    if isinstance(quality.get("ssim_window"), Mapping):
         usual = {"data_range": high - low, "steps": list(range(header["domain"]["shape"][0]))}
-        full["quality"] = {**quality, "ssim_window": {**usual, **quality["ssim_window"]}}
-    return full
-
-
-def full_config(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Every setting that a file was made with.
-
-    Files of the profile compact before version 1.3 hold only what differs from the defaults, the
-    promise included. The other settings had their defaults. Those of lean headers are in the
-    format.
-    """
-    config = header.get("config", {})
-    profile = header.get("model", {}).get("profile", "compact")
-    defaults = EncodeConfig(profile=profile).to_dict()
-    if lean_header.may_be_lean(header):
-        defaults |= lean_header.CONFIG_DEFAULTS
-    return {**defaults, **config}
-
-
-def _steps(per_step: Any, data_range: float) -> list[dict[str, Any]]:
-    """The figures of each step, from lists by name; what another writer misshaped is left out.
-
-    A PSNR that is not there follows from the root of the mean squared error.
-    """
-    if isinstance(per_step, list):
-        return [dict(step) for step in per_step if isinstance(step, Mapping)]
-    if not isinstance(per_step, Mapping):
-        return []
-    names = [name for name in ("psnr", "rmse", "max_abs_error") if name in per_step]
-    lists: list[Any] = [per_step[name] for name in names]
-    if not all(isinstance(values, list) for values in lists):
-        return []
-    steps = [
-        {"step": step, **dict(zip(names, figures, strict=True))}
-        for step, figures in enumerate(zip_longest(*lists))
-    ]
-    if "psnr" not in names and "rmse" in names:
-        for entry in steps:
-            entry["psnr"] = _psnr(entry["rmse"], data_range)
-    return steps
+        quality["ssim_window"] = {**usual, **quality["ssim_window"]}
+    model = dict(header["model"])
+    if isinstance(model.get("gains"), list):
+        gains = [gain for gain in model["gains"] if isinstance(gain, list)]
+        model["gains"] = [dict(zip(GAIN, gain, strict=False)) for gain in gains]
+    history = history_points(header["history"])
+    return {**header, "model": model, "quality": quality, "history": history}
 
 
 def _psnr(rmse: Any, data_range: float) -> float | None:
@@ -372,7 +336,7 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         for array in container.arrays.values()
     }
     return {
-        **full_header(header),
+        **full_header(header, container.arrays),
         "path": str(path),
         "bytes": container.size,
         "overhead_bytes": container.overhead(),

@@ -20,6 +20,7 @@ from fhash_codec.compact.plain import correction_of, correction_type, predicted
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
+from fhash_codec.header import begin_variable
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.paper.storage import BITS, feature_bits
@@ -27,9 +28,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
-from fhash_formats.container.apart import MASK_ARRAY
-from fhash_formats.container.header import PLAIN_FEATURE
-from fhash_formats.container.named import ARRAY, DIMENSIONS
+from fhash_formats.container.header import MASK_ARRAY, PLAIN_FEATURE, STEPS
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
 from fhash_formats.errors import InputError
@@ -95,11 +94,10 @@ class _Export:
     def __init__(self, volume: Volume, writer: ContainerWriter, progress: Progress) -> None:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
-        header = volume.container.header
-        # Levels of plain tables have no names in the source.
-        self._header = {
-            name: value for name, value in header.items() if name not in (ARRAY, DIMENSIONS)
-        }
+        self._header = volume.container.header
+        begin_variable(writer, self._header["variable"])
+        names = [coordinate.name for coordinate in volume.coords.values()]
+        writer.name_axes(names, volume.shape)
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:
@@ -261,8 +259,8 @@ class _Export:
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
         for name, array in self._arrays.items():
-            # the mask of missing values, and what belongs to the variable in its source
-            if name == "missing/bits" or name.startswith(AUXILIARY):
+            # masks, figures of steps, and what belongs to the variable in its source
+            if name in ("missing/bits", STEPS) or name.startswith(AUXILIARY):
                 self._total += prod(array.grid)
                 self._copy(name, array)
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.lean_header import CONFIG_DEFAULTS
 from fhash_formats.container import SOURCE, Container, describe_metadata, read_metadata
+from fhash_formats.container.defaults import CONFIG_DEFAULTS
 from fhash_formats.series import AXES, Coordinate, Series
 from fhash_formats.source_metadata import SourceMetadata, with_history
 

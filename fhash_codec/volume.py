@@ -32,9 +32,6 @@ from fhash_formats.transform.values.elementwise import about_origin
 OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
 
-CLIPPED_SINCE = (1, 2)
-"""Format version since which values between vertices and steps are clipped to the range, too."""
-
 
 def open(
     path: Place,
@@ -108,7 +105,6 @@ class Volume(Card, ArrayLike):
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = exact_number(header["background"])
-        self._clips = tuple(header["format_version"]) >= CLIPPED_SINCE
         self._outside_is_missing = header.get("missing") == OUTSIDE_IS_MISSING
         self._model = open_model(container)
         self.chunks = self._model.chunks
@@ -354,8 +350,6 @@ class Volume(Card, ArrayLike):
 
     def _in_range(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Interpolated values without the rounding that takes some beyond the series' range."""
-        if not self._clips:
-            return values
         low, high = map(self.float_dtype.type, self.value_range.floats)
         return np.asarray(np.clip(values, low, high))
 

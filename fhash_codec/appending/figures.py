@@ -16,6 +16,7 @@ from fhash_codec.header import brief_quality
 from fhash_codec.measure.errors import psnr
 from fhash_codec.measure.sums import Values, error_sums
 from fhash_codec.measure.value_range import ValueRange, power_of_two
+from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import InputError
 
 __all__ = ["Figures", "StepErrors"]
@@ -88,8 +89,13 @@ class Figures:
             raise RuntimeError("a decoded frame has values that are not finite")
         return StepErrors(sums.number, sums.squares, sums.largest)
 
-    def header(self, data_range: float) -> dict[str, Any]:
-        """The header's `quality`. data_range: width of the header's value range."""
+    def header(self, writer: ContainerWriter, data_range: float) -> dict[str, Any]:
+        """The header's `quality`.
+
+        Args:
+            writer: of the container; it gets an array for the figures of many steps.
+            data_range: width of the header's value range.
+        """
         count = sum(step.number for step in self.steps)
         squares = math.fsum(step.squares for step in self.steps)
         root = math.sqrt(squares / count)
@@ -107,7 +113,7 @@ class Figures:
         ]
         everywhere = {f"{name}_domain": value for name, value in whole.items()}
         quality: dict[str, Any] = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
-        return brief_quality(quality, data_range, len(self.steps))
+        return brief_quality(writer, quality, data_range, len(self.steps))
 
     def _figure(self, scaled: float) -> float | None:
         """A scaled error in data units; None where it is not finite."""

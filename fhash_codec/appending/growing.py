@@ -12,14 +12,12 @@ import numpy as np
 
 from fhash_codec.appending.figures import Figures
 from fhash_codec.appending.layers import CodedLayer, LayerCoder
-from fhash_codec.lean_header import lean
+from fhash_codec.header import begin_variable
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import StoredArray, coordinate_features, describe_coordinates
-from fhash_formats.container.apart import TABLE
+from fhash_formats.container import StoredArray, describe_coordinates
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
-from fhash_formats.container.header import NOT_STORED
-from fhash_formats.container.named import Names
+from fhash_formats.container.header import NOT_STORED, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
 
@@ -63,7 +61,7 @@ class GrowingFile:
         self._range: ValueRange | None = None
         self._container = GrowingContainer(path, force=force, continues=continues)
         frame = tuple(coords[axis].values.size for axis in ("z", "y", "x"))
-        self._container.names = self._names(frame)
+        self._name(frame)
         self._array = GrowingArray(
             name=TABLE,
             frame=frame,
@@ -110,10 +108,10 @@ class GrowingFile:
         if publish:
             self.publish()
 
-    def carry(self, array: StoredArray) -> None:
+    def carry(self, name: str, array: StoredArray) -> None:
         """Write an array that does not depend on time, as another file has it."""
         self._container.add_whole(
-            array.name,
+            name,
             array.read(),
             dimension_names=array.dimension_names,
             attributes=array.attributes,
@@ -138,10 +136,10 @@ class GrowingFile:
     def publish(self) -> None:
         """Make the file complete, with the layers so far."""
         mark = self._container.mark()
-        self._container.names = self._names(self._array.frame)
+        names = self._name(self._array.frame)
         self._container.describe(self._array, self.steps)
         coords = {**self._coords, "t": self._time()}
-        described = describe_coordinates(coords)
+        described = describe_coordinates(coords, names)
         for axis, stored in AXIS_NAMES.items():
             if stored not in described:
                 coordinate = coords[axis]
@@ -152,10 +150,11 @@ class GrowingFile:
                 )
         self._container.publish(self._full_header(described), mark)
 
-    def _names(self, frame: Sequence[int]) -> Names:
-        """The names of the arrays, which stay the same for any number of steps."""
+    def _name(self, frame: Sequence[int]) -> list[str]:
+        """Name the arrays; the names of the axes, which stay the same for any number of steps."""
+        begin_variable(self._container, self._header["variable"])
         coordinates = [self._coords[axis].name for axis in AXES]
-        return Names.of(self._header["variable"], coordinates, (self.steps, *frame))
+        return self._container.name_axes(coordinates, (self.steps, *frame))
 
     def _time(self) -> Coordinate:
         known = self._coords["t"]
@@ -190,10 +189,9 @@ class GrowingFile:
         settings = self.coder.settings
         shape = [self.steps, *self._array.frame]
         weights = 0 if settings.head is None else settings.head.size
-        features = ["transform", *settings.features]
-        header = {
+        return {
             **self._header,
-            "required_features": features + coordinate_features(described),
+            "required_features": ["transform"],
             "domain": {"shape": shape},
             "value_range": [self._range.low, self._range.high],
             "coordinates": described,
@@ -202,6 +200,5 @@ class GrowingFile:
                 "levels": [shape],
                 "parameters": self._nonzero + weights,
             },
-            "quality": self.figures.header(self._range.high - self._range.low),
+            "quality": self.figures.header(self._container, self._range.high - self._range.low),
         }
-        return lean(header)

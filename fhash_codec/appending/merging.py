@@ -18,18 +18,15 @@ from fhash_codec.appending.parts import COLUMNS, COUNTS, ERRORS, PART, WHOLE, co
 from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
-from fhash_codec.header import brief_quality, write_series
-from fhash_codec.lean_header import lean
+from fhash_codec.header import begin_variable, brief_quality, write_series
 from fhash_codec.measure.metrics import Comparer
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
-from fhash_formats.container import SOURCE, Container, ContainerWriter, coordinate_features
-from fhash_formats.container.apart import TABLE
-from fhash_formats.container.header import NOT_STORED
+from fhash_formats.container import SOURCE, Container, ContainerWriter
+from fhash_formats.container.header import NOT_STORED, TABLE
 from fhash_formats.container.record import Record
 from fhash_formats.container.source import damage_named
 from fhash_formats.container.table_parts import TableParts
-from fhash_formats.container.variables import is_several
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.atomic import check_output
@@ -113,7 +110,7 @@ class _Piece:
     def __init__(self, container: Container) -> None:
         self.container, self.path = container, container.path
         header = container.header
-        if is_several(header) or PART not in header:
+        if container.variables or PART not in header:
             raise InputError(
                 f"{self.path} is no part of a series but a whole file; parts are made by "
                 "fhash encode --part I/N"
@@ -289,6 +286,7 @@ class _Whole:
             value_range=ValueRange(low, high), mean=low, finite_count=0, missing=self._missing()
         )
         series = _Positions(self.shape, self._coords())
+        begin_variable(writer, header["variable"])
         for name, array in first.container.arrays.items():
             if name.startswith(WHOLE):
                 writer.add_whole(name.removeprefix(WHOLE), array.read())
@@ -314,16 +312,12 @@ class _Whole:
         header["variable"] = self._variable()
         if SOURCE in first.container.header[PART]:
             header[SOURCE] = first.container.header[PART][SOURCE]
-        header["required_features"] = table.features + coordinate_features(described["coordinates"])
+        header["required_features"] = ["transform"]
         header["coordinates"] = described["coordinates"]
         header["domain"] = {"shape": list(self.shape)}
         header["model"] = self._model(table)
-        gains = header["model"].pop("gains")
         quality = self._quality(ValueRange(low, high), header["background"])
-        header["quality"] = brief_quality(quality, high - low, self.shape[0])
-        header = lean({**header, "model": {**header["model"], "gains": []}})
-        # They are in the lean form already.
-        header["model"]["gains"] = gains
+        header["quality"] = brief_quality(writer, quality, high - low, self.shape[0])
         return header, quality
 
     def _variable(self) -> dict[str, Any]:
@@ -364,7 +358,7 @@ class _Whole:
         model["levels"] = [list(table.shape)]
         model["parameters"] = sum(part.nonzero for part in self._parts) + weights
         last = all_tiles(sum(part.size for part in self._parts))
-        model["gains"] = [*model["gains"][:-1], [last["what"], last["bytes"]]]
+        model["gains"] = [*model["gains"][:-1], last]
         return model
 
     def _quality(self, value_range: ValueRange, background: float) -> dict[str, Any]:

@@ -30,8 +30,14 @@ from fhash_codec.coreset.extent import Extent, packed_masks
 from fhash_codec.coreset.features import Everything, resolve_features
 from fhash_codec.coreset.scan import Scan, scan_steps
 from fhash_codec.coreset.selection import Source, mask_files, open_source
-from fhash_codec.header import OUTSIDE, brief_quality, describe_source, write_series
-from fhash_codec.lean_header import lean
+from fhash_codec.header import (
+    OUTSIDE,
+    begin_variable,
+    brief_quality,
+    describe_source,
+    describe_variable,
+    write_series,
+)
 from fhash_codec.measure.metrics import Comparison
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.sums import ErrorSums
@@ -40,7 +46,7 @@ from fhash_codec.provenance import source_parts
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.container import SOURCE, ContainerWriter, coordinate_features
+from fhash_formats.container import SOURCE, ContainerWriter
 from fhash_formats.container.header import NOT_STORED
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import InputError
@@ -204,8 +210,7 @@ class _Job:
             quality, errors, whole = self._measured(writer, header, progress)
             writer.add_whole(ERRORS, errors)
             low, high = header["value_range"]
-            header["quality"] = brief_quality(quality, high - low, len(self.steps))
-            header = lean(header)
+            header["quality"] = brief_quality(writer, quality, high - low, len(self.steps))
             header[PART] |= {
                 "number": self.part.number,
                 "of": self.part.of,
@@ -252,6 +257,8 @@ class _Job:
         """Write coordinates, masks and tiles; the header without its quality."""
         plan, steps = self.plan, StepsSeries(self.series, self.steps)
         everything = str(Everything()) in plan.features
+        variable = describe_variable(self.series)
+        begin_variable(writer, variable)
         source = self._write_source(writer)
         value_range = plan.value_range
         scanned = Scan(
@@ -261,7 +268,13 @@ class _Job:
             missing={step - self.steps.start: bits for step, bits in missing.items()},
         )
         described = write_series(
-            writer, steps, scanned, range(len(self.steps)), brief=True, everything=everything
+            writer,
+            steps,
+            scanned,
+            range(len(self.steps)),
+            variable=variable,
+            brief=True,
+            everything=everything,
         )
         if everything and plan.has_missing:
             described["missing"] = OUTSIDE
@@ -274,7 +287,7 @@ class _Job:
         )
         parts.write(writer)
         own = deepcopy(dict(plan.header))
-        own["required_features"] = parts.features + coordinate_features(described["coordinates"])
+        own["required_features"] = ["transform"]
         own["model"]["levels"] = [list(parts.shape)]
         own["model"]["parameters"] += coded.outcome.nonzero
         own["model"]["gains"].append(all_tiles(coded.outcome.size))

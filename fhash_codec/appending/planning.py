@@ -18,7 +18,7 @@ from fhash_codec.compact.plan import plan
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection, select_features
-from fhash_codec.header import HEAD_POINTS, brief_history, history_columns
+from fhash_codec.header import HEAD_POINTS, brief_history
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
@@ -119,9 +119,7 @@ def plan_layers(
     )
     header = _header(selection, promised, coder)
     header["training"] = training_header(found.history, timings=False)
-    header["history"] = history_columns(
-        brief_history(found.history, timings=False, most=HEAD_POINTS)
-    )
+    header["history"] = brief_history(found.history, timings=False, most=HEAD_POINTS)
     return GrowingPlan(coder=coder, header=header)
 
 

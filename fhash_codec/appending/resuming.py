@@ -18,10 +18,8 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import SOURCE, Container, StoredArray
-from fhash_formats.container.apart import HEAD_ARRAY, TABLE
-from fhash_formats.container.header import COMPACT, PLAIN_FEATURE
+from fhash_formats.container.header import COMPACT, PLAIN_FEATURE, STEPS, TABLE
 from fhash_formats.container.source import damage_named
-from fhash_formats.container.variables import is_several
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.transform.tile.integers import TRELLIS_WEIGHT, WEIGHT
@@ -42,16 +40,16 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
     state = os.stat(path) if path.exists() else None
     with Container.open(path) as container:
         assert state is not None
-        if is_several(container.header):
+        if container.variables:
             raise InputError(f"{path} has several variables; only a file of one can grow")
-        header = full_header(container.header)
+        header = full_header(container.header, container.arrays)
         settings = _settings(container, header)
         kept = _kept_steps(container, steps)
         value_range = ValueRange(*header["value_range"])
         growing = GrowingFile(
             path,
             _coder(container.arrays[TABLE], settings, header, value_range),
-            _lasting(header),
+            _lasting(header) | {"history": container.header["history"]},
             {axis: container.coordinate(stored) for axis, stored in AXIS_NAMES.items()},
             _figures(path, header, value_range, kept),
             continues=state,
@@ -146,7 +144,6 @@ def _lasting(header: Mapping[str, Any]) -> dict[str, Any]:
         "encoder": encoder,
         "model": {**model, "gains": []},
         "config": config,
-        "history": header["history"],
     }
 
 
@@ -174,14 +171,14 @@ def _figures(path: Path, header: Mapping[str, Any], value_range: ValueRange, kep
 def _keep(growing: GrowingFile, container: Container, kept: int, value_range: ValueRange) -> None:
     """Write what is kept of a file: arrays that do not depend on time, and layers of tiles."""
     for name, array in container.arrays.items():
-        if name in (TABLE, HEAD_ARRAY) or name.startswith("coords/"):
+        if name in (TABLE, STEPS) or name.startswith("coords/"):
             continue
         if _follows_time(array, container):
             raise InputError(
                 f"{container.path}: array {name} has a value for each step; a file with such "
                 "arrays cannot grow"
             )
-        growing.carry(array)
+        growing.carry(name, array)
     for one in container.header.get(SOURCE, {}).get("variables", []):
         if "axis" not in one and container.coordinate("time").name in one.get("dimensions", []):
             raise InputError(

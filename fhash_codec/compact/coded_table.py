@@ -13,6 +13,7 @@ from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.tiles.blocks import Index
 from fhash_codec.compact.tiles.coding import Outcome
 from fhash_codec.config import EncodeConfig
+from fhash_codec.header import GAIN
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.transform.values.elementwise import at_origin
@@ -71,7 +72,7 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
         "parameters": table.outcome.nonzero + weights,
         "head": None if head is None else {"hidden": list(head.hidden), "cross": head.cross},
         "gains": [
-            {name: value for name, value in gain.items() if config.timings or name != "seconds"}
+            [gain[name] for name in (GAIN if config.timings else GAIN[:-1]) if name in gain]
             for gain in table.plan.gains
         ],
     }

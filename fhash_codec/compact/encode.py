@@ -28,13 +28,12 @@ from fhash_codec.header import (
     HEAD_POINTS,
     brief_history,
     describe_source,
-    history_columns,
     write_series,
 )
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
-from fhash_formats.container import ContainerWriter, coordinate_features
+from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
 
 HEADER_BYTES = 750
@@ -87,8 +86,7 @@ def encode_compact(
             parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         own = table_header(selection, table, config, seconds)
-        own["required_features"] = list(parts.features)
-        own["required_features"] += coordinate_features(described["coordinates"])
+        own["required_features"] = ["transform"]
         header = complete(source | described | own, table.in_source)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
@@ -126,9 +124,7 @@ def table_header(
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
         "training": training_header(trained, timings=config.timings),
-        "history": history_columns(
-            brief_history(trained, timings=config.timings, most=HEAD_POINTS)
-        ),
+        "history": brief_history(trained, timings=config.timings, most=HEAD_POINTS),
     }
 
 

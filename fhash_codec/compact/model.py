@@ -16,7 +16,6 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.model_parts import Mlp, Table
 from fhash_formats.container import Container
-from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.values.elementwise import cast
@@ -38,10 +37,6 @@ class CompactModel:
         if PLAIN_FEATURE in container.header["required_features"]:
             self._plain = PlainArray(container.header["model"], self._arrays)
         self._array = self._plain or self._table
-        # Files from before the feature `mask` have their occupancy in arrays that are plain.
-        self._older = not self._table.masked and any(
-            name.startswith("occupancy/") for name in self._arrays
-        )
         self.chunks = self._array.chunk_shape
 
     @cached_property
@@ -71,9 +66,7 @@ class CompactModel:
     def _occupied_at(self, first: int, end: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (t, z, y, x) of a region are in the coreset at each step."""
         steps, space = slice(first, end), region.slices()
-        if MASK_ARRAY in self._arrays and not self._table.masked:
-            return np.asarray(self._arrays[MASK_ARRAY].read((steps, *space)) != 0)
-        if self._table.masked or "occupancy/bits" not in self._arrays:
+        if self._plain is None:
             return self._table.read_mask((steps, *space))
         stored = self._arrays["occupancy/bits"]
         z, y, x = self._array.shape[1:]
@@ -205,13 +198,7 @@ class CompactModel:
         return values, corners, weights
 
     def _without_infinities(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return values of the table, which are finite or NaN; raise DamagedFileError otherwise.
-
-        Outside the coreset, where no value counts, tables of older files may hold infinities. They
-        become NaN, in place.
-        """
-        if values.dtype.kind == "f" and (infinite := np.isinf(values)).any():
-            if not self._older:
-                raise DamagedFileError("the table holds infinities; the file is damaged")
-            values[infinite] = np.nan
+        """Return values of the table, which are finite or NaN; raise DamagedFileError otherwise."""
+        if values.dtype.kind == "f" and np.isinf(values).any():
+            raise DamagedFileError("the table holds infinities; the file is damaged")
         return values

@@ -34,6 +34,7 @@ from fhash_codec.compact.tiles.known import TileRun
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size, is_exact
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
+from fhash_codec.header import GAIN
 from fhash_codec.measure.bulk import bulk_of_ranks, find_bulk
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
@@ -109,7 +110,8 @@ def code_series(
             )
             other = _code_all(replace(exact, goal=goal), workers, progress)
             table = other if other.outcome.size < table.outcome.size else table
-    gain = {**all_tiles(table.outcome.size), "seconds": round(time.perf_counter() - begun, 3)}
+    seconds = round(time.perf_counter() - begun, 3)
+    gain = dict(zip(GAIN, (*all_tiles(table.outcome.size), seconds), strict=True))
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
 
@@ -159,9 +161,9 @@ def plan_series(
     return coding_plan, goal, None if bulk is None else bulk.moved(origin)
 
 
-def all_tiles(size: int) -> dict[str, Any]:
+def all_tiles(size: int) -> list[Any]:
     """Return the last entry of a header's gains: tiles of so many bytes."""
-    return {"what": "all tiles", "bytes": size + OVERHEAD_BYTES}
+    return ["all tiles", size + OVERHEAD_BYTES]
 
 
 def resized(table: CodedTable, overhead: int, progress: Progress) -> CodedTable:

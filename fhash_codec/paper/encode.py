@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.header import brief_history, describe_source, describe_variable, write_series
 from fhash_codec.paper.levels import parameter_count
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
@@ -62,7 +62,13 @@ def encode_paper(
     goal = _goal(selection, series, config)
     trained = train_model(coreset, architecture, config, path, progress, goal)
     with stage("writing", "coordinates, masks, tables, network and header"):
-        write_series(writer, series, selection.scanned, coreset.key_frames)
+        write_series(
+            writer,
+            series,
+            selection.scanned,
+            coreset.key_frames,
+            variable=describe_variable(series),
+        )
     loss, vertices = None, parameter_count(architecture.levels, 1)
     if config.tables == "transform":
         with stage("tables", "--tables transform: coded at a loss that the promise allows"):
@@ -83,9 +89,7 @@ def encode_paper(
     if sparse_tables(coreset, config):
         header["required_features"] = [SPARSE_FEATURE]
     if loss is not None:
-        from fhash_codec.paper.tables.small_parts import MASK_FEATURES
-
-        header["required_features"] = ["transform", *MASK_FEATURES]
+        header["required_features"] = ["transform"]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint, _advice(selection, series, trained, config)
 

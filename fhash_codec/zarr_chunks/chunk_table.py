@@ -17,8 +17,7 @@ from fhash_codec.provenance import figure_attributes, history_line, source_attri
 from fhash_codec.value_type import holds
 from fhash_codec.volume import Volume
 from fhash_formats.container import StoredArray
-from fhash_formats.container.apart import TABLE
-from fhash_formats.container.header import COMPACT, PLAIN_FEATURE
+from fhash_formats.container.header import COMPACT, PLAIN_FEATURE, TABLE
 from fhash_formats.container.sharding import Sharding
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES
@@ -26,7 +25,6 @@ from fhash_formats.source_metadata import NO_AXIS, with_history
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.array_axes import NO_AXIS as NO_TILE_AXIS
 from fhash_formats.transform.array_axes import TILE_AXES, ArrayAxes
-from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.writers.common.outline import Outline
 from fhash_formats.writers.common.region import Region
 
@@ -111,11 +109,10 @@ class ChunkTable:
         return base64.standard_b64encode(struct.pack("<d", float(self.fill))).decode()
 
     def stream(self, index: Sequence[int]) -> bytes:
-        """The bytes of a chunk, with its mask. Raises DamagedFileError."""
+        """The bytes of a chunk. Raises DamagedFileError."""
         by_axis = dict(zip(self.outline.dimensions.values(), index, strict=True))
         place = tuple(by_axis.get(axis, 0) for axis in AXES)
-        data, masks = self._table.coded(place), self._table.masks
-        return bytes(data) if masks is None else join_mask(data, masks.coded(place))
+        return bytes(self._table.coded(place))
 
     def _fill(self) -> int | float | None:
         """The number that stands for a missing value, as xarray's engine shows it."""
@@ -161,16 +158,14 @@ def _with_provenance(outline: Outline, volume: Volume) -> Outline:
 
 def _require_plain_tiles(volume: Volume) -> None:
     """Raise InputError for a volume whose values are more than what its tiles decode to."""
-    header, arrays = volume.container.header, volume.container.arrays
+    header = volume.container.header
     if header["model"]["profile"] != COMPACT:
         raise InputError(_refusal(volume, f"a model of the profile {volume.profile}"))
     if PLAIN_FEATURE in header["required_features"]:
         raise InputError(_refusal(volume, "tables of plain numbers"))
-    table: StoredArray = arrays[TABLE]
+    table: StoredArray = volume.container.arrays[TABLE]
     if table.shape != volume.shape:
         raise InputError(_refusal(volume, "tiles of a part of its domain or of its steps alone"))
-    if any(name.startswith("occupancy/") for name in arrays) and not table.masked:
-        raise InputError(_refusal(volume, "its features beside its tiles"))
     if table.masked and table.dtype.kind != "f":
         raise InputError(_refusal(volume, "integers of which some have no value"))
     if table.dtype != volume.dtype and table.dtype != np.float16:

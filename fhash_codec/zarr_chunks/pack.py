@@ -25,15 +25,14 @@ from fhash_codec.header import (
     write_missing,
     write_series,
 )
-from fhash_codec.lean_header import lean
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.provenance import PACKED
 from fhash_codec.report import bytes_on_disk
 from fhash_codec.zarr_chunks.tiles import Tiles
 from fhash_formats import list_variables
-from fhash_formats.container import ContainerWriter, SeveralWriter, coordinate_features
-from fhash_formats.container.apart import TABLE
+from fhash_formats.container import ContainerWriter
+from fhash_formats.container.header import TABLE
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.request import Request, selection
@@ -93,7 +92,8 @@ def pack(
     request = Request(axes=None if axes is None else tuple(axes), select=selection(select))
     job = _Job(source=root, request=request, absent=absent, timings=timings, progress=progress)
     figures: dict[str, Any] = {}
-    with ContainerWriter(path, force=force) as writer:
+    several = names if len(names) > 1 else ()
+    with ContainerWriter(path, force=force, variables=several) as writer:
         if len(names) == 1:
             with job.opened(names[0]) as (series, array):
                 header, figures[array.name] = job.write(writer, series, array, "")
@@ -124,14 +124,13 @@ def _write_several(
             labels[name] = {**series.attributes, **units}
             metadata = series.metadata
     writer.attributes = {} if metadata is None else json_attributes(metadata.attributes)
-    several = SeveralWriter(writer, names)
     for number, name in enumerate(names, start=1):
-        own = several.variable(name, labels[name])
+        writer.begin(name, labels[name])
         with job.opened(name) as (series, array):
             note = f"{name}, {number} of {len(names)}"
-            header, figures[name] = job.write(own, series, array, note)
-        own.finish(header)
-    return several.commit()
+            header, figures[name] = job.write(writer, series, array, note)
+        writer.finish(header)
+    return writer.commit()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +227,6 @@ def _header(
     """The header of a variable. What only the original data could tell is not in it."""
     settings, facts = tiles.metadata.coder.settings, tiles.facts
     source = describe_source(series, scan.value_range, config)
-    features = {*tiles.metadata.coder.features, *facts.features}
     weights, head = 0, None
     if settings is not None and settings.head is not None:
         weights = settings.head.size
@@ -236,15 +234,11 @@ def _header(
     masked = facts.occupied < prod(array.shape)
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
-    header = {
+    return {
         **source,
         **described,
         **({"missing": OUTSIDE} if masked else {}),
-        "required_features": [
-            "transform",
-            *sorted(features),
-            *coordinate_features(described["coordinates"]),
-        ],
+        "required_features": ["transform"],
         "encoder": {**encoder, **({"codec": array.quality} if array.quality else {})},
         "background": exact_number(_in_type(scan.mean, array.dtype)),
         "feature_bounding_box": [[0, n] for n in array.shape[1:]],
@@ -262,9 +256,8 @@ def _header(
         "config": {**config.to_dict(), **bound},
         "quality": {},
         "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
-        "history": [],
+        "history": {},
     }
-    return lean(header)
 
 
 def _in_type(value: float, dtype: np.dtype[Any]) -> float:

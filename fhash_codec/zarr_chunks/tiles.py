@@ -20,7 +20,6 @@ from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.readers.zarr_coded import CodedArray
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.tile.stream_features import stream_features
 
 __all__ = ["Facts", "Tiles"]
 
@@ -42,7 +41,6 @@ class _Look:
         mean: of its values.
         occupied: number of its vertices that its mask has.
         missing: mask of its vertices without a value, within the array; None where all have one.
-        features: that a reader of it must know.
         absent: whether the store lacks it.
     """
 
@@ -52,7 +50,6 @@ class _Look:
     mean: Mean
     occupied: int
     missing: npt.NDArray[np.bool_] | None
-    features: frozenset[str]
     absent: bool
 
 
@@ -66,7 +63,6 @@ class Facts:
         low, high: their range.
         occupied: number of vertices that masks have.
         missing: packed bits of the vertices without a value, for each step with some.
-        features: that a reader of the tiles must know.
         absent: number of chunks that the store lacks.
         bytes: of all tiles.
     """
@@ -77,7 +73,6 @@ class Facts:
     high: float = -np.inf
     occupied: int = 0
     missing: dict[int, npt.NDArray[np.uint8]] = field(default_factory=dict)
-    features: set[str] = field(default_factory=set)
     absent: int = 0
     bytes: int = 0
     _layer: npt.NDArray[np.bool_] | None = None
@@ -89,7 +84,6 @@ class Facts:
         self.mean.join(look.mean)
         self.low, self.high = min(self.low, look.low), max(self.high, look.high)
         self.occupied += look.occupied
-        self.features |= look.features
         self.absent += look.absent
         self.bytes += len(look.stream)
         steps, *space = region
@@ -212,7 +206,6 @@ class Tiles:
         stream, absent = self._stream(index)
         try:
             decoded, mask = self._decode(stream)
-            features = stream_features(stream, self.metadata.coder.settings)
         except DamagedFileError as error:
             raise DamagedFileError(
                 f"{self._source}: chunk {index} of {array.name} is damaged: {error}"
@@ -244,7 +237,6 @@ class Tiles:
             mean=mean,
             occupied=values.size if occupied is None else int(np.count_nonzero(occupied)),
             missing=missing if missing is not None and missing.any() else None,
-            features=features,
             absent=absent,
         )
 

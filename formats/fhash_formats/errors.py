@@ -57,7 +57,7 @@ class DamagedFileError(FhashError, ValueError):
 
 
 class UnsupportedFileError(DamagedFileError):
-    """A sound `.fhz` file of a newer format, or with features that this version does not know."""
+    """A sound `.fhz` file of another format, or with features that this version does not know."""
 
 
 class TrainingError(FhashError, ArithmeticError):

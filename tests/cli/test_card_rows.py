@@ -21,17 +21,18 @@ def added(line: str) -> bool:
     ("name", "said"),
     [
         (
-            "paper-1.0-feature",
-            ["tables/level_1 to tables/level_", "bytes,", "mlp/weight_1 to mlp/weight_2",
-             "relu", "occupancy/bits, bytes,"],
+            "paper-feature",
+            ["parts/0.tables.level_1 to parts/0.tables.level_", "bytes,",
+             "parts/0.mlp.weight_1 to parts/0.mlp.weight_2",
+             "relu", "parts/0.occupancy.bits, bytes,"],
         ),
-        ("paper-1.1-transform", ["fhash.transform", "occupancy/bits, bytes,"]),
-        ("paper-1.6-sparse", ["; 2 at each needed vertex, float16; tables/level_1 to tables/"]),
-        ("compact-1.1-psnr", ["tables/level_1, fhash.transform,", "none: the values"]),
-        ("compact-1.1-mask", ["in the tiles of tables/level_1"]),
+        ("paper-transform", ["fhash.transform", "parts/0.occupancy.mask, fhash.transform,"]),
+        ("paper-sparse", ["; 2 at each needed vertex, float16; parts/0.tables.level_1 to parts/"]),
+        ("compact-psnr", ["density, fhash.transform,", "none: the values"]),
+        ("compact-mask", ["in the tiles of density"]),
         (
-            "compact-1.4-cross",
-            ["; mlp/parameters, fhash.head, 402 B", "; occupancy/mask, fhash.mask, "],
+            "compact-cross",
+            ["; packed in the codec of density", "in the tiles of density"],
         ),
     ],
 )  # fmt: skip
@@ -56,13 +57,13 @@ def test_the_card_names_every_part_with_its_place(
 
 
 def test_bytes_of_the_parts_are_those_of_the_arrays(fhash: Callable[..., Result]) -> None:
-    info = json.loads(fhash("info", GOLDEN / "paper-1.1-transform.fhz", "--json").stdout)
+    info = json.loads(fhash("info", GOLDEN / "paper-transform.fhz", "--json").stdout)
     card, arrays = info["card"], info["arrays"]
     parts = [*card["tables"], *card["mlp"], card["occupancy"]]
     stored = sum(
         array["bytes"]
         for name, array in arrays.items()
-        if name.startswith(("tables/", "mlp/", "occupancy/"))
+        if name.startswith(("parts/0.tables.", "parts/0.mlp.", "parts/0.occupancy."))
     )
     assert sum(part["bytes"] for part in parts) == stored
     assert 0 < card["config"]["bytes"] < info["bytes"]

@@ -65,12 +65,13 @@ def interpolated(table, lengths, at):
 def values(path, key):
     """Values (z, y, x) of the box at a key frame, float64; NaN outside the coreset."""
     root = zarr.open_group(zarr.storage.ZipStore(path, mode="r"), mode="r")
-    model, (low, high) = (root.attrs["fhash"][name] for name in ("model", "value_range"))
+    (header,), parts = root.attrs["fhash"]["variables"], root["parts"]
+    model, (low, high) = header["model"], header["value_range"]
     lengths, layers = model["levels"][0], []
-    while f"mlp/weight_{len(layers) + 1}" in root:
-        weight, bias = (root[f"mlp/{kind}_{len(layers) + 1}"] for kind in ("weight", "bias"))
+    while f"0.mlp.weight_{len(layers) + 1}" in parts:
+        weight, bias = (parts[f"0.mlp.{kind}_{len(layers) + 1}"] for kind in ("weight", "bias"))
         layers.append((weight[...].astype("f8"), bias[...], weight.attrs.get("scale")))
-    tables = [root[f"tables/level_{n + 1}"] for n in range(len(model["levels"]))]
+    tables = [parts[f"0.tables.level_{n + 1}"] for n in range(len(model["levels"]))]
     if model["profile"] == "paper":
         at = [[key], *map(np.arange, lengths[1:])]
         inputs = np.concatenate([interpolated(table, lengths, at) for table in tables])
@@ -86,8 +87,8 @@ def values(path, key):
             base = tables[0][(*at, 0)]
             base = corrected(base, layers, model["head"]) if layers else base
             base = base if np.dtype(model["values"]).kind == "f" else np.rint(base)
-            more = root["corrections"][at] if "corrections" in root else 0 * base
+            more = parts["0.corrections"][at] if "0.corrections" in parts else 0 * base
             frame[tuple(space)] = (base + more)[key - t.start]
-    bits = root["occupancy/bits"][key]
+    bits = parts["0.occupancy.bits"][key]
     root.store.close()
     return np.where(occupied(bits, lengths[1:]), frame, np.nan)

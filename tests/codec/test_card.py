@@ -16,8 +16,8 @@ from fhash_codec import EncodeConfig, InputError, Volume
 from fhash_codec.coreset.occupancy import morton_index, pack
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
-PAPER = ["paper-1.0-feature", "paper-1.0-linear-uint8", "paper-1.1-transform"]
-COMPACT = ["compact-1.1-psnr", "compact-1.1-mask", "compact-1.2-clip", "compact-1.2-labels"]
+PAPER = ["paper-feature", "paper-linear-uint8", "paper-transform"]
+COMPACT = ["compact-psnr", "compact-mask", "compact-clip", "compact-labels"]
 
 
 @pytest.fixture(params=[*PAPER, *COMPACT])
@@ -30,9 +30,10 @@ def arrays(volume: Volume) -> dict[str, Any]:
     """Every array of a file as zarr reads it: (values, attributes)."""
     with zarr.storage.ZipStore(volume.path, mode="r") as store:
         members = zarr.open_group(store, mode="r").members(max_depth=None)
+        names = {array.name: name for name, array in volume.container.arrays.items()}
         return {
-            name: (array[...], dict(array.attrs))
-            for name, array in members
+            names[path]: (array[...], dict(array.attrs))
+            for path, array in members
             if isinstance(array, zarr.Array)
         }
 
@@ -45,7 +46,7 @@ def test_the_paper_shows_the_arrays_of_its_file(name: str) -> None:
         for table in volume.tables:
             path = f"tables/level_{table.level}"
             assert table.ndim == 5
-            if name == "paper-1.1-transform":
+            if name == "paper-transform":
                 components = [plain[f"{path}/component_{n + 1}"] for n in range(table.shape[4])]
                 mixed = sum(
                     values[..., None] * np.float32(attributes["mixing"])
@@ -65,7 +66,8 @@ def test_the_paper_shows_the_arrays_of_its_file(name: str) -> None:
         keys = [int(step) for step in plain["key_frames"][0]]
         for key, step in enumerate(keys):
             bits = volume.occupancy_bits(step)
-            np.testing.assert_array_equal(bits, plain["occupancy/bits"][0][key])
+            if name != "paper-transform":  # its occupancy is coded
+                np.testing.assert_array_equal(bits, plain["occupancy/bits"][0][key])
 
 
 def test_bits_are_the_mask_in_ragged_morton_order(golden: Volume) -> None:

@@ -146,11 +146,10 @@ def part_writer(number: int) -> Callable[[Path], None]:
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {
-    "compact-1.7-variables": write_variables,
-    "compact-1.7-curvilinear": write_curvilinear,
-    "compact-1.7-grown": write_grown,
-    "compact-1.8-grown": write_grown,
-    "compact-1.7-part-1": part_writer(1),
-    "compact-1.7-part-2": part_writer(2),
+    "compact-variables": write_variables,
+    "compact-curvilinear": write_curvilinear,
+    "compact-grown": write_grown,
+    "compact-part-1": part_writer(1),
+    "compact-part-2": part_writer(2),
 }
 """Writers of the goldens by name."""

@@ -1,7 +1,6 @@
-"""Writes the golden containers of the present format version: `python tests/golden/make.py`.
+"""Writes the golden containers of the present form of the format: `python tests/golden/make.py`.
 
-A golden is made once, when its format version is new, and kept for ever: every later version must
-decode it to the values beside it. Tests only read goldens.
+Until a first release the format may change, and the goldens are made again. Tests only read them.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ TOLERANCE = 1e-5
 """Tolerance of decoded values, as a fraction of the range: float32 sums in another order."""
 
 GOLDENS = {
-    "paper-1.0-plain": EncodeConfig(
+    "paper-plain": EncodeConfig(
         profile="paper", hidden_layers=1, width=8, timings=False, tables="float32"
     ),
-    "paper-1.0-feature": EncodeConfig(
+    "paper-feature": EncodeConfig(
         profile="paper",
         hidden_layers=1,
         width=8,
@@ -42,7 +41,7 @@ GOLDENS = {
         key_frames="0,1,4",
         tables="float16",
     ),
-    "paper-1.0-linear-uint8": EncodeConfig(
+    "paper-linear-uint8": EncodeConfig(
         profile="paper",
         hidden_layers=0,
         embedding_size=1,
@@ -51,35 +50,28 @@ GOLDENS = {
         key_frames="every:2",
         tables="uint8",
     ),
-    "compact-1.1-psnr": EncodeConfig(psnr=50.0, effort=4, timings=False),
-    "compact-1.1-bound": EncodeConfig(
+    "compact-psnr": EncodeConfig(psnr=50.0, effort=4, timings=False),
+    "compact-bound": EncodeConfig(
         max_error=0.01, effort=2, tile="3x4x7x5", timings=False, features=("interval:0.5:2",)
     ),
-    "compact-1.1-mask": EncodeConfig(
-        psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)
-    ),
-    "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
-    "compact-1.2-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
-    "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
-    "compact-1.2-classes": EncodeConfig(max_error=0.0, effort=2, timings=False),
-    "compact-1.2-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
-    "compact-1.3-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
-    "compact-1.3-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
-    "compact-1.3-cross": EncodeConfig(
+    "compact-mask": EncodeConfig(psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)),
+    "compact-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
+    "compact-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
+    "compact-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
+    "compact-classes": EncodeConfig(max_error=0.0, effort=2, timings=False),
+    "compact-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
+    "compact-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
+    "compact-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-cross": EncodeConfig(
         max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
     ),
-    "compact-1.3-many-labels": EncodeConfig(
+    "compact-many-labels": EncodeConfig(
         max_error=0.0, effort=2, timings=False, features=("interval:700:9000",), dilation=0
     ),
-    "compact-1.4-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
-    "compact-1.4-cross": EncodeConfig(
-        max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
-    ),
-    "compact-1.5-lean-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
-    "compact-1.5-trellis": EncodeConfig(psnr=50.0, effort=2, timings=False),
-    "compact-1.5-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
-    "compact-1.5-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
-    "paper-1.1-transform": EncodeConfig(
+    "compact-trellis": EncodeConfig(psnr=50.0, effort=2, timings=False),
+    "compact-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
+    "compact-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
+    "paper-transform": EncodeConfig(
         profile="paper",
         hidden_layers=1,
         width=8,
@@ -88,7 +80,7 @@ GOLDENS = {
         tables="transform",
         psnr=60.0,
     ),
-    "paper-1.3-coded-occupancy": EncodeConfig(
+    "paper-coded-occupancy": EncodeConfig(
         profile="paper",
         hidden_layers=1,
         width=32,
@@ -98,7 +90,7 @@ GOLDENS = {
         tables="transform",
         key_frames="0,2,4",
     ),
-    "paper-1.3-features": EncodeConfig(
+    "paper-features": EncodeConfig(
         profile="paper",
         hidden_layers=1,
         width=4,
@@ -108,7 +100,7 @@ GOLDENS = {
         tables="uint8",
         key_frames="0,2,4",
     ),
-    "paper-1.6-sparse": EncodeConfig(
+    "paper-sparse": EncodeConfig(
         profile="paper",
         hidden_layers=1,
         width=8,
@@ -118,7 +110,7 @@ GOLDENS = {
         tables="sparse",
         key_frames="0,2,3",
     ),
-    "paper-1.6-sparse-untrained": EncodeConfig(
+    "paper-sparse-untrained": EncodeConfig(
         profile="paper",
         hidden_layers=0,
         embedding_size=1,
@@ -130,23 +122,23 @@ GOLDENS = {
         tables="uint8",
         key_frames="0,1,4",
     ),
-    "compact-1.7-source": EncodeConfig(psnr=50.0, effort=1, timings=False),
-    "compact-1.8-named": EncodeConfig(
+    "compact-source": EncodeConfig(psnr=50.0, effort=1, timings=False),
+    "compact-named": EncodeConfig(
         max_error=0.02, effort=1, timings=False, features=("interval:0.5:2",)
     ),
-    "compact-1.8-origin": EncodeConfig(max_error=3.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-origin": EncodeConfig(max_error=3.0, effort=2, timings=False, tile="3x6x4x9"),
 }
 
 PLAIN = {
-    "compact-1.3-plain-bound": "compact-1.1-bound",
-    "compact-1.3-plain-cross": "compact-1.3-cross",
-    "compact-1.3-plain-head": "compact-1.3-head",
-    "compact-1.3-plain-labels": "compact-1.2-labels",
-    "paper-1.3-plain-coded": "paper-1.3-coded-occupancy",
+    "compact-plain-bound": "compact-bound",
+    "compact-plain-cross": "compact-cross",
+    "compact-plain-head": "compact-head",
+    "compact-plain-labels": "compact-labels",
+    "paper-plain-coded": "paper-coded-occupancy",
 }
 """Goldens that are the plain export of another one."""
 
-PACKED = ("compact-1.8-axes",)
+PACKED = ("compact-axes",)
 """Goldens of a Zarr store whose chunks were copied."""
 
 TIME = Coordinate(
@@ -315,17 +307,17 @@ def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
 
 
 SERIES = {
-    "compact-1.1-predictor": fronts,
-    "compact-1.2-classes": classes,
-    "compact-1.2-counts": counts,
-    "compact-1.2-labels": basins,
-    "compact-1.3-many-labels": grains,
-    "compact-1.5-lean-head": cells,
-    "compact-1.5-linear": fronts,
-    "compact-1.5-trellis": fronts,
-    "compact-1.7-source": with_source,
-    "compact-1.8-named": long_axis,
-    "compact-1.8-origin": nanoseconds,
+    "compact-predictor": fronts,
+    "compact-classes": classes,
+    "compact-counts": counts,
+    "compact-labels": basins,
+    "compact-many-labels": grains,
+    "compact-head": cells,
+    "compact-linear": fronts,
+    "compact-trellis": fronts,
+    "compact-source": with_source,
+    "compact-named": long_axis,
+    "compact-origin": nanoseconds,
 }
 """Sources of the goldens that are not made from `series`."""
 

@@ -8,6 +8,9 @@ import random
 from collections.abc import Iterator
 from typing import Any
 
+from fhash_formats.container.header import POSITIONS, TABLE
+from fhash_formats.container.variables import part_place
+
 DOCUMENT = "zarr.json"
 """End of the names of metadata documents; alone, the name of the root's."""
 LARGE = (
@@ -149,3 +152,19 @@ def places(value: Any) -> Iterator[Place]:
 def dumped(values: Any) -> bytes:
     """Return the values as JSON."""
     return json.dumps(values).encode()
+
+
+def header_of(parts: list[tuple[str, bytes]]) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """Return the root document, its attribute `fhash`, and the header of the first variable."""
+    root = json.loads(dict(parts)[DOCUMENT])
+    top = root["attributes"]["fhash"]
+    return root, top, top["variables"][0]
+
+
+def path_of(header: dict[str, Any], name: str) -> str:
+    """Return the path of an array of the first variable in a sound file."""
+    if name == TABLE:
+        return str(header.get("array", part_place(0, name)))
+    if name.startswith("coords/"):
+        return str(header["dimensions"][POSITIONS.index(name.removeprefix("coords/"))])
+    return part_place(0, name)

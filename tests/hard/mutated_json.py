@@ -12,7 +12,7 @@ from copy import deepcopy
 from typing import Any
 
 from containers import Parts
-from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
+from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, header_of, hostile, places
 
 from fhash_formats.container.header import KNOWN_FEATURES
 
@@ -70,13 +70,15 @@ def _key(chance: random.Random, parts: Parts) -> Parts:
 
 def _length(chance: random.Random, parts: Parts) -> Parts:
     """Replace one length of the volume in all documents, so that they agree."""
-    header = json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
+    _, _, header = header_of(parts)
     old = chance.choice(header["domain"]["shape"])
     new = chance.choice((1, 2, old - 1, old + 1, old + 3, 2 * old, 100, 1000, *LARGE[:10]))
     result = []
     for name, data in parts:
         if name.endswith(DOCUMENT):
             values = json.loads(data)
+            if name == DOCUMENT:
+                values["attributes"]["fhash"]["variables"][0]["quality"].pop("steps", None)
             for holder, key in list(places(values)):
                 if type(holder[key]) is int and holder[key] == old and isinstance(holder, list):
                     holder[key] = new
@@ -89,7 +91,7 @@ def _lengths(chance: random.Random, parts: Parts) -> Parts:
     """Make the domain larger than the box, with positions by rule."""
 
     def change(values: dict[str, Any]) -> None:
-        header = values["attributes"]["fhash"]
+        header = chance.choice(values["attributes"]["fhash"]["variables"])
         shape = header["domain"]["shape"]
         for axis in chance.sample(range(4), chance.choice((1, 2, 4))):
             shape[axis] = max(shape[axis], chance.choice((100, 2**10, 2**20, 2**40)))
@@ -114,8 +116,7 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
     steps."""
 
     def change(values: dict[str, Any]) -> None:
-        header = values["attributes"]["fhash"]
-        header = chance.choice(header.get("variables", [header]))
+        header = chance.choice(values["attributes"]["fhash"]["variables"])
         for axis in chance.sample(("time", "z", "y", "x"), chance.choice((1, 1, 2, 4))):
             length = header["domain"]["shape"][("time", "z", "y", "x").index(axis)]
             listed = {
@@ -134,7 +135,8 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
     """Replace numbers of the header on which decoding depends; each is allowed by itself."""
 
     def change(values: dict[str, Any]) -> None:
-        header = values["attributes"]["fhash"]
+        top = values["attributes"]["fhash"]
+        header = chance.choice(top["variables"])
         shape = header["domain"]["shape"]
         turn = chance.randrange(8)
         if turn == 0:
@@ -151,12 +153,12 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
                 [a, chance.randrange(a + 1, n + 1)] for a, n in zip(low, shape[1:], strict=True)
             ]
         elif turn == 4:
-            header["format_version"] = chance.choice(
-                ([1, 0], [1, 1], [1, 2], [1, 3], [1, 9999], [2, 0], [0, 1], [1, -1], [10**9, 0])
+            top["format_version"] = chance.choice(
+                ([2, 0], [2, 1], [2, 9999], [1, 8], [3, 0], [0, 1], [2, -1], [10**9, 0], [2])
             )
         elif turn == 5:
             names = (*sorted(KNOWN_FEATURES), "novelty", "")
-            header["required_features"] = chance.sample(names, chance.randrange(len(names)))
+            top["required_features"] = chance.sample(names, chance.randrange(len(names)))
         elif turn == 6:
             header["features"] = chance.choice(
                 (
@@ -176,7 +178,7 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
                     {},
                     {"epoch": []},
                     {"epoch": [1] * 70_000},
-                    [{}] * 1000,
+                    {"epoch": [None] * 9, "psnr": [1]},
                     {"epoch": [1], "psnr": [None]},
                 )
             )
@@ -185,8 +187,8 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
                     {},
                     {"psnr": None},
                     {"psnr": 1e308, "rmse": 0},
-                    {"per_step": []},
-                    {"per_step": {"psnr": 3}},
+                    {"steps": []},
+                    {"steps": {"rmse": [0] * (shape[0] + 1), "max_abs_error": 3}},
                 )
             )
 

@@ -6,7 +6,6 @@ file without what a kind changes is passed over.
 
 from __future__ import annotations
 
-import json
 import random
 import zlib
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from documents import DOCUMENT, FLOATS, OTHERS, dumped
+from documents import DOCUMENT, FLOATS, OTHERS, dumped, header_of, path_of
 from mutated_payload import (
     NothingFitsError,
     configuration_of,
@@ -27,6 +26,7 @@ from mutated_payload import (
     shard_of,
 )
 
+from fhash_formats.container.header import TABLE
 from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.tile.sections import (
@@ -41,15 +41,7 @@ from fhash_formats.transform.tile.sections import (
     section,
 )
 
-TABLE = "tables/level_1"
-"""Name of the array of values in a compact file."""
 Bytes = bytes | memoryview
-
-
-def _header_of(parts: Parts) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the root document and the header in it."""
-    root = json.loads(dict(parts)[DOCUMENT])
-    return root, root["attributes"]["fhash"]
 
 
 def _labelled(parts: Parts) -> list[tuple[str, int]]:
@@ -178,11 +170,12 @@ def _clip(chance: random.Random, parts: Parts) -> Parts:
 
     Without an error all decoded values lie in the range (hostile_trial.py checks it).
     """
-    document = documents_of(parts).get(TABLE, {})
+    root, top, header = header_of(parts)
+    table = path_of(header, TABLE)
+    document = documents_of(parts).get(table, {})
     settings = configuration_of(document) if document and is_coded(document) else {}
     if "clip" not in settings:
         raise NothingFitsError
-    root, header = _header_of(parts)
     low, high = settings["range"]
     middle = (low + high) / 2
     turn = chance.randrange(7)
@@ -204,12 +197,12 @@ def _clip(chance: random.Random, parts: Parts) -> Parts:
             ([low - 9, low - 8], [middle, middle], [high, high], [0, 0], [-3e38, 3e38])
         )
     elif turn == 5:
-        features = [name for name in header["required_features"] if name != "clip"]
-        header["required_features"] = chance.choice((features, [*features, "clip", "clip"], []))
+        features = top["required_features"]
+        top["required_features"] = chance.choice(([*features, "clip"], features * 2, []))
     else:
-        header["format_version"] = chance.choice(([1, 0], [1, 1], [1, 2], [1, 3]))
+        top["format_version"] = chance.choice(([1, 8], [2, 1], [2, 2], [3, 0]))
         settings["double"] = chance.random() < 0.5
-    return replaced(parts, {f"{TABLE}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
+    return replaced(parts, {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
 FILLS: tuple[Any, ...] = (
@@ -221,8 +214,9 @@ FILLS: tuple[Any, ...] = (
 
 def _integers(chance: random.Random, parts: Parts) -> Parts:
     """Change the type of integers, their fill value, and what stands for missing ones."""
-    document = documents_of(parts).get(TABLE, {})
-    root, header = _header_of(parts)
+    root, _, header = header_of(parts)
+    table = path_of(header, TABLE)
+    document = documents_of(parts).get(table, {})
     variable, model = header["variable"], header["model"]
     if not document or np.dtype(variable["dtype"]).kind not in "iu":
         raise NothingFitsError
@@ -248,7 +242,7 @@ def _integers(chance: random.Random, parts: Parts) -> Parts:
         header["background"] = chance.choice((*FLOATS, 127, 128, 1e30))
         if chance.random() < 0.5:
             variable.pop("fill", None)
-    return replaced(parts, {f"{TABLE}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
+    return replaced(parts, {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {

@@ -1,24 +1,24 @@
-"""Mutations of what version 1.7 of the format added: parts of a series, and files that grew.
+"""Mutations of parts of a series, and of files that grew.
 
 All checksums are correct. A file that is neither is passed over.
 """
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from math import prod
-from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
+from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, header_of, hostile, path_of, places
 from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, replaced, tile_of
 from mutated_plain import array_of_zeros
 from numcodecs.zstd import compress, decompress
 
-ERRORS = "steps/errors"
+from fhash_formats.container.variables import part_place
+
+ERRORS = "parts/0.steps.errors"
 TABLE = "tables/level_1"
 WHOLE = (
     *(
@@ -35,15 +35,9 @@ WHOLE = (
 NUMBERS = (*FLOATS, *SPECIAL, 1.7e308, -1.0, 2.0**63, 0.0)
 
 
-def _root(parts: Parts) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the root document, and the header in it."""
-    root = json.loads(dict(parts)[DOCUMENT])
-    return root, root["attributes"]["fhash"]
-
-
 def _part(chance: random.Random, parts: Parts) -> Parts:
     """Change what a part says of itself and of the whole."""
-    root, header = _root(parts)
+    root, _, header = header_of(parts)
     if "part" not in header:
         raise NothingFitsError
     part, turn = header["part"], chance.randrange(9)
@@ -78,10 +72,8 @@ def _whole(chance: random.Random, parts: Parts) -> Parts:
     """Give a part arrays that the whole is said to have, small and large."""
     length = chance.choice((1, 3, 1 << 20, 1 << 22))
     name = f"whole/{chance.choice(WHOLE)}"
-    added = array_of_zeros(name, [length], chance.choice(("float64", "uint8", "int64")))
-    groups = ["/".join(name.split("/")[:n]) for n in range(1, name.count("/") + 1)]
-    group = b'{"zarr_format":3,"node_type":"group"}'
-    added = [*((f"{path}/{DOCUMENT}", group) for path in groups), *added]
+    kind = chance.choice(("float64", "uint8", "int64"))
+    added = array_of_zeros(name, [length], kind, part_place(0, name))
     kept = [item for item in parts if item[0] != DOCUMENT]
     return [*dict([*added, *kept]).items(), (DOCUMENT, dict(parts)[DOCUMENT])]
 
@@ -107,8 +99,8 @@ def _errors(chance: random.Random, parts: Parts) -> Parts:
 
 def _grown(chance: random.Random, parts: Parts) -> Parts:
     """Change what the next layers depend on: promise, range, figures, tiles, times, history."""
-    root, header = _root(parts)
-    table = header.get("array", TABLE)
+    root, _, header = header_of(parts)
+    table = path_of(header, TABLE)
     document = documents_of(parts).get(table)
     growing = document is not None and coding(document) == "fhash.transform"
     if not growing or "max_error" not in header.get("config", {}) or "part" in header:
@@ -126,10 +118,9 @@ def _grown(chance: random.Random, parts: Parts) -> Parts:
             ([], errors[key][:-1], [0] * 8, [None] * 8, [10**9] * 8, [-(10**9)] * 8, *OTHERS)
         )
     elif turn == 3:
-        quality.pop("steps", None)
         steps = header["domain"]["shape"][0]
-        figures = chance.choices((*FLOATS, 0.0, 1, None), k=steps)
-        quality["per_step"] = {"rmse": figures, "max_abs_error": figures[::-1]}
+        figures = chance.choices((0, 1, -1, -2, 30_000, -(2**31) + 1, 2**31 - 1), k=steps + 1)
+        quality["steps"] = {"rmse": figures, "max_abs_error": figures[::-1]}
     elif turn == 4:
         shape = header["domain"]["shape"]
         shape[0] = chance.choice((1, 2, 3, 5, 6, 8))
@@ -138,7 +129,7 @@ def _grown(chance: random.Random, parts: Parts) -> Parts:
         header["model"]["levels"][0][0] = shape[0]
     elif turn == 5:
         steps = header["domain"]["shape"][0]
-        header["coordinates"]["time"] = chance.choice(
+        header.setdefault("coordinates", {})["time"] = chance.choice(
             (
                 {"values": chance.choices((*FLOATS, 0, 1), k=steps)},
                 {"values": [0] * steps},
@@ -152,7 +143,7 @@ def _grown(chance: random.Random, parts: Parts) -> Parts:
     elif turn == 7:
         header["model"]["parameters"] = chance.choice((1, *LARGE[:12]))
         header["model"]["gains"] = chance.choice(OTHERS)
-        header["history"] = chance.choice(([], {}, [{}] * 1000, {"epoch": [1] * 70_000}))
+        header["history"] = chance.choice(([], {}, {"epoch": [1] * 70_000}))
     elif turn == 8:
         return _beside(chance, parts)
     else:
@@ -163,13 +154,15 @@ def _grown(chance: random.Random, parts: Parts) -> Parts:
 
 def _beside(chance: random.Random, parts: Parts) -> Parts:
     """Add an array that a growing file would have to carry on."""
-    name = chance.choice(("extra", "steps/errors", "auxiliary/a", "occupancy/bits", "coords/x"))
-    table = _root(parts)[1].get("array", TABLE)
-    length = chance.choice((1, 7, prod(tile_of(documents_of(parts)[table])), 1 << 22))
-    added = array_of_zeros(name, [length], chance.choice(("float64", "uint8")))
-    if "/" in name:
-        group = b'{"zarr_format":3,"node_type":"group"}'
-        added = [(f"{name.split('/')[0]}/{DOCUMENT}", group), *added]
+    names = ("extra", "steps/errors", "steps/figures", "auxiliary/a", "occupancy/bits", "coords/x")
+    name, (_, _, header) = chance.choice(names), header_of(parts)
+    tile = tile_of(documents_of(parts)[path_of(header, TABLE)])
+    length = chance.choice((1, 7, prod(tile), 1 << 22))
+    kind = chance.choice(("float64", "uint8"))
+    path = name if name == "extra" else path_of(header, name)
+    added = array_of_zeros(name, [length], kind, path)
+    if path.startswith("parts/"):
+        added = [(f"parts/{DOCUMENT}", b'{"zarr_format":3,"node_type":"group"}'), *added]
     kept = [item for item in parts if item[0] != DOCUMENT]
     return [*dict([*added, *kept]).items(), (DOCUMENT, dict(parts)[DOCUMENT])]
 

@@ -19,11 +19,9 @@ from containers import Parts, with_crc
 from documents import DOCUMENT
 from numcodecs.zstd import compress, decompress
 
-from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.sharding import Sharding, pack_index, parse_index
 from fhash_formats.errors import FhashError
-from fhash_formats.transform.apart import without_names
 from fhash_formats.transform.array_axes import take_axes
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.entropy.coder import decode_integers
@@ -31,7 +29,6 @@ from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels
 from fhash_formats.transform.entropy.mask import decode_mask
 from fhash_formats.transform.entropy.predict import decode_predicted
 from fhash_formats.transform.entropy.table import single_band
-from fhash_formats.transform.tile.apart import join_mask, split_mask
 from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
 from fhash_formats.transform.tile.sections import (
     MISSING,
@@ -253,8 +250,7 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     _, document, member, data = chosen(chance, parts, True)
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    whole, apart = without_names(configuration_of(document))
-    whole, axes = take_axes(whole)
+    whole, axes = take_axes(configuration_of(document))
     shape = sharding.chunk_shape if axes is None else axes.tile_shape(sharding.chunk_shape)
     dtype = np.dtype(document["data_type"])
     stream = chunks[at][:-4]
@@ -265,11 +261,7 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
         if own is None:
             raise NothingFitsError
         settings = unpack_settings(own)
-    if MASK_ARRAY in apart:
-        stream = split_mask(_restreamed(chance, join_mask(stream, b""), settings, shape, dtype))[0]
-    else:
-        stream = _restreamed(chance, stream, settings, shape, dtype)
-    chunks[at] = with_crc(stream)
+    chunks[at] = with_crc(_restreamed(chance, stream, settings, shape, dtype))
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 

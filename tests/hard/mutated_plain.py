@@ -1,11 +1,10 @@
-"""Mutations of what version 1.3 of the format added: plain files, and occupancy in other forms.
+"""Mutations of plain files, and of occupancy in arrays.
 
 All checksums are correct. A file without what a kind changes is passed over.
 """
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from math import prod
@@ -13,25 +12,25 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
+from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, header_of, hostile, path_of, places
 from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, replaced
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.header import KNOWN_FEATURES
 from fhash_formats.support.number_types import DTYPES
 
+CORRECTIONS = "parts/0.corrections"
+"""Path of the corrections."""
+NUMBERS = ("parts/0.mlp.", "parts/0.tables.", CORRECTIONS)
+"""Beginnings of the paths of arrays of numbers."""
+OCCUPANCY = "parts/0.occupancy."
+"""Beginning of the paths of arrays of occupancy."""
 GIANT_BYTES = 1 << 28
 """Largest decoded bytes of a chunk of zeros in a file of some kilobytes."""
 
 
-def _root(parts: Parts) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the root document and the header in it."""
-    root = json.loads(dict(parts)[DOCUMENT])
-    return root, root["attributes"]["fhash"]
-
-
 def _is_plain(parts: Parts) -> bool:
-    return "plain" in _root(parts)[1]["required_features"]
+    return "plain" in header_of(parts)[1]["required_features"]
 
 
 def _members(parts: Parts, name: str) -> list[str]:
@@ -51,7 +50,7 @@ def _plain(chance: random.Random, parts: Parts) -> Parts:
     """Change what the header of a plain file says: tiles, levels, types, head, features."""
     if not _is_plain(parts):
         raise NothingFitsError
-    root, header = _root(parts)
+    root, top, header = header_of(parts)
     model, turn = header["model"], chance.randrange(8)
     if turn == 0:
         sizes = (1, 1, 2, 5, 64, *LARGE[:8], 0, -1)
@@ -71,7 +70,7 @@ def _plain(chance: random.Random, parts: Parts) -> Parts:
         )
     elif turn == 4:
         names = sorted(KNOWN_FEATURES)
-        header["required_features"] = chance.choice(
+        top["required_features"] = chance.choice(
             ([], names, ["plain"] * 2, ["plain", "transform"], ["transform"], ["plain", "mask"])
         )
     elif turn == 5 and model["head"] is not None:
@@ -104,7 +103,7 @@ def _numbers(chance: random.Random, parts: Parts) -> Parts:
     if not _is_plain(parts):
         raise NothingFitsError
     documents = documents_of(parts)
-    names = [name for name in documents if name.startswith(("mlp/", "tables/", "corrections"))]
+    names = [name for name in documents if name.startswith(NUMBERS)]
     name = chance.choice(names)
     document, turn = documents[name], chance.randrange(4)
     if turn == 0 and "scale" in document.get("attributes", {}):
@@ -113,8 +112,8 @@ def _numbers(chance: random.Random, parts: Parts) -> Parts:
             (*FLOATS, *OTHERS[:6], 0, scale / 2, scale * 2, scale / 3, -scale)
         )
         return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document)})
-    if turn == 1 and name == "corrections":
-        gone = [(other, data) for other, data in parts if not other.startswith("corrections/")]
+    if turn == 1 and name == CORRECTIONS:
+        gone = [(other, data) for other, data in parts if not other.startswith(f"{CORRECTIONS}/")]
         return gone if chance.random() < 0.5 else _retyped(chance, parts, name, document)
     member = chance.choice(_members(parts, name))
     values = _values(parts, member, document)
@@ -142,11 +141,12 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     """Declare a giant volume of zeros in a plain file of a few kilobytes, with one tile."""
     if not _is_plain(parts):
         raise NothingFitsError
-    root, header = _root(parts)
+    root, _, header = header_of(parts)
     vertices = 1 << chance.choice((16, 18, 20, 22, 24))
     shape = [1, 1, 1, 1]
     while prod(shape) < vertices:
         shape[chance.randrange(4)] *= 2
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = shape
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["variable"]["dtype"] = header["model"]["values"] = kind = chance.choice(list(DTYPES))
@@ -172,17 +172,24 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     ]
     if chance.random() < 0.5:
         new.append(("corrections", shape, "float32"))
-    gone = ("tables/", "corrections/", "key_frames/", "occupancy/", "coords/", "missing/")
-    kept = [(name, data) for name, data in parts if not name.startswith(gone) and name != DOCUMENT]
-    group = dumped({"zarr_format": 3, "node_type": "group"})
-    kept += [(f"{name}/{DOCUMENT}", group) for name in ("tables", "occupancy", "coords")]
+    gone = ("parts/", *(f"{name}/" for name in header["dimensions"]))
+    head = "parts/0.mlp."
+    kept = [
+        (name, data)
+        for name, data in parts
+        if name.startswith(head) or not (name.startswith(gone) or name == DOCUMENT)
+    ]
+    kept.append((f"parts/{DOCUMENT}", dumped({"zarr_format": 3, "node_type": "group"})))
     for name, lengths, dtype in new:
-        kept += array_of_zeros(name, lengths, dtype)
+        kept += array_of_zeros(name, lengths, dtype, path_of(header, name))
     return [*kept, (DOCUMENT, dumped(root))]
 
 
-def array_of_zeros(name: str, shape: list[int], dtype: str) -> Parts:
-    """Return the members of an array of one chunk; key frames and positions ascend."""
+def array_of_zeros(name: str, shape: list[int], dtype: str, path: str = "") -> Parts:
+    """Return the members of an array of one chunk; key frames and positions ascend.
+
+    path: in the file; the name by default.
+    """
     size = prod(shape)
     ascending = name.startswith(("key_frames", "coords"))
     values = np.arange(size, dtype=dtype) if ascending else np.zeros(size, dtype)
@@ -203,8 +210,8 @@ def array_of_zeros(name: str, shape: list[int], dtype: str) -> Parts:
             {"name": "crc32c"},
         ],
     }
-    chunk = f"{name}/c/" + "/".join("0" * len(shape))
-    return [(f"{name}/{DOCUMENT}", dumped(document)), (chunk, _stored(values))]
+    chunk = f"{path or name}/c/" + "/".join("0" * len(shape))
+    return [(f"{path or name}/{DOCUMENT}", dumped(document)), (chunk, _stored(values))]
 
 
 _LITTLE = {"configuration": {"endian": "little"}}
@@ -213,16 +220,16 @@ _LITTLE = {"configuration": {"endian": "little"}}
 def _occupancy(chance: random.Random, parts: Parts) -> Parts:
     """Change which vertices are in the coreset, in any of the arrays that say so."""
     documents = documents_of(parts)
-    names = [name for name in documents if name.startswith("occupancy/")]
+    names = [name for name in documents if name.startswith(OCCUPANCY)]
     if not names:
         raise NothingFitsError
-    root, header = _root(parts)
+    root, top, header = header_of(parts)
     name, turn = chance.choice(names), chance.randrange(7)
     document = documents[name]
     if turn == 0:  # under another name, or beside itself
         other = chance.choice(("bits", "mask", "feature_1", "feature_2", "feature_3", "feature_9"))
         renamed = [
-            (f"occupancy/{other}/{member.removeprefix(f'{name}/')}", data)
+            (f"{OCCUPANCY}{other}/{member.removeprefix(f'{name}/')}", data)
             for member, data in parts
             if member.startswith(f"{name}/")
         ]
@@ -237,19 +244,18 @@ def _occupancy(chance: random.Random, parts: Parts) -> Parts:
     if turn == 1:  # gone
         return [(member, data) for member, data in parts if not member.startswith(f"{name}/")]
     if turn == 2:
-        features = header["required_features"]
-        coded = [feature for feature in features if feature != "coded-occupancy"]
-        header["required_features"] = chance.choice(
-            (coded, [*coded, "coded-occupancy"], [f for f in features if f != "labels"], [])
+        features = top["required_features"]
+        top["required_features"] = chance.choice(
+            (features * 2, [*features, "sparse-tables"], [*features, "transform"], [])
         )
         return replaced(parts, {DOCUMENT: dumped(root)})
     if turn == 3:
         header["features"] = chance.choice(
-            (header["features"][:1], header["features"] * 2, [], ["all"], ["interval:1:2"] * 40)
+            ([], ["all"], ["all"] * 2, ["interval:1:2"], ["interval:1:2"] * 40)
         )
         return replaced(parts, {DOCUMENT: dumped(root)})
     if coding(document) != "bytes":
-        raise NothingFitsError  # kinds "stream" and "apart" and their like
+        raise NothingFitsError  # kind "stream" and its like
     member = chance.choice(_members(parts, name))
     values = _values(parts, member, document)
     if turn == 4:

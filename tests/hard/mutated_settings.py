@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from documents import DOCUMENT, dumped, hostile, places
+from documents import DOCUMENT, dumped, header_of, hostile, path_of, places
 from mutated_payload import (
     bytes_changed,
     chosen,
@@ -33,7 +33,7 @@ from mutated_payload import (
     values_changed,
 )
 
-from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
+from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE, TABLE
 from fhash_formats.container.sharding import Sharding
 from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.axes.basis import Basis
@@ -52,7 +52,7 @@ from fhash_formats.transform.tile.sections import (
     PREDICTED,
 )
 
-CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE, "variables", "named"})
+CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE})
 """Features of files with coded tiles: all but those of files whose headers differ."""
 
 
@@ -94,12 +94,8 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         configuration_of(document),
         tile_of(document),
     )
-    root = json.loads(dict(parts)[DOCUMENT])
-    header = root["attributes"]["fhash"]
-    own = [name for name in ("variables", "named") if name in header["required_features"]]
-    header["required_features"] = [*CODED_FEATURES, *own]
-    for variable in header.get("variables", ()):
-        variable["required_features"] = CODED_FEATURES
+    root, top, _ = header_of(parts)
+    top["required_features"] = CODED_FEATURES
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
@@ -224,11 +220,12 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
 
     All tiles are empty.
     """
-    document = documents_of(parts).get("tables/level_1", {})
-    root = json.loads(dict(parts)[DOCUMENT])
-    header = root["attributes"]["fhash"]
+    root, top, header = header_of(parts)
+    table = path_of(header, TABLE)
+    document = documents_of(parts).get(table, {})
     if header["model"]["profile"] != "compact" or not is_coded(document):
         return values_changed(chance, parts)
+    top["required_features"] = CODED_FEATURES
     kind = chance.choice(list(DTYPES))
     shape, chunk, shard = _giant_shapes(chance, header, kind)
     settings = configuration_of(document)
@@ -250,13 +247,13 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     stream = _empty_stream(chance, prod(chunk), np.dtype(kind).itemsize)
     present = sharding.present((0, 0, 0, 0), shape)
     chunks = [with_crc(stream)] * int(present.sum())
-    new = {f"tables/level_1/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)}
+    new = {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)}
     kept = [
         (name, data)
         for name, data in parts
-        if not name.startswith(("missing/", "occupancy/", "tables/level_1/c"))
+        if not name.startswith((f"{table}/c", "parts/0.missing."))
     ]
-    shards = ("tables/level_1/c/0/0/0/0", shard_of(sharding, present, chunks))
+    shards = (f"{table}/c/0/0/0/0", shard_of(sharding, present, chunks))
     return [*replaced(kept, new), shards]
 
 
@@ -277,12 +274,12 @@ def _giant_shapes(
     ]
     domain = [max(n, chance.choice((1, n, 2**20))) for n in shape]
     domain[0] = shape[0]
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = domain
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["model"]["levels"] = [shape]
     header["model"]["tables"] = kind
     header["coordinates"] = {name: {} for name in ("time", "z", "y", "x")}
-    header["required_features"] = CODED_FEATURES
     return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
 
 

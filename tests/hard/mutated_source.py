@@ -1,4 +1,4 @@
-"""Mutations of what version 1.7 of the format added: the source's metadata.
+"""Mutations of the metadata of a source.
 
 All checksums are correct. A file without such metadata is passed over.
 """
@@ -14,6 +14,8 @@ from containers import Parts
 from documents import DOCUMENT, LARGE, OTHERS, dumped, hostile, places
 from mutated_payload import NothingFitsError, replaced
 from mutated_plain import array_of_zeros
+
+from fhash_formats.container.variables import part_place
 
 TYPES = (
     *("int8", "int16", "uint64", "float16", "float32", "float64", "text", "bytes1", "bytes65536"),
@@ -41,7 +43,7 @@ def _headers(parts: Parts) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Return the root document, and all headers with metadata of the source."""
     root = json.loads(dict(parts)[DOCUMENT])
     header = root["attributes"]["fhash"]
-    found = [one for one in header.get("variables", [header]) if "source" in one]
+    found = [one for one in header["variables"] if "source" in one]
     if not found:
         raise NothingFitsError
     return root, found
@@ -144,14 +146,13 @@ def _zeros(chance: random.Random, parts: Parts) -> Parts:
         header["source"]["variables"] = [
             {"name": f"a{n}", "dimensions": ["long"], "array": "long"} for n in range(times)
         ]
-    several = "variables" in root["attributes"]["fhash"]
-    node = headers[0].get("array")
-    name = f"parts/{node}.auxiliary.long" if several else "auxiliary/long"
+    number = root["attributes"]["fhash"]["variables"].index(headers[0])
     for header in headers[1:]:
-        header["shares"] = {"auxiliary/long": node}
+        header["shares"] = {"auxiliary/long": number}
     kept = [item for item in parts if item[0] != DOCUMENT]
-    group = ("auxiliary/" + DOCUMENT, b'{"zarr_format":3,"node_type":"group"}')
-    added = [*array_of_zeros(name, [length], "float64"), *([] if several else [group])]
+    group = (f"parts/{DOCUMENT}", b'{"zarr_format":3,"node_type":"group"}')
+    path = part_place(number, "auxiliary/long")
+    added = [*array_of_zeros("auxiliary/long", [length], "float64", path), group]
     return [*dict([*added, *kept]).items(), (DOCUMENT, dumped(root))]
 
 

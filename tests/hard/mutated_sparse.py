@@ -1,36 +1,34 @@
-"""Mutations of what version 1.6 of the format added: tables of needed vertices alone.
+"""Mutations of tables of needed vertices alone.
 
 All checksums are correct. A file without what a kind changes is passed over.
 """
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from math import prod
 from typing import Any
 
 from containers import Parts
-from documents import DOCUMENT, LARGE, OTHERS, dumped, hostile, places
+from documents import DOCUMENT, LARGE, OTHERS, dumped, header_of, hostile, path_of, places
 from mutated_payload import NothingFitsError, documents_of, replaced
 from mutated_plain import array_of_zeros
 
-NAMES = ("tables/level_1", "tables/level_2")
+NAMES = ("parts/0.tables.level_1", "parts/0.tables.level_2")
 
 
-def _header(parts: Parts) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the root document of a file of sparse tables, and the header in it."""
-    root = json.loads(dict(parts)[DOCUMENT])
-    header = root["attributes"]["fhash"]
+def _header(parts: Parts) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Return what `header_of` gives for a file of sparse tables."""
+    root, top, header = header_of(parts)
     if "sparse" not in header["model"]:
         raise NothingFitsError
-    return root, header
+    return root, top, header
 
 
 def _sparse(chance: random.Random, parts: Parts) -> Parts:
     """Change what says which vertices a table has: header, counts, levels, features."""
-    root, header = _header(parts)
+    root, top, header = _header(parts)
     model, turn = header["model"], chance.randrange(7)
     if turn < 3:
         return _counts(chance, parts)
@@ -40,8 +38,8 @@ def _sparse(chance: random.Random, parts: Parts) -> Parts:
         if chance.random() < 0.2:
             del model["sparse"]
     elif turn == 4:
-        names = ([], ["sparse-tables"] * 2, ["sparse-tables", "coded-occupancy"], ["transform"])
-        header["required_features"] = chance.choice(names)
+        names = ([], ["sparse-tables"] * 2, ["sparse-tables", "transform"], ["transform"])
+        top["required_features"] = chance.choice(names)
         model["tables"] = chance.choice(("float16", "float32", "uint8", "transform"))
     elif turn == 5:
         levels = model["levels"]
@@ -81,11 +79,12 @@ def _counts(chance: random.Random, parts: Parts) -> Parts:
 
 def _giant_sparse(chance: random.Random, parts: Parts) -> Parts:
     """Declare a giant volume in a file of a few kilobytes that has few or all of its vertices."""
-    root, header = _header(parts)
+    root, _, header = _header(parts)
     shape = [1, 1, 1, 1]
     vertices = 1 << chance.choice((16, 18, 20, 22, 24))
     while prod(shape) < vertices:
         shape[chance.randrange(1, 4)] *= 2
+    header["quality"].pop("steps", None)
     header["domain"]["shape"] = shape
     header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
     header["model"].update(levels=[shape], embedding_size=1, hidden_layers=0, tables="float16")
@@ -102,17 +101,14 @@ def _giant_sparse(chance: random.Random, parts: Parts) -> Parts:
             for axis, n in zip(("time", "z", "y", "x"), shape, strict=True)
         ),
     ]
-    gone = ("tables/", "mlp/", "key_frames/", "occupancy/", "coords/", "missing/")
+    gone = ("parts/", *(f"{name}/" for name in header["dimensions"]))
     kept = [(name, data) for name, data in parts if not name.startswith(gone) and name != DOCUMENT]
-    group = dumped({"zarr_format": 3, "node_type": "group"})
-    kept += [(f"{name}/{DOCUMENT}", group) for name in ("tables", "mlp", "occupancy", "coords")]
+    kept.append((f"parts/{DOCUMENT}", dumped({"zarr_format": 3, "node_type": "group"})))
     for name, lengths, dtype in arrays:
-        kept += array_of_zeros(name, lengths, dtype)
-    table = documents_of(kept)["tables/level_1"]
+        kept += array_of_zeros(name, lengths, dtype, path_of(header, name))
+    table = documents_of(kept)[NAMES[0]]
     table["attributes"] = {"counts": [rows]}
-    return replaced(
-        [*kept, (DOCUMENT, dumped(root))], {f"tables/level_1/{DOCUMENT}": dumped(table)}
-    )
+    return replaced([*kept, (DOCUMENT, dumped(root))], {f"{NAMES[0]}/{DOCUMENT}": dumped(table)})
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {

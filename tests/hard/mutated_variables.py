@@ -1,6 +1,6 @@
-"""Mutations of what version 1.7 of the format added: files of several variables.
+"""Mutations of variables: their number, names, places and what they share.
 
-All checksums are correct. A file of one variable is passed over.
+All checksums are correct. Some kinds pass over files of one variable.
 """
 
 from __future__ import annotations
@@ -44,15 +44,13 @@ Root = dict[str, Any]
 def root_of(parts: Parts) -> tuple[Root, list[dict[str, Any]]]:
     """Return the root document, and the headers of its variables."""
     root = json.loads(dict(parts)[DOCUMENT])
-    listed = root["attributes"]["fhash"].get("variables")
-    if not isinstance(listed, list):
-        raise NothingFitsError
+    listed: list[dict[str, Any]] = root["attributes"]["fhash"]["variables"]
     return root, listed
 
 
 def is_several(parts: Parts) -> bool:
     """Whether a sound file holds several variables."""
-    return "variables" in json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
+    return len(root_of(parts)[1]) > 1
 
 
 def consolidated(parts: Parts) -> Parts:
@@ -81,7 +79,7 @@ def _variables(chance: random.Random, parts: Parts) -> Parts:
     if turn == 0:
         key = chance.choice(("name", "array"))
         header[key] = chance.choice(
-            (*NODES, *(other[key] for other in listed), hostile(chance, "u"))
+            (*NODES, *(other.get(key) for other in listed), hostile(chance, "u"))
         )
     elif turn == 1:
         names = chance.choice(listed)["dimensions"]
@@ -100,13 +98,12 @@ def _variables(chance: random.Random, parts: Parts) -> Parts:
         del listed[chance.randrange(1, len(listed) + 1) :]
     elif turn == 3:
         listed.append(deepcopy(header))
-        listed[-1]["name"] = chance.choice(("again", header["name"]))
-        listed[-1]["array"] = chance.choice(("again", header["array"]))
+        for key in ("name", "array"):
+            listed[-1][key] = chance.choice(("again", header.get(key)))
     elif turn == 4:
         features = top["required_features"]
-        chosen = chance.choice((top, header))
-        chosen["required_features"] = chance.choice(
-            ([], features[1:], features[:1], [*features, "novelty"], features * 9, ["variables"], 3)
+        top["required_features"] = chance.choice(
+            ([], features[1:], features[:1], [*features, "novelty"], features * 9, ["plain"], 3)
         )
     elif turn == 5:
         other = chance.choice(listed)
@@ -127,10 +124,10 @@ def _shares(chance: random.Random, parts: Parts) -> Parts:
     """Change which arrays a variable shares, or the shared array."""
     root, listed = root_of(parts)
     header = chance.choice(listed)
-    nodes = [other["array"] for other in listed]
+    numbers = range(-1, len(listed) + 1)
     if chance.random() < 0.6:
         header["shares"] = {
-            chance.choice(SHARED): chance.choice((*nodes, *nodes, *NODES, None, 3, []))
+            chance.choice(SHARED): chance.choice((*[*numbers] * 20, *NODES, None, 1.0, True, []))
             for _ in range(chance.choice((1, 1, 2)))
         }
     else:
@@ -145,14 +142,20 @@ def _places(chance: random.Random, parts: Parts) -> Parts:
     """Put an array at another place: among the parts, at the root, to another variable."""
     _, listed = root_of(parts)
     names = [name for name in documents_of(parts) if name]
-    name, node = chance.choice(names), chance.choice(listed)["array"]
+    name, number = chance.choice(names), chance.randrange(len(listed) + 1)
+    node = str(listed[0].get("array", "u"))
     other = chance.choice(
         (
             *(
-                f"parts/{node}.{end}"
+                f"parts/{number}.{end}"
                 for end in ("tables.level_1", "coords.x", "key_frames", "", "..")
             ),
-            *(f"parts/{chance.choice(NODES)}.mlp.bias_1", f"{node}_2", f"parts/{node}", "extra/a"),
+            *(
+                f"parts/{chance.choice(NODES)}.mlp.bias_1",
+                f"{node}_2",
+                f"parts/{number}",
+                "extra/a",
+            ),
             *(chance.choice(names), chance.choice(NODES)),
         )
     )
@@ -168,44 +171,11 @@ def _places(chance: random.Random, parts: Parts) -> Parts:
     return [*changed.items(), (DOCUMENT, root_document)]
 
 
-def is_named(parts: Parts) -> bool:
-    """Whether a sound file has the names of its source."""
-    header = json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
-    return "named" in header["required_features"]
-
-
-def _named(chance: random.Random, parts: Parts) -> Parts:
-    """Change the names of the source in a file of one variable, or put an array elsewhere."""
-    if not is_named(parts):
-        raise NothingFitsError
-    root = json.loads(dict(parts)[DOCUMENT])
-    header, turn = root["attributes"]["fhash"], chance.randrange(6)
-    table, dimensions = header["array"], header["dimensions"]
-    others = (*NODES, "tables/level_1", "missing", "whole", *dimensions, table)
-    if turn == 0:
-        header["array"] = chance.choice((*others, hostile(chance, table)))
-    elif turn == 1:
-        header["dimensions"] = chance.choice(
-            (dimensions[::-1], dimensions[:3], [*dimensions, "w"], chance.choices(others, k=4), 3)
-        )
-    elif turn == 2:
-        features = header["required_features"]
-        header["required_features"] = [name for name in features if name != "named"]
-    elif turn == 3:
-        del header[chance.choice(("array", "dimensions"))]
-    else:
-        old = chance.choice([name for name in documents_of(parts) if name])
-        new = chance.choice([name for name in others if name])
-        moved = [(name.replace(f"{old}/", f"{new}/", 1), data) for name, data in parts]
-        parts = [*dict(moved if turn == 4 else [*moved[:-1], *parts]).items()]
-        if turn == 5:
-            header["array"] = chance.choice((table, new))
-    return replaced(parts, {DOCUMENT: dumped(root)})
-
-
 def _consolidated(chance: random.Random, parts: Parts) -> Parts:
     """Change the copies of the documents in the root, or the original of one."""
     root, _ = root_of(parts)
+    if "consolidated_metadata" not in root:
+        raise NothingFitsError
     turn = chance.randrange(4)
     if turn == 0:
         holder, key = chance.choice(list(places(root["consolidated_metadata"])))
@@ -224,26 +194,32 @@ def _many(chance: random.Random, parts: Parts) -> Parts:
     """Declare hundreds of variables, on one grid or each on its own, and long lists."""
     root, listed = root_of(parts)
     header = min(listed, key=lambda one: len(json.dumps(one)))
+    own = listed.index(header)
     count, own_grid = chance.choice((30, 200, 700)), chance.random() < 0.4
     axis = chance.randrange(4)
-    grid, table = header["dimensions"][axis], header["array"]
+    grid, table = header["dimensions"][axis], header.get("array", "u")
     below = [
         (name, data)
         for name, data in parts
-        if name.startswith((f"{table}/", f"parts/{table}.")) and name != DOCUMENT
+        if name.startswith((f"{table}/", f"parts/{own}.")) and name != DOCUMENT
     ]
     positions = [(name, data) for name, data in parts if name.startswith(f"{grid}/")]
     added: Parts = []
     for number in range(count):
         node = f"n{number}"
-        copy = {**header, "name": node, "array": node}
+        copy = {**header, "name": node, **({"array": node} if "array" in header else {})}
         if own_grid:
             copy["dimensions"] = [*header["dimensions"]]
             copy["dimensions"][axis] = f"g{number}"
             added += [(name.replace(grid, f"g{number}", 1), data) for name, data in positions]
         listed.append(copy)
         added += [
-            (name.replace(f"{table}.", f"{node}.", 1).replace(f"{table}/", f"{node}/", 1), data)
+            (
+                name.replace(f"/{own}.", f"/{len(listed) - 1}.", 1)
+                if name.startswith("parts/")
+                else name.replace(f"{table}/", f"{node}/", 1),
+                data,
+            )
             for name, data in below
         ]
     if chance.random() < 0.3:
@@ -262,6 +238,8 @@ def _large(chance: random.Random, parts: Parts) -> Parts:
     axis = chance.randrange(4)
     old = chance.choice(listed)["domain"]["shape"][axis]
     new = chance.choice((1, old + 1, 2 * old, 100, *LARGE[:8]))
+    for header in listed:
+        header["quality"].pop("steps", None)
     changed = {}
     for name, data in parts:
         values = root if name == DOCUMENT else json.loads(data) if name.endswith(DOCUMENT) else None
@@ -281,5 +259,4 @@ KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
     "consolidated": _consolidated,
     "many variables": _many,
     "variables length": _large,
-    "named path": _named,
 }

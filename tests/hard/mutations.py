@@ -8,7 +8,6 @@ reaches the code behind them. A sealed file may even be sound.
 from __future__ import annotations
 
 import contextlib
-import json
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import mutated_apart
+import documents
 import mutated_json
 import mutated_labels
 import mutated_parts
@@ -31,12 +30,12 @@ from containers import Parts, pack, unpack
 
 GOLDENS = Path(__file__).parents[1] / "golden"
 NEWEST = (
-    "compact-1.2-clip",
-    "compact-1.2-labels",
-    "compact-1.2-counts",
-    "compact-1.2-classes",
-    "compact-1.4-cross",
-    "compact-1.3-many-labels",
+    "compact-clip",
+    "compact-labels",
+    "compact-counts",
+    "compact-classes",
+    "compact-cross",
+    "compact-many-labels",
 )
 """Goldens that take turns most evenly, with clipped values and with labels in turns: every kind
 soon meets both."""
@@ -93,8 +92,6 @@ def _mutation(number: int, golden: str, kind: str) -> Mutation:
     chance = random.Random(number)
     data, parts = goldens()[golden]
     if kind in OF_ONE and mutated_variables.is_several(parts):
-        raise mutated_payload.NothingFitsError
-    if kind in UNNAMED and mutated_variables.is_named(parts):
         raise mutated_payload.NothingFitsError
     if kind in DAMAGES:
         return Mutation(
@@ -189,7 +186,6 @@ _MODULES = (
     mutated_settings,
     mutated_labels,
     mutated_plain,
-    mutated_apart,
     mutated_sparse,
     mutated_variables,
     mutated_source,
@@ -202,27 +198,20 @@ SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
 KINDS = (*DAMAGES, *SEALED)
 PLAIN_KINDS = frozenset(mutated_plain.KINDS)
 """Kinds that change plain files, or arrays of occupancy, only."""
-APART_KINDS = frozenset(mutated_apart.KINDS)
-"""Kinds that change parts of a table that lie in arrays of their own, only."""
 SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
 """Kinds that change tables of needed vertices only."""
-SEVERAL_KINDS = frozenset(mutated_variables.KINDS) - {"named path"}
+SEVERAL_KINDS = frozenset(("consolidated",))
 """Kinds that change files of several variables only."""
 SOURCE_KINDS = frozenset(mutated_source.KINDS)
 """Kinds that change metadata of a source only."""
 PART_KINDS = frozenset(mutated_parts.KINDS)
 """Kinds that change parts of a series or files that grew only."""
-OF_ONE = frozenset(
-    ("length", "domain", "header", "giant", "clip", "integers", "apart", "occupancy", "grown")
-) | (PLAIN_KINDS | SPARSE_KINDS)
+OF_ONE = frozenset(("length", "giant", "clip", "integers", "occupancy", "grown")) | (
+    PLAIN_KINDS | SPARSE_KINDS
+)
 """Kinds that change files of one variable only."""
-UNNAMED = frozenset(("giant", "clip", "integers", "apart"))
-"""Kinds that change the table under its internal name only."""
-NAMED_KINDS = frozenset(("named path",))
-"""Kinds that change files with the names of their source only."""
 
 
 def header_of(parts: Parts) -> Any:
     """Return the header of a golden; of several variables, that of the first."""
-    header = json.loads(dict(parts)["zarr.json"])["attributes"]["fhash"]
-    return header["variables"][0] if "variables" in header else header
+    return documents.header_of(parts)[2]

@@ -19,8 +19,8 @@ from properties import looking
 import fhash_codec
 from fhash_cli.output import emit
 from fhash_codec import EncodeConfig, FhashWarning
-from fhash_codec.header import brief_history, brief_quality, history_columns, history_points
-from fhash_formats.container import strict_json
+from fhash_codec.header import brief_history, brief_quality, history_points
+from fhash_formats.container import ContainerWriter, strict_json
 from fhash_formats.series import ArraySeries, Coordinate
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.plain_json import plain_json
@@ -81,9 +81,7 @@ def test_anything_becomes_strict_json_and_stays_it(value: dict[str, Any]) -> Non
     timings=st.booleans(),
 )
 def test_any_history_is_stored_and_read(points: list[dict[str, Any]], timings: bool) -> None:
-    stored = strict_json.dumps(
-        {"history": history_columns(brief_history(points, timings=timings))}, "it"
-    )
+    stored = strict_json.dumps({"history": brief_history(points, timings=timings)}, "it")
     read = history_points(strict_json.loads(stored)["history"])
     assert len(read) == min(len(points), 24)
     for point in read:
@@ -96,7 +94,9 @@ def test_any_quality_is_stored_and_printed(figures: list[Any], largest: float) -
     step = {"step": 0, "psnr": figures[0], "rmse": figures[1], "max_abs_error": largest}
     quality = {"psnr": figures[2], "max_abs_error": largest, "per_step": [step], "ssim_window": {}}
     finite = plain_json(quality)
-    strict_json.dumps(plain_json(brief_quality(finite, 1.0, 1)), "it")
+    strict_json.dumps(
+        plain_json(brief_quality(ContainerWriter("unused.fhz"), finite, 1.0, 1)), "it"
+    )
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         emit({"quality": quality, "data_range": math.inf}, "", as_json=True)
     assert json.loads(printed.getvalue(), parse_constant=lambda name: 1 / 0)["data_range"] is None

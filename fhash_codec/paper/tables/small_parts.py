@@ -18,8 +18,8 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Layer
 from fhash_codec.paper.storage import MASK_BITS, MASK_FEATURE_BITS, write_features_apart
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.coding import transform_codecs
+from fhash_formats.container.header import MASK_ARRAY
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -30,8 +30,6 @@ WEIGHT_STEPS = tuple(2.0**-power for power in range(2, 13))
 """Quantiser steps tried for the weights of a matrix, as shares of their root mean square."""
 MASK_VERTICES = 4 << 20
 """Vertices of a chunk of the occupancy; a frame is read by decoding one chunk."""
-MASK_FEATURES = ("labels", "coded-occupancy")
-"""Features of the format that the coded occupancy needs of a reader."""
 
 _PLAIN = TransformSpec.from_dict(dict.fromkeys("tzyx", "none"))
 

@@ -22,6 +22,7 @@ The tests prove that the zarr library reads every array equal.
     hierarchy        members of the ZIP -> header and arrays
     record           checked access to a JSON object
     header           checks of the header
+    defaults         what a header leaves out
     expected_arrays  arrays that a header asks for
     coordinates      positions in the header
     source_described what belongs to the variable in its source -> header and arrays
@@ -36,15 +37,14 @@ The tests prove that the zarr library reads every array equal.
     stored           StoredArray: one array, read region by region
     reader           Container: a file for reading
     writer           ContainerWriter: a file for writing
-    variables        names and headers of several variables in a file
-    several          SeveralWriter: several variables, one after the other
+    variables        names and headers of the variables in a file
 """
 
-from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
-from fhash_formats.container.header import FORMAT_VERSION, validate_header
+from fhash_formats.container.coordinates import describe_coordinates
+from fhash_formats.container.header import validate_header
+from fhash_formats.container.layout import FORMAT_VERSION
 from fhash_formats.container.location import Location, Place, StorageOptions
 from fhash_formats.container.reader import Container, is_container
-from fhash_formats.container.several import SeveralWriter, VariableWriter
 from fhash_formats.container.sharding import shard_order, shard_shape
 from fhash_formats.container.source_described import describe_metadata
 from fhash_formats.container.source_entry import SOURCE, read_metadata
@@ -58,11 +58,8 @@ __all__ = [
     "ContainerWriter",
     "Location",
     "Place",
-    "SeveralWriter",
     "StorageOptions",
     "StoredArray",
-    "VariableWriter",
-    "coordinate_features",
     "describe_coordinates",
     "describe_metadata",
     "is_container",

@@ -53,8 +53,7 @@ class ChunkCoder(Protocol):
 
     - A coder that can decode with less detail has `decode(data, lod)`; level of detail 0 is all.
     - A coder whose chunks say which values are occupied has `masked` True and
-      `decode_masked(data)`, which returns values and mask. Masks may lie in an array of their own:
-      `join(data, mask)` makes the chunk that has its mask itself.
+      `decode_masked(data)`, which returns values and mask.
     - A coder that corrects its values last has `parted` True, `uncorrected(data, part)` and
       `corrected(table, part)`, by which a part of a chunk is had sooner than all of it.
     """
@@ -133,34 +132,10 @@ def _transform_coder(
     return TransformCoder(codecs, dtype, shape)
 
 
-def _head_coder(
-    codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> ChunkCoder:
-    """The coder of `fhash.head`."""
-    from fhash_formats.transform.parts import HeadCoder
-
-    return HeadCoder(codecs, dtype, shape)
-
-
-def _mask_coder(
-    codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> ChunkCoder:
-    """The coder of `fhash.mask`."""
-    from fhash_formats.transform.parts import MaskCoder
-
-    return MaskCoder(codecs, dtype, shape)
-
-
 TRANSFORM = "fhash.transform"
-HEAD = "fhash.head"
-"""Codec of the head of a table, see `apart`."""
-MASK = "fhash.mask"
-"""Codec of the masks of a table's tiles, see `apart`."""
 ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {
     "bytes": PlainCoder,
     TRANSFORM: _transform_coder,
-    HEAD: _head_coder,
-    MASK: _mask_coder,
 }
 """Coder by the name of the first codec; the coder is given all codecs but the last, `crc32c`."""
 
@@ -180,27 +155,18 @@ class CheckedCoder:
         """The bytes of a full chunk and their CRC-32C."""
         return with_crc32c(self._coder.encode(chunk))
 
-    def decode(
-        self, data: memoryview, lod: int = 0, mask: memoryview | None = None
-    ) -> npt.NDArray[Any]:
+    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
         """The full chunk at a level of detail; 0 is all of it.
-
-        mask: the chunk's mask where it lies in an array of its own, without its CRC-32C.
 
         Raises DamagedFileError for damaged data, and InputError for another level of detail of a
         coder that has none.
         """
-        coded = self._whole(data, mask)
+        coded = without_crc32c(data)
         if lod == 0:
             return self._coder.decode(coded)
         if lod < 0 or "lod" not in inspect.signature(self._coder.decode).parameters:
             raise InputError(f"level of detail {lod}; the array has none but 0")
         return self._coder.decode(coded, lod)  # type: ignore[call-arg]
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Features that a reader of the chunks must know, besides that of the codec itself."""
-        return tuple(getattr(self._coder, "features", ()))
 
     @property
     def settings(self) -> Any:
@@ -212,14 +178,12 @@ class CheckedCoder:
         """Axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones."""
         return getattr(self._coder, "axes", None)
 
-    def decode_table(
-        self, data: memoryview, lod: int = 0, mask: memoryview | None = None
-    ) -> npt.NDArray[Any]:
+    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
         """The full chunk before it is corrected, for a coder that tells both apart.
 
         Raises DamagedFileError.
         """
-        coded = self._whole(data, mask)
+        coded = without_crc32c(data)
         decode = getattr(self._coder, "decode_table", None)
         values: npt.NDArray[Any] = decode(coded, lod) if decode else self._coder.decode(coded)
         return values
@@ -249,21 +213,10 @@ class CheckedCoder:
         """Whether the chunks say which of their values are occupied."""
         return bool(getattr(self._coder, "masked", False))
 
-    def decode_masked(
-        self, data: memoryview, mask: memoryview | None = None
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk and its mask, for a coder that is `masked`; raises DamagedFileError."""
-        coded = self._whole(data, mask)
-        values, occupied = self._coder.decode_masked(coded)  # type: ignore[attr-defined]
+        values, occupied = self._coder.decode_masked(without_crc32c(data))  # type: ignore[attr-defined]
         return values, occupied
-
-    def _whole(self, data: memoryview, mask: memoryview | None) -> memoryview | bytes:
-        """The checked bytes of a chunk, with its mask put behind them."""
-        coded = without_crc32c(data)
-        if mask is None:
-            return coded
-        joined: bytes = self._coder.join(coded, mask)  # type: ignore[attr-defined]
-        return joined
 
 
 def chunk_coder(

@@ -19,8 +19,6 @@ import numpy.typing as npt
 from fhash_formats.container.record import Record
 from fhash_formats.series import AXIS_NAMES, Coordinate
 
-FEATURE = "ulps"
-"""Feature of the format that a reader of rules with `ulps` must know."""
 MAX_LISTED = 1024
 """Positions that are written as a list, also one of `ulps`; a reader takes any number.
 
@@ -41,17 +39,21 @@ _DIGITS = (*range(1, 16), 17)
 Floats = npt.NDArray[np.float64]
 
 
-def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
+def describe_coordinates(
+    coords: Mapping[str, Coordinate], dimensions: Sequence[str] = tuple(AXIS_NAMES.values())
+) -> dict[str, Any]:
     """The header's `coordinates`, without those that need an array of their own.
 
-    `coords` holds a coordinate for each of "t", "z", "y" and "x".
+    Args:
+        coords: a coordinate for each of "t", "z", "y" and "x".
+        dimensions: names of these axes in the header, which those of coordinates are by default.
     """
     described = {}
-    for axis, stored in AXIS_NAMES.items():
+    for (axis, stored), dimension in zip(AXIS_NAMES.items(), dimensions, strict=True):
         coordinate = coords[axis]
         description = describe_positions(coordinate.values)
         if description is not None:
-            name = {} if coordinate.name == stored else {"name": coordinate.name}
+            name = {} if coordinate.name == dimension else {"name": coordinate.name}
             attributes = (
                 {"attributes": dict(coordinate.attributes)} if coordinate.attributes else {}
             )
@@ -59,17 +61,17 @@ def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
     return described
 
 
-def described_coordinate(description: Mapping[str, Any], stored: str, length: int) -> Coordinate:
+def described_coordinate(description: Mapping[str, Any], dimension: str, length: int) -> Coordinate:
     """The coordinate that a description stands for, once `check_positions` has passed it.
 
     Args:
         description: the axis' object in the header.
-        stored: name of the axis in the container.
+        dimension: name of the axis in the header.
         length: number of positions.
     """
     values = positions(description, length)
     return Coordinate(
-        name=description.get("name", stored),
+        name=description.get("name", dimension),
         values=values,
         attributes=description.get("attributes", {}),
     )
@@ -142,11 +144,6 @@ def check_positions(record: Record, length: int) -> None:
         record.text("name")
     if record.has("attributes"):
         record.record("attributes")
-
-
-def coordinate_features(coordinates: Mapping[str, Any]) -> list[str]:
-    """Features that a reader of the header's `coordinates` must know."""
-    return [FEATURE] if any("ulps" in one for one in coordinates.values()) else []
 
 
 def _nearly_ruled(values: Floats, kinds: Sequence[str]) -> dict[str, Any] | None:

@@ -14,30 +14,32 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.apart import MASK_ARRAY, TABLE
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import MASK, TRANSFORM
+from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.container.header import (
     CODED,
     COMPACT,
     HEAD_CROSS,
     HEAD_INPUTS,
+    LOWEST,
+    MASK_ARRAY,
+    MAX_LEVEL,
     PAPER,
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
+    STEP_BYTES,
+    STEP_FIGURES,
+    STEPS,
     TRANSFORM_FEATURE,
 )
 from fhash_formats.container.record import Record
 from fhash_formats.container.source_entry import check_source
-from fhash_formats.container.sparse import SPARSE, check_occupancy, sparse_shape
+from fhash_formats.container.sparse import SPARSE, sparse_shape
 from fhash_formats.errors import DamagedFileError
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
 """Name, shape and allowed number types of an array."""
-
-MASK_FEATURE = "coded-occupancy"
-"""Feature of files that have MASK_ARRAY in place of bits."""
 
 
 def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
@@ -45,10 +47,13 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
 
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
-    if SPARSE in header["model"]:
-        check_occupancy(arrays)
+    paper = header["model"]["profile"] == PAPER
+    if SPARSE in header["model"] and MASK_ARRAY in arrays:
+        raise DamagedFileError(
+            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs occupancy/bits"
+        )
     for name, shape, dtypes in _required_arrays(header, arrays):
-        if name == "occupancy/bits" and MASK_ARRAY in arrays:
+        if name == "occupancy/bits" and MASK_ARRAY in arrays and paper:
             continue
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
@@ -57,17 +62,13 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
             _check_table_attributes(name, arrays[name], header["model"])
     if PLAIN_FEATURE in header["required_features"]:
         _check_layers(arrays, header["model"])
-    plain = PLAIN_FEATURE in header["required_features"]
-    _check_array_features(
-        header["required_features"],
-        arrays,
-        coded_needed=plain or header["model"]["profile"] == PAPER,
-    )
+    _check_codecs(header["required_features"], arrays)
     for name, shape, dtypes in _optional_arrays(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
-    if MASK_ARRAY in arrays and arrays[MASK_ARRAY].coding == MASK:
-        _check_masks(arrays[MASK_ARRAY], arrays[TABLE])
+    if STEPS in arrays:
+        attributes = Record(arrays[STEPS].attributes, f"array {STEPS} attribute ")
+        attributes.integers(LOWEST, len(STEP_FIGURES), -MAX_LEVEL, MAX_LEVEL)
     for axis in POSITIONS:
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
@@ -159,18 +160,14 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     if model["profile"] == COMPACT:
         key_frames, *box = model["levels"][0]
         yield "key_frames", (key_frames,), ("int64",)
-        yield (
-            "occupancy/bits",
-            (key_frames, occupancy_bytes(header["feature_bounding_box"])),
-            ("uint8",),
-        )
         yield "corrections", (key_frames, *box), PLAIN_TABLE_TYPES
     else:
-        # One of each feature, where there are several; a file from before 1.2 has none.
+        # One of each feature, where there are several.
         bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
         for number in range(1, len(header["features"]) + 1):
             yield f"occupancy/feature_{number}", bits, ("uint8",)
-    yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
+        yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
+    yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
@@ -194,15 +191,6 @@ def _check_table_attributes(name: str, table: ArrayMetadata, model: Mapping[str,
         attributes.numbers("mixing", model["embedding_size"])
 
 
-def _check_masks(masks: ArrayMetadata, table: ArrayMetadata) -> None:
-    """Check that there is one mask for each tile of a table."""
-    if masks.shape != table.shape or masks.inner_shape != table.inner_shape:
-        raise DamagedFileError(
-            f"array {MASK_ARRAY} has shape {masks.shape} in chunks of {masks.inner_shape}; "
-            f"its table has {table.shape} in tiles of {table.inner_shape}"
-        )
-
-
 def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any]) -> None:
     """Check the units of the weights and biases of a plain head."""
     for number in range(1, len(layer_shapes(model)) + 1):
@@ -212,32 +200,13 @@ def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any])
             unit.need(unit.number("scale") > 0, "scale", "above 0")
 
 
-def _check_array_features(
-    required_features: Sequence[str],
-    arrays: Mapping[str, ArrayMetadata],
-    *,
-    coded_needed: bool,
-) -> None:
-    """Check that the header requires every feature that a reader of the arrays must know.
-
-    coded_needed: whether an occupancy in MASK_ARRAY needs a feature of its own, as in all files but
-    coded ones of the profile compact.
-    """
-    if TRANSFORM_FEATURE not in required_features:
-        for name, array in arrays.items():
-            if array.sharding is not None or array.coding == TRANSFORM:
-                raise DamagedFileError(
-                    f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
-                    "which the header does not require"
-                )
-    if coded_needed and MASK_ARRAY in arrays and MASK_FEATURE not in required_features:
-        raise DamagedFileError(
-            f"array {MASK_ARRAY} is there without the feature {MASK_FEATURE}; "
-            "a reader that does not know it would look for other arrays"
-        )
+def _check_codecs(required_features: Sequence[str], arrays: Mapping[str, ArrayMetadata]) -> None:
+    """Check that the header requires the feature of the codecs of the arrays."""
+    if TRANSFORM_FEATURE in required_features:
+        return
     for name, array in arrays.items():
-        for feature in array.coder.features:
-            if feature not in required_features:
-                raise DamagedFileError(
-                    f"array {name} has the feature {feature}, which the header does not require"
-                )
+        if array.sharding is not None or array.coding == TRANSFORM:
+            raise DamagedFileError(
+                f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
+                "which the header does not require"
+            )

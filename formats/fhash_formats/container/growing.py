@@ -199,7 +199,7 @@ class GrowingContainer(ContainerWriter):
         except OSError as error:
             raise self._explained(error) from error
 
-    def _tail(self, header: Mapping[str, Any]) -> bytes:
+    def _tail(self, header: Mapping[str, Any] | None = None) -> bytes:
         self._wake()
         return super()._tail(header)
 

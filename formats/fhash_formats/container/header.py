@@ -11,46 +11,34 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.container.coordinates import FEATURE as ULPS_FEATURE
 from fhash_formats.container.coordinates import MAX_RULED, check_positions
+from fhash_formats.container.layout import check_major
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.support.number_types import DTYPES
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 8)
-"""(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
-AXES_FEATURE = "axes"
-"""Feature of tables whose tiles are coded along other axes than (t, z, y, x)."""
 PLAIN_FEATURE = "plain"
 """Feature of a file of the profile compact whose tables are plain numbers."""
-KNOWN_FEATURES = frozenset(
-    {
-        TRANSFORM_FEATURE,
-        PLAIN_FEATURE,
-        "apart",
-        AXES_FEATURE,
-        "clip",
-        "coded-occupancy",
-        "cross",
-        "labels",
-        "many-labels",
-        "mask",
-        "named",
-        "origin",
-        "predictor",
-        SPARSE_FEATURE,
-        "trellis",
-        ULPS_FEATURE,
-        "variables",
-    }
-)
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
 COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
+TABLE = "tables/level_1"
+"""Name of the array of the finest table."""
+MASK_ARRAY = "occupancy/mask"
+"""Name of the array of an occupancy that is coded, in place of bits."""
+STEPS = "steps/figures"
+"""Name of the array of the figures of single steps, where they are not in the header."""
+STEP_FIGURES = ("rmse", "max_abs_error")
+"""Lists of `quality.steps`, and rows of this array."""
+STEP_BYTES = 3
+"""Bytes of a number in this array, the lowest first, each in a plane of its own."""
+LOWEST = "lowest"
+"""Attribute of this array: the first number of each list."""
 POSITIONS = ("time", "z", "y", "x")
 """Names of the coordinates in a container, in the order of the axes."""
 QUALITY = (
@@ -68,7 +56,7 @@ MISSING = ("outside",)
 NOT_STORED = "not_stored"
 """Key of `variable`: what nobody wrote of the values."""
 HISTORY = ("seconds", "epoch", "psnr")
-"""Figures of an entry of `history`, each a number or null."""
+"""Lists of `history`, one figure each at some epochs."""
 CODED = "transform"
 """Value of `model.tables` for tables that are coded component by component."""
 TABLE_TYPES = ("float32", "float16", "uint8", CODED)
@@ -83,6 +71,8 @@ MAX_HEAD_LAYERS = 3
 """Hidden layers of a head."""
 MAX_HEAD_WIDTH = 64
 """Outputs of a hidden layer of a head."""
+MAX_LEVEL = 2**31 - 1
+"""Hundredths of a dB that a figure of a step may lie below or above the range."""
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
 """Numbers of an embedding."""
@@ -95,7 +85,7 @@ MAX_PARAMETERS = 1 << 62
 def validate_header(header: Mapping[str, Any]) -> None:
     """Check a header alone.
 
-    Raises UnsupportedFileError for a newer format, and DamagedFileError that names the first key
+    Raises UnsupportedFileError for another format, and DamagedFileError that names the first key
     that is missing or has a wrong value.
     """
     top = Record(header, "header key ")
@@ -125,7 +115,10 @@ def validate_header(header: Mapping[str, Any]) -> None:
     for key in QUALITY:
         quality.number_or_null(key)
     _check_bulk(quality)
-    _check_history(top, profile)
+    if quality.has("steps"):
+        for key in STEP_FIGURES:
+            quality.record("steps").integers(key, shape[0] + 1, -MAX_LEVEL, MAX_LEVEL)
+    _check_history(top.record("history"))
 
 
 def _check_bulk(quality: Record) -> None:
@@ -139,18 +132,13 @@ def _check_bulk(quality: Record) -> None:
 
 
 def check_format(top: Record) -> None:
-    """Check the format of a header; raises UnsupportedFileError for a newer one."""
+    """Check the format of a header; raises UnsupportedFileError for one of another version."""
     if top.get("format") != FORMAT:
         raise DamagedFileError(
             f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed"
         )
     major, minor = top.integers("format_version", 2, 0, 10_000)
-    if major > FORMAT_VERSION[0]:
-        raise UnsupportedFileError(
-            f"written by a newer fhash format {major}.{minor}; "
-            f"this version reads {FORMAT_VERSION[0]}.x; upgrade"
-        )
-    top.need(major == FORMAT_VERSION[0], "format_version", f"[{FORMAT_VERSION[0]}, n]")
+    check_major(major, f"{major}.{minor}")
     unknown = [name for name in top.texts("required_features") if name not in KNOWN_FEATURES]
     if unknown:
         raise UnsupportedFileError(
@@ -233,18 +221,12 @@ def _check_training(training: Record) -> None:
     training.number_or_null("learning_rate")
 
 
-def _check_history(top: Record, profile: str) -> None:
-    """Check `history`: a list of entries, or in the profile compact also an object of lists."""
-    if profile == PAPER or isinstance(top.get("history"), list):
-        for entry in top.records("history"):
-            for key in HISTORY:
-                entry.number_or_null(key)
-        return
-    columns = top.record("history")
+def _check_history(history: Record) -> None:
+    """Check `history`: lists of numbers or null by name, as long as each other."""
     for key in HISTORY:
-        if columns.has(key):
-            epochs = columns.get("epoch")
-            columns.numbers(key, len(epochs) if isinstance(epochs, list) else 0)
+        if history.has(key):
+            epochs = history.get("epoch")
+            history.numbers_or_null(key, len(epochs) if isinstance(epochs, list) else 0)
 
 
 def _box(top: Record, shape: Sequence[int]) -> list[int]:
@@ -275,12 +257,6 @@ def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
                     length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions"
                 )
                 check_positions(coordinates.record(axis), length)
-                top.need(
-                    not coordinates.record(axis).has("ulps")
-                    or ULPS_FEATURE in top.texts("required_features"),
-                    "required_features",
-                    f"{ULPS_FEATURE} for positions that differ from their rule",
-                )
 
 
 def _largest_decoded(source: np.dtype[Any]) -> float:

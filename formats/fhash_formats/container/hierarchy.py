@@ -6,25 +6,20 @@ Every member must have a place in the hierarchy, and every array must have all o
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
 from fhash_formats.container import strict_json
-from fhash_formats.container.apart import HEAD_ARRAY, inline
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
-from fhash_formats.container.coding import without_crc32c
-from fhash_formats.container.header import validate_header
 from fhash_formats.container.layout import Member
-from fhash_formats.container.named import paths_of
 from fhash_formats.container.source import Source
 from fhash_formats.container.variables import (
     CONSOLIDATED,
     VariablePlaces,
     consolidated,
-    is_several,
     read_variables,
     variable_named,
 )
@@ -34,9 +29,6 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}
 """The zarr.json of a group without attributes."""
 
-MAX_HEAD_BYTES = 1 << 20
-"""Bytes of a packed head that a reader accepts; the largest has some 20 thousand."""
-
 _CHUNK = re.compile(r"(.+)/(c(?:/[0-9]+)+)")
 
 
@@ -45,20 +37,18 @@ class Hierarchy:
     """The content of a container's ZIP.
 
     Attributes:
-        header: attribute "fhash" of the root, checked by `validate_header`.
-        arrays: metadata by name of the array; by path in a file of several variables.
-        chunks: members by the same name, and index of the chunk.
-        paths: by the same name.
-        variables: of a file of several; none in others.
+        header: attribute "fhash" of the root.
+        arrays: metadata by path of the array, in the order of the file.
+        chunks: members by the same path, and index of the chunk.
+        variables: at least one.
         attributes: of the root beside the header.
     """
 
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
     chunks: dict[str, dict[tuple[int, ...], Member]]
-    paths: Mapping[str, str]
-    variables: tuple[VariablePlaces, ...] = ()
-    attributes: Mapping[str, Any] = field(default_factory=dict)
+    variables: tuple[VariablePlaces, ...]
+    attributes: Mapping[str, Any]
 
 
 def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
@@ -69,11 +59,10 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
     if source.gap:
-        limits = {DOCUMENT: strict_json.MAX_BYTES, f"{HEAD_ARRAY}/c/0": MAX_HEAD_BYTES}
         source.prefetch(
             (member.offset, member.header_size + member.size)
             for name, member in members.items()
-            if member.size <= limits.get(name, limits.get(name.rpartition("/")[2], -1))
+            if name.rpartition("/")[2] == DOCUMENT and member.size <= strict_json.MAX_BYTES
         )
     groups: dict[str, Mapping[str, Any]] = {}
     group_documents: dict[str, Mapping[str, Any]] = {}
@@ -97,34 +86,20 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     for node in [*documents, *groups]:
         if node and node.rpartition("/")[0] not in groups:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
-    # A newer format says so in its header, and may have arrays of which nothing is known here.
+    # Another format says so in its header, and may have arrays of which nothing is known here.
     header = groups[""]["fhash"]
-    attributes = {name: value for name, value in groups[""].items() if name != "fhash"}
-    if not is_several(header):
-        validate_header(header)
-        paths = paths_of(header, documents.keys())
-        arrays = _read_arrays(source, members, documents, paths)
-        chunks = _place_chunks(arrays, chunk_members)
-        return Hierarchy(
-            header=header,
-            arrays={name: arrays[path] for name, path in paths.items()},
-            chunks={name: chunks[path] for name, path in paths.items()},
-            paths=paths,
-            attributes=attributes,
-        )
     variables, others = read_variables(header, documents.keys())
     _check_consolidated(group_documents, documents)
-    arrays = _read_arrays(source, members, documents, {name: name for name in others})
+    arrays = _read_arrays(documents, others)
     for variable in variables:
-        with variable_named(variable.name):
-            arrays |= _read_arrays(source, members, documents, variable.places)
+        with variable_named(variable.name, len(variables)):
+            arrays |= _read_arrays(documents, variable.places.values())
     return Hierarchy(
         header=header,
-        arrays={name: arrays[name] for name in documents},
+        arrays={path: arrays[path] for path in documents},
         chunks=_place_chunks(arrays, chunk_members),
-        paths={name: name for name in documents},
         variables=tuple(variables),
-        attributes=attributes,
+        attributes={name: value for name, value in groups[""].items() if name != "fhash"},
     )
 
 
@@ -164,33 +139,13 @@ def _read_document(source: Source, member: Member) -> Mapping[str, Any]:
 
 
 def _read_arrays(
-    source: Source,
-    members: Mapping[str, Member],
-    documents: Mapping[str, Mapping[str, Any]],
-    places: Mapping[str, str],
+    documents: Mapping[str, Mapping[str, Any]], paths: Iterable[str]
 ) -> dict[str, ArrayMetadata]:
-    """The metadata of arrays by path. Raises errors that name the member.
-
-    places: path by the name that the format has for the array.
-    """
-
-    def only_chunk(name: str) -> bytes:
-        chunk = f"{places[name]}/c/0"
-        if chunk not in members:
-            raise DamagedFileError(f"member {chunk} is missing")
-        if members[chunk].size > MAX_HEAD_BYTES:
-            raise DamagedFileError(
-                f"member {chunk}: {members[chunk].size} bytes of a head; "
-                f"the limit is {MAX_HEAD_BYTES}"
-            )
-        with member_named(chunk):
-            return bytes(without_crc32c(read_member(source, members[chunk])))
-
-    own = {name: documents[place] for name, place in places.items()}
+    """The metadata of arrays by path. Raises errors that name the member."""
     arrays = {}
-    for name, document in inline(own, only_chunk).items():
-        with member_named(f"{places[name]}/{DOCUMENT}"):
-            arrays[places[name]] = ArrayMetadata.from_dict(document)
+    for path in paths:
+        with member_named(f"{path}/{DOCUMENT}"):
+            arrays[path] = ArrayMetadata.from_dict(documents[path])
     return arrays
 
 

@@ -18,10 +18,12 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-LAYOUT_VERSION = 2
-"""Version of the layout that is written; version 1 has no deflated members."""
+from fhash_formats.errors import UnsupportedFileError
+
+FORMAT_VERSION = (2, 0)
+"""(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 COMMENT = re.compile(rb"fhash ([0-9]{1,4}) sha256=[0-9a-f]{64}\Z")
-"""The comment at the end of a container: layout version and digest of the directory."""
+"""The comment at the end of a container: major version of the format, digest of the directory."""
 
 LOCAL = struct.Struct("<4s5H3I2H")
 ENTRY = struct.Struct("<4s4B4H3I5H2I")
@@ -56,6 +58,19 @@ MAX_16 = 0xFFFF
 """Value of a 16-bit field whose true value stands in a 64-bit record."""
 MAX_32 = 0xFFFFFFFF
 """Value of a 32-bit field whose true value stands in a 64-bit record."""
+
+
+def check_major(major: int, version: str) -> None:
+    """Raise UnsupportedFileError for a file of another major version of the format.
+
+    version: as it is shown, such as "1.8".
+    """
+    known = FORMAT_VERSION[0]
+    if major != known:
+        advice = "upgrade" if major > known else "encode the source again"
+        raise UnsupportedFileError(
+            f"the file is of format {version}; this fhash reads format {known}.x: {advice}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -196,12 +211,13 @@ def end_records(count: int, size: int, offset: int) -> bytes:
     return end_64 + LOCATOR_64.pack(LOCATOR_64_MARK, 0, offset + size, 1) + end
 
 
-def comment(directory: bytes, version: int = LAYOUT_VERSION) -> bytes:
-    """The signature of a container: its layout version and a SHA-256.
+def comment(directory: bytes) -> bytes:
+    """The signature of a container: the major version of the format and a SHA-256.
 
     `directory` is what is digested: every byte from the first directory entry to the comment.
     """
-    return b"fhash %d sha256=%s" % (version, hashlib.sha256(directory).hexdigest().encode("ascii"))
+    digest = hashlib.sha256(directory).hexdigest().encode("ascii")
+    return b"fhash %d sha256=%s" % (FORMAT_VERSION[0], digest)
 
 
 def ending(members: Sequence[Member]) -> bytes:

@@ -13,19 +13,16 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_formats.container.apart import MASK_ARRAY, TABLE
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.container.coding import MASK
 from fhash_formats.container.coordinates import described_coordinate
 from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
 from fhash_formats.container.header import POSITIONS
-from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
+from fhash_formats.container.hierarchy import read_hierarchy
 from fhash_formats.container.layout import Member, directory_entry
 from fhash_formats.container.location import Location, Place, StorageOptions, located
-from fhash_formats.container.mask_array import MaskArray
 from fhash_formats.container.source import CountedSource, FileSource, Source, damage_named
 from fhash_formats.container.stored import StoredArray
-from fhash_formats.container.variables import VariablePlaces, variable_named
+from fhash_formats.container.variables import DIMENSIONS, VariablePlaces, variable_named
 from fhash_formats.container.zip_checked import (
     DOCUMENT,
     check_member,
@@ -66,10 +63,12 @@ class Container:
         size: bytes of the file.
         digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
             everything, so that files of different content have different digests.
-        header: attribute "fhash" of the root (FORMAT.md).
+        header: of the only variable (FORMAT.md), with the root's keys; of several, attribute
+            "fhash" of the root.
         attributes: of the root beside the header: those of a whole dataset.
         header_bytes: bytes of the document that holds the header, as it lies in the file.
-        arrays: StoredArray by name, in the order of the file.
+        arrays: StoredArray by name, in the order of the file; "/" and the path for those that the
+            format does not know. Of several variables, by path.
         variables: of a file of several, by name in the order of its list; each is a container as
             if it were alone in the file. None in a file of one variable.
         variable: name of the variable where the container is one of those; else None.
@@ -104,16 +103,29 @@ class Container:
                     member.name.endswith("zarr.json") for member in members.values()
                 )
                 tree = read_hierarchy(source, members)
-                if not tree.variables:
-                    check_arrays(tree.header, tree.arrays)
-            self.header, self.header_bytes = tree.header, members[DOCUMENT].size
+                for variable in tree.variables:
+                    with variable_named(variable.name, len(tree.variables)):
+                        own = {name: tree.arrays[path] for name, path in variable.places.items()}
+                        check_arrays(variable.header, own)
+            self.header_bytes = members[DOCUMENT].size
             self.attributes = MappingProxyType(dict(tree.attributes))
-            self.arrays = MappingProxyType(self._stored_arrays(tree))
-            if tree.variables:
-                self.variables = MappingProxyType(self._variables(tree, members))
-            else:
-                _attach_masks(self.arrays)
+            stored = {
+                name: StoredArray(path, name, metadata, tree.chunks[name], source, self._cache)
+                for name, metadata in tree.arrays.items()
+            }
+            if len(tree.variables) == 1:
+                only = tree.variables[0]
+                names = {place: name for name, place in only.places.items()}
+                self.header, self._name = only.header, only.name
+                self.arrays = MappingProxyType(
+                    {names.get(place, f"/{place}"): array for place, array in stored.items()}
+                )
                 _check_key_frames(self)
+            else:
+                self.header, self.arrays = tree.header, MappingProxyType(stored)
+                self.variables = MappingProxyType(
+                    {each.name: VariableContainer(self, each, members) for each in tree.variables}
+                )
         except BaseException:
             source.close()
             raise
@@ -166,28 +178,6 @@ class Container:
             digest=self.digest,
         )
 
-    def _stored_arrays(self, tree: Hierarchy) -> dict[str, StoredArray]:
-        """The arrays by name; each knows its path."""
-        arrays = {}
-        for name, metadata in tree.arrays.items():
-            kind = MaskArray if metadata.coding == MASK else StoredArray
-            arrays[name] = kind(
-                self.path, tree.paths[name], metadata, tree.chunks[name], self._source, self._cache
-            )
-        return arrays
-
-    def _variables(
-        self, tree: Hierarchy, members: Mapping[str, Member]
-    ) -> dict[str, VariableContainer]:
-        """The variables of a file of several, checked as files of their own are."""
-        found = {}
-        for variable in tree.variables:
-            own = {name: tree.arrays[place] for name, place in variable.places.items()}
-            with damage_named(self.path, self._source), variable_named(variable.name):
-                check_arrays(variable.header, own)
-            found[variable.name] = VariableContainer(self, variable, members)
-        return found
-
     @property
     def bytes_read(self) -> int:
         """Bytes of the file that were read so far, opening included."""
@@ -201,16 +191,14 @@ class Container:
         axis = POSITIONS.index(stored)
         if f"coords/{stored}" not in self.arrays:
             return described_coordinate(
-                self.header["coordinates"][stored], stored, self.header["domain"]["shape"][axis]
+                self.header["coordinates"][stored],
+                self.header[DIMENSIONS][axis],
+                self.header["domain"]["shape"][axis],
             )
         array = self.arrays[f"coords/{stored}"]
         attributes = dict(array.attributes)
-        name = attributes.pop("name", self._usual_name(array, stored))
+        name = attributes.pop("name", array.name)
         return Coordinate(name=name, values=array.read(), attributes=attributes)
-
-    def _usual_name(self, array: StoredArray, stored: str) -> str:
-        """The name of a coordinate whose array has no attribute that says it."""
-        return stored
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Read and decode every chunk; the number of arrays. Metadata were read at opening.
@@ -254,13 +242,18 @@ class Container:
         """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the variables, in the order of the file."""
+        return list(self.variables) or [self._name]
+
     def select(self, variable: str | None) -> Container:
         """The container of one variable, whose `close` closes the file.
 
         variable: its name; None for the only one of the file. Raises InputError where the file
         does not hold it, or holds several and none is named.
         """
-        names = list(self.variables) or [self.header["variable"]["name"]]
+        names = self.names
         listed = ", ".join(names)[:400]
         if variable is None and len(names) > 1:
             raise InputError(
@@ -323,8 +316,7 @@ class VariableContainer(Container):
             for member in chain(chunks, (members[name] for name in documents))
         )
         self._documents = len(documents)
-        _attach_masks(self.arrays)
-        with variable_named(variable.name):
+        with variable_named(variable.name, 2):
             _check_key_frames(self)
 
     def closing_file(self) -> VariableContainer:
@@ -336,9 +328,6 @@ class VariableContainer(Container):
         """The location of the file that holds the variable, with the digest of the whole."""
         return self._file.reopening()
 
-    def _usual_name(self, array: StoredArray, stored: str) -> str:
-        return array.name
-
     def overhead(self) -> int:
         """Bytes of the variable's arrays that are no data of chunks."""
         return self.size - sum(self.arrays[name].nbytes_stored for name in self._own)
@@ -347,13 +336,6 @@ class VariableContainer(Container):
         """Release the file after `closing_file`, else nothing: other variables need it."""
         if self._closes_file:
             self._file.close()
-
-
-def _attach_masks(arrays: Mapping[str, StoredArray]) -> None:
-    """Let a table know the array of its masks."""
-    masks = arrays.get(MASK_ARRAY)
-    if isinstance(masks, MaskArray):
-        masks.attach(arrays[TABLE])
 
 
 def _check_key_frames(container: Container) -> None:

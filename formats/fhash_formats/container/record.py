@@ -109,6 +109,16 @@ class Record:
         """The value of `key`, a finite number, or None where the key is null or missing."""
         return None if self._values.get(key) is None else self.number(key)
 
+    def numbers_or_null(self, key: str, count: int) -> None:
+        """Refuse the value of `key` unless it is a list of `count` finite numbers or null."""
+        values = self.get(key)
+        fits = (
+            isinstance(values, list)
+            and len(values) == count
+            and all(value is None or _is_finite(value) for value in values)
+        )
+        self.need(fits, key, f"{count} finite numbers or null")
+
     def numbers(self, key: str, count: int) -> list[float]:
         """The value of `key`, a list of `count` finite numbers; integers beyond 2^53 stay such."""
         values = self.get(key)

@@ -41,8 +41,6 @@ __all__ = [
 
 SOURCE = "source"
 """Key of the header."""
-SINCE = (1, 7)
-"""(major, minor) of the first format that knows the key; an older file may hold anything there."""
 AUXILIARY = "auxiliary/"
 """Prefix of the arrays."""
 MAX_VARIABLES = 1024
@@ -109,7 +107,7 @@ def check_source(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> N
 
 def has_source(header: Mapping[str, Any]) -> bool:
     """Whether a header describes its source."""
-    return SOURCE in header and tuple(header["format_version"]) >= SINCE
+    return SOURCE in header
 
 
 def read_metadata(

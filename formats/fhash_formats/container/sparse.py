@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import prod
 
-from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError
@@ -72,11 +71,3 @@ def sparse_shape(
     attributes = Record(arrays[name].attributes, f"array {name} attribute ")
     counts = attributes.integers(COUNTS, level[0], 0, prod(level[1:]))
     return sum(counts), embedding_size
-
-
-def check_occupancy(arrays: Mapping[str, ArrayMetadata]) -> None:
-    """Refuse an occupancy that is not stored as bits: the needed vertices follow from the bits."""
-    if MASK_ARRAY in arrays:
-        raise DamagedFileError(
-            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs occupancy/bits"
-        )

@@ -50,7 +50,6 @@ class StoredArray:
         chunks: members of the file, in its order, by index of the chunk or, where there are
             shards, of the shard.
         nbytes_stored: bytes of the members' data in the file.
-        masks: the array that holds the masks of the chunks; None where chunks hold their own.
     """
 
     def __init__(
@@ -75,7 +74,6 @@ class StoredArray:
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
-        self.masks: StoredArray | None = None
         sharding = metadata.sharding
         self._shards = (
             None if sharding is None else ShardPlaces(sharding, self.shape, chunks, source)
@@ -257,27 +255,24 @@ class StoredArray:
                 self._announce(product(*spans), (self.name, self.name + TABLE), lod)
 
     def _read_places(self, spans: Sequence[range]) -> None:
-        """Read where chunks lie in their shards; of masks only if that saves requests."""
+        """Read where chunks lie in their shards."""
         if self._shards is not None:
             self._shards.read(spans)
-        if self._source.gap and self.masks is not None:
-            self.masks._read_places(spans)
 
     def _announce(
         self, indices: Iterable[ChunkIndex], names: Sequence[str] = (), lod: int = 0
     ) -> None:
-        """Let a source elsewhere fetch chunks, with their masks, that are not in the cache.
+        """Let a source elsewhere fetch chunks that are not in the cache.
 
         names: of the cache, under which they may be there.
         """
         if self._source.gap:
             names = names or (self.name, self.name + UNCORRECTED)
-            parts = [self] if self.masks is None or lod else [self, self.masks]
-            places = []
-            for index in indices:
-                if all(self._cache.get((name, index, lod)) is None for name in names):
-                    places += [array._place(index) for array in parts]
-            self._source.prefetch(places)
+            self._source.prefetch(
+                self._place(index)
+                for index in indices
+                if all(self._cache.get((name, index, lod)) is None for name in names)
+            )
 
     def _place(self, index: ChunkIndex) -> tuple[int, int]:
         """Offset in the file and bytes of what `_stored_chunk` reads of an inner chunk."""
@@ -342,16 +337,13 @@ class StoredArray:
 
         table: the chunk before its corrections, without its mask.
         """
-        # A level of detail has no mask.
-        masks = self.masks
-        mask = None if masks is None else memoryview(b"") if lod else masks.coded(index)
         with self._stored_chunk(index) as data:
             coder = self._metadata.coder
             if table:
-                return coder.decode_table(data, lod, mask), None
+                return coder.decode_table(data, lod), None
             if self.masked and not lod:
-                return coder.decode_masked(data, mask)
-            return coder.decode(data, lod, mask), None
+                return coder.decode_masked(data)
+            return coder.decode(data, lod), None
 
     def coded(self, index: ChunkIndex) -> memoryview:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.apart import TABLE
 from fhash_formats.container.coding import transform_codecs
+from fhash_formats.container.header import TABLE
 from fhash_formats.container.sharding import shard_shape
 from fhash_formats.container.writer import ContainerWriter
 from fhash_formats.transform.tile.settings import TileSettings
@@ -40,11 +40,6 @@ class TableParts:
     settings: TileSettings
     streams: Sequence[bytes]
     sizes: npt.NDArray[np.int64] | None = None
-
-    @property
-    def features(self) -> list[str]:
-        """Features of the format that a reader of the table must know."""
-        return ["transform", *self.settings.features]
 
     def write(self, writer: ContainerWriter) -> None:
         """Write the table, an array of a chunk for each tile.

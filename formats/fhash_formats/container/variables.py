@@ -1,8 +1,7 @@
-"""Several variables in one container: names of their arrays, and checks of the root's header.
+"""Variables of a container: names of their arrays, and checks of the root's header.
 
-FORMAT.md describes such files in its section "Several variables". Each variable has a header and
-arrays as a file of its own would have them. Here the names of arrays in such a file
-("tables/level_1") become their places in the hierarchy ("u"), and back.
+FORMAT.md describes them in its section "Variables". Code names arrays as that document does in its
+section "Arrays" ("tables/level_1"). Here such names become paths in the hierarchy ("u"), and back.
 """
 
 from __future__ import annotations
@@ -13,52 +12,66 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from fhash_formats.container.apart import TABLE
-from fhash_formats.container.header import POSITIONS, check_format, validate_header
+from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.defaults import complete
+from fhash_formats.container.header import POSITIONS, TABLE, check_format, validate_header
 from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError
 
 __all__ = [
+    "ARRAY",
     "AUXILIARY",
     "CONSOLIDATED",
-    "FEATURE",
+    "COORDINATES",
+    "DIMENSIONS",
     "NODE",
     "PARTS",
     "SHARES",
+    "SHOWN_ATTRIBUTES",
+    "VARIABLES",
     "VariablePlaces",
     "consolidated",
     "free_node",
-    "is_several",
     "part_place",
     "read_variables",
+    "shows_values",
     "variable_named",
 ]
 
-FEATURE = "variables"
-"""Feature of files of several variables, and key of their headers at the root."""
+VARIABLES = "variables"
+"""Key of the root's header: the headers of the variables."""
+ARRAY = "array"
+"""Key of a variable's header: name of its table at the root, if it lies there."""
+DIMENSIONS = "dimensions"
+"""Key of a variable's header: names of its axes, and of the arrays with its positions."""
+SHARES = "shares"
+"""Key of a variable's header: arrays beside the data that lie with another variable."""
 PARTS = "parts"
-"""Group of all arrays of variables but those that show their values."""
+"""Group of all arrays but tables that show values, and coordinates."""
+AUXILIARY = "auxiliary/"
+"""Beginning of the names of arrays beside the data."""
+COORDINATES = "coords/"
+"""Beginning of the names of coordinates."""
 CONSOLIDATED = "consolidated_metadata"
 """Key of the root's document with the documents of all others, for libraries that ask for it."""
 NODE = re.compile(r"[A-Za-z0-9_-]{1,100}")
-"""Name of an array at the root; without dots, so that those in `parts` mean one variable."""
+"""Name of an array at the root."""
+SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
+"""Attributes of a variable that its array has for libraries that show it."""
 
-AUXILIARY = "auxiliary/"
-"""Beginning of the names of arrays beside the data."""
-SHARES = "shares"
-"""Key of a variable's header: arrays beside the data that lie with another variable."""
-
-_COORDINATES = "coords/"
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
+_OF_ROOT = ("format", "format_version", "required_features")
 
 
 @dataclass(frozen=True, kw_only=True)
 class VariablePlaces:
-    """A variable of a file of several.
+    """A variable of a file.
 
     Attributes:
-        name: as in the file's list.
-        header: as a file of this variable alone would have it, checked by `validate_header`.
-        places: path in the hierarchy by name of the array in a file of this variable alone.
+        name: in the file.
+        header: of the variable, with the keys of the root but `variables`, checked.
+        places: path in the hierarchy by name of the array.
         own: names of the arrays that no other variable has.
     """
 
@@ -68,20 +81,14 @@ class VariablePlaces:
     own: Sequence[str]
 
 
-def is_several(header: Mapping[str, Any]) -> bool:
-    """Whether the header of a root is that of several variables; it need not be checked yet."""
-    features = header.get("required_features")
-    return isinstance(features, list) and FEATURE in features
-
-
-def part_place(node: str, name: str) -> str:
-    """The path of a variable's array in the group of parts: "parts/u.mlp.parameters".
+def part_place(number: int, name: str) -> str:
+    """The path of a variable's array in the group of parts: "parts/0.mlp.weight_1".
 
     Args:
-        node: the variable's own name in the hierarchy.
-        name: the array's name in a file of this variable alone.
+        number: of the variable, from 0 in the order of the file.
+        name: the array's name.
     """
-    return f"{PARTS}/{node}.{name.replace('.', '..').replace('/', '.')}"
+    return f"{PARTS}/{number}.{name.replace('.', '..').replace('/', '.')}"
 
 
 def free_node(wish: str, taken: Collection[str]) -> str:
@@ -100,6 +107,18 @@ def free_node(wish: str, taken: Collection[str]) -> str:
     return name
 
 
+def shows_values(table: ArrayMetadata) -> bool:
+    """Whether a library that has the codec of a table finds the values of its variable there.
+
+    In integers, vertices without a value have a number that looks like one.
+    """
+    if table.coding != TRANSFORM:
+        return False
+    # Tiles with settings of their own may have masks of which the codec says nothing.
+    settings = table.coder.settings
+    return table.dtype.kind == "f" or (settings is not None and settings.mask is None)
+
+
 def read_variables(
     root: Mapping[str, Any], arrays: Collection[str]
 ) -> tuple[list[VariablePlaces], list[str]]:
@@ -113,36 +132,36 @@ def read_variables(
     that contradict it.
     """
     headers = _headers(root)
-    nodes = {header["array"]: name for name, header in headers.items()}
+    names = list(headers)
+    nodes = {header[ARRAY]: name for name, header in headers.items() if ARRAY in header}
     places: dict[str, dict[str, str]] = {name: {} for name in headers}
     others = []
     for array in arrays:
         if array in nodes:
             _place(places[nodes[array]], TABLE, array)
         elif array.startswith(f"{PARTS}/"):
-            node, _, part = array.removeprefix(f"{PARTS}/").partition(".")
+            number, _, part = array.removeprefix(f"{PARTS}/").partition(".")
             name = re.sub(r"\.\.|\.", lambda dots: "." if len(dots[0]) == 2 else "/", part)
-            if node not in nodes or part_place(node, name) != array or not name:
+            owner = int(number) if _NUMBER.fullmatch(number) else len(names)
+            if owner >= len(names) or part_place(owner, name) != array or not name:
                 raise DamagedFileError(f"array {array} belongs to no variable")
-            if name.startswith(_COORDINATES):
+            if name.startswith(COORDINATES):
                 raise DamagedFileError(f"array {array} is a coordinate, which lies at the root")
-            _place(places[nodes[node]], name, array)
+            _place(places[names[owner]], name, array)
         else:
             others.append(array)
     shared = set()
     free = frozenset(others)
     own = {name: tuple(found) for name, found in places.items()}
     for name, header in headers.items():
-        for part, node in header.get(SHARES, {}).items():
-            owner = nodes[node]
-            if part not in own[owner]:
-                raise DamagedFileError(f"array {part_place(node, part)} is missing")
-            _place(places[name], part, places[owner][part])
-        for axis, dimension in zip(POSITIONS, header["dimensions"], strict=True):
-            if dimension not in free:
-                raise DamagedFileError(f"array {dimension} is missing")
-            places[name][f"{_COORDINATES}{axis}"] = dimension
-            shared.add(dimension)
+        for part, number in header.get(SHARES, {}).items():
+            if part not in own[names[number]]:
+                raise DamagedFileError(f"array {part_place(number, part)} is missing")
+            _place(places[name], part, places[names[number]][part])
+        for axis, dimension in zip(POSITIONS, header[DIMENSIONS], strict=True):
+            if dimension in free:
+                places[name][f"{COORDINATES}{axis}"] = dimension
+                shared.add(dimension)
     found = [
         VariablePlaces(name=name, header=header, places=places[name], own=own[name])
         for name, header in headers.items()
@@ -156,11 +175,16 @@ def consolidated(documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 @contextmanager
-def variable_named(name: str) -> Iterator[None]:
-    """A block whose errors about a file begin with the name of a variable."""
+def variable_named(name: str, count: int) -> Iterator[None]:
+    """A block whose errors about a file begin with the name of a variable, if it is one of several.
+
+    count: number of the file's variables.
+    """
     try:
         yield
     except DamagedFileError as error:
+        if count == 1:
+            raise
         raise type(error)(f"variable {name[:80]!a}: {error}") from error
 
 
@@ -168,48 +192,51 @@ def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The headers of all variables by name, complete and checked."""
     top = Record(root, "header key ")
     check_format(top)
-    features = frozenset(top.texts("required_features"))
+    of_root = {key: root[key] for key in _OF_ROOT}
     headers: dict[str, dict[str, Any]] = {}
     nodes: set[str] = set()
-    for entry, record in zip(top.get(FEATURE), top.records(FEATURE), strict=True):
-        name = record.text("name")
-        record.need(bool(name) and name not in headers, "name", "a text that no other has")
-        with variable_named(name):
-            node = record.text("array")
-            fits = NODE.fullmatch(node) is not None and node != PARTS and node not in nodes
-            record.need(fits, "array", "a name of A-Z a-z 0-9 _ - that no other has")
-            dimensions = record.texts("dimensions")
-            fits = len(set(dimensions)) == len(dimensions) == len(POSITIONS)
-            fits = fits and all(NODE.fullmatch(dimension) for dimension in dimensions)
-            record.need(fits, "dimensions", "four different names of A-Z a-z 0-9 _ -")
-            for feature in record.texts("required_features"):
-                known = f"{feature[:40]!a} at the root as well"
-                record.need(feature in features, "required_features", known)
-            complete = {"format": root["format"], "format_version": root["format_version"]}
-            validate_header(header := {**entry, **complete})
-        nodes.add(node)
+    entries, records = top.get(VARIABLES), top.records(VARIABLES)
+    top.need(bool(entries), VARIABLES, "at least one variable")
+    for entry, record in zip(entries, records, strict=True):
+        own = record.record("variable").text("name")
+        name = record.text("name") if record.has("name") else own
+        key = "name" if record.has("name") else "variable"
+        record.need(name not in headers, key, "a name that no other has")
+        with variable_named(name, len(entries)):
+            header = complete(entry) | of_root
+            validate_header(header)
+            _check_names(Record(header, "header key "), nodes)
+            nodes.update({header[ARRAY]} if ARRAY in header else ())
         headers[name] = header
-    top.need(bool(headers), FEATURE, "at least one variable")
     for name, header in headers.items():
-        with variable_named(name):
-            _check_shares(header, nodes)
-    for name, header in headers.items():
-        if not nodes.isdisjoint(header["dimensions"]):
-            raise DamagedFileError(
-                f"variable {name[:80]!a}: header key dimensions has the array of a variable"
-            )
+        with variable_named(name, len(entries)):
+            checked = Record(header, "header key ")
+            unlike = "four names that no variable has"
+            checked.need(nodes.isdisjoint(header[DIMENSIONS]), DIMENSIONS, unlike)
+            _check_shares(checked, len(headers))
     return headers
 
 
-def _check_shares(header: Mapping[str, Any], nodes: Collection[str]) -> None:
-    """Check which arrays of a variable lie with another one."""
-    record = Record(header, "header key ")
-    if not record.has(SHARES):
+def _check_names(header: Record, nodes: Collection[str]) -> None:
+    """Check the names of a variable's table and axes. nodes: those of the variables before."""
+    if header.has(ARRAY):
+        node = header.text(ARRAY)
+        fits = NODE.fullmatch(node) is not None and node != PARTS and node not in nodes
+        header.need(fits, ARRAY, "a name of A-Z a-z 0-9 _ - that no other has")
+    dimensions = header.texts(DIMENSIONS)
+    fits = len(set(dimensions)) == len(dimensions) == len(POSITIONS) and PARTS not in dimensions
+    fits = fits and all(NODE.fullmatch(dimension) for dimension in dimensions)
+    header.need(fits, DIMENSIONS, "four different names of A-Z a-z 0-9 _ -")
+
+
+def _check_shares(header: Record, count: int) -> None:
+    """Check which arrays of a variable lie with another one. count: number of the variables."""
+    if not header.has(SHARES):
         return
-    record.record(SHARES)
-    for part, node in header[SHARES].items():
-        fits = part.startswith(AUXILIARY) and isinstance(node, str) and node in nodes
-        record.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the array of a variable")
+    header.record(SHARES)
+    for part, number in header.get(SHARES).items():
+        fits = part.startswith(AUXILIARY) and type(number) is int and 0 <= number < count
+        header.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the number of a variable")
 
 
 def _place(places: dict[str, str], name: str, array: str) -> None:

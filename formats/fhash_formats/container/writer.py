@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from types import TracebackType
@@ -15,19 +17,36 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import strict_json
-from fhash_formats.container.apart import TABLE
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.chunks import Coded, coded_chunk, cut, expect_end, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
-from fhash_formats.container.header import FORMAT, FORMAT_VERSION
+from fhash_formats.container.defaults import brief
+from fhash_formats.container.header import FORMAT, POSITIONS, TABLE
 from fhash_formats.container.hierarchy import GROUP
-from fhash_formats.container.layout import Member, document_member, ending, local_header
-from fhash_formats.container.named import FEATURE as NAMED
-from fhash_formats.container.named import Names, shows_values
+from fhash_formats.container.layout import (
+    FORMAT_VERSION,
+    Member,
+    document_member,
+    ending,
+    local_header,
+)
 from fhash_formats.container.reader import Container
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
-from fhash_formats.container.variables import CONSOLIDATED, consolidated, is_several
+from fhash_formats.container.variables import (
+    ARRAY,
+    AUXILIARY,
+    CONSOLIDATED,
+    COORDINATES,
+    DIMENSIONS,
+    SHARES,
+    SHOWN_ATTRIBUTES,
+    VARIABLES,
+    consolidated,
+    free_node,
+    part_place,
+    shows_values,
+)
 from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.atomic import replacing
@@ -40,6 +59,35 @@ USUAL_CHUNK_BYTES = 2 << 20
 
 class _Abandoned(Exception):
     """A block left without `commit`: no error, but it tells `replacing` to keep nothing."""
+
+
+@dataclass(kw_only=True)
+class _Variable:
+    """The variable that is being written.
+
+    Attributes:
+        name: among several; None for the only one.
+        number: in the file, from 0.
+        node: name of its table at the root.
+        attributes: that its table shows.
+        begun: bytes of the file with the variables before.
+        shown: whether the table lies at the root.
+        dimensions: names at the root by axis.
+        lengths: positions of the axes that are known.
+        boxes: names by axis of those axes of the table that have not every position.
+        shares: numbers of other variables by name of the array that is theirs.
+    """
+
+    name: str | None
+    number: int
+    node: str
+    attributes: Mapping[str, Any]
+    begun: int = 0
+    shown: bool = True
+    dimensions: dict[str, str] = field(default_factory=dict)
+    lengths: dict[str, int] = field(default_factory=dict)
+    boxes: dict[str, str] = field(default_factory=dict)
+    shares: dict[str, int] = field(default_factory=dict)
 
 
 class Mark(NamedTuple):
@@ -62,18 +110,31 @@ class ContainerWriter:
     the root. Identical calls give identical bytes. Entering raises OutputExistsError or
     OutputError.
 
+    Arrays have the names of FORMAT.md; the writer finds their paths. Several variables are written
+    one after the other, from `begin` to `finish`. Coordinates and arrays beside the data that
+    several of them have are there once.
+
     Attributes:
         path: name that the file takes.
         attributes: of the root beside the header, JSON values; they may be set until `commit`.
-        one_of_several: whether the arrays are those of one variable among several in the file.
-        names: of the table and the coordinates in the source, where they are to be paths in the
-            hierarchy; they may be set until the first of these arrays is written.
+        one_of_several: whether the file takes several variables.
     """
 
-    one_of_several = False
+    def __init__(
+        self, path: str | Path, *, force: bool = False, variables: Sequence[str] = ()
+    ) -> None:
+        """Prepare a writer.
 
-    def __init__(self, path: str | Path, *, force: bool = False) -> None:
-        """Prepare a writer; `force` allows it to replace an existing file."""
+        Args:
+            path: name that the file takes.
+            force: allow it to replace an existing file.
+            variables: names of several variables, which are taken first, so that no coordinate
+                takes the place of a variable's values; none for a file of one variable.
+
+        Raises InputError for an empty name, and one that is there twice.
+        """
+        if not all(variables) or len(set(variables)) < len(variables):
+            raise InputError(f"variables {', '.join(variables)[:80]!a}: different names are needed")
         self.path = Path(path)
         self._force = force
         self._stack = ExitStack()
@@ -81,7 +142,56 @@ class ContainerWriter:
         self._arrays: dict[str, dict[str, Any]] = {}
         self._position = 0
         self.attributes: Mapping[str, Any] = {}
-        self.names: Names | None = None
+        self.one_of_several = bool(variables)
+        self._variable: _Variable | None = None
+        self._headers: list[dict[str, Any]] = []
+        self._nodes: dict[str, str] = {}
+        for name in variables:
+            self._nodes[name] = free_node(name, self._nodes.values())
+        self._names_taken = set(self._nodes.values())
+        self._coordinates: dict[str, tuple[Any, ...]] = {}
+        self._auxiliary: dict[tuple[Any, ...], int] = {}
+
+    def begin(self, name: str, attributes: Mapping[str, Any]) -> None:
+        """Begin a variable, whose table has a name as near as possible to this one.
+
+        Args:
+            name: of the variable; among several, one of their names.
+            attributes: of the variable; its table gets those of SHOWN_ATTRIBUTES.
+        """
+        shown = {key: attributes[key] for key in SHOWN_ATTRIBUTES if attributes.get(key)}
+        if self.one_of_several:
+            begun = self._position + len(self._tail()) if self._headers else 0
+            self._variable = _Variable(
+                name=name,
+                number=len(self._headers),
+                node=self._nodes[name],
+                attributes=shown,
+                begun=begun,
+            )
+            return
+        self._variable = _Variable(name=None, number=0, node=free_node(name, ()), attributes=shown)
+        self._names_taken = {self._variable.node}
+
+    @property
+    def begun(self) -> bool:
+        """Whether a variable has begun that is not finished."""
+        return self._variable is not None
+
+    def name_axes(self, coordinates: Sequence[str], shape: Sequence[int]) -> list[str]:
+        """Give the axes of the variable names before their coordinates are written, if at all.
+
+        Returns the names, in the order of POSITIONS.
+
+        Args:
+            coordinates: names of the coordinates, in the order of POSITIONS.
+            shape: number of their positions.
+        """
+        variable = self._current()
+        for axis, name, length in zip(POSITIONS, coordinates, shape, strict=True):
+            variable.dimensions[axis] = self._free(name)
+            variable.lengths[axis] = length
+        return [variable.dimensions[axis] for axis in POSITIONS]
 
     def __enter__(self) -> ContainerWriter:
         with ExitStack() as stack:
@@ -115,7 +225,7 @@ class ContainerWriter:
         """Write an array chunk by chunk; never more than one chunk is held.
 
         Args:
-            name: path in the hierarchy, unless `names` has another one for it.
+            name: of the array (FORMAT.md, Arrays).
             shape: length of each axis.
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
@@ -161,7 +271,7 @@ class ContainerWriter:
         """Write an array of shards; the coded bytes of one shard are held at a time.
 
         Args:
-            name: path in the hierarchy.
+            name: of the array.
             shape: length of each axis.
             dtype: number type of the array.
             chunk_shape: shape of a full chunk within a shard.
@@ -205,7 +315,23 @@ class ContainerWriter:
 
         By default an array of up to USUAL_CHUNK_BYTES is one chunk, and a larger one is cut into
         slabs along its leading axes. Arguments and errors are those of `add_array`.
+
+        A coordinate, or an array beside the data, is written only where no other variable has it.
         """
+        if name.startswith(COORDINATES):
+            attributes = dict(attributes or {})
+            wish = str(attributes.pop("name", name.removeprefix(COORDINATES)))
+            if self._has_coordinate(name.removeprefix(COORDINATES), wish, array, attributes):
+                return
+            if self._path(name) != wish:
+                attributes["name"] = wish
+        elif name.startswith(AUXILIARY):
+            variable = self._current()
+            content = (name, array.dtype.str, array.shape, sha256(array.tobytes()).digest())
+            owner = self._auxiliary.setdefault(content, variable.number)
+            if owner != variable.number:
+                variable.shares[name] = owner
+                return
         if chunk_shape is None:
             chunk_shape = slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES)
         self.add_array(
@@ -230,22 +356,18 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None,
     ) -> ArrayMetadata:
         """Write the metadata of an array."""
-        if name == TABLE and self.names is not None:
-            if not shows_values(dtype, codecs):
-                self.names = self.names.hidden()
-            dimension_names, attributes = self.names.axes(shape), self.names.attributes
-        elif name.startswith("coords/") and self.names is not None:
-            dimension_names = [self.names.path(name)]
-        elif name == "key_frames" and self.names is not None:
-            dimension_names = [name]
         try:
             metadata = ArrayMetadata(
                 shape=tuple(int(n) for n in shape),
                 dtype=dtype,
                 chunk_shape=tuple(int(n) for n in chunk_shape),
                 codecs=tuple(codecs),
-                dimension_names=None if dimension_names is None else tuple(dimension_names),
-                attributes=dict(attributes or {}),
+            )
+            names, shown = self._shown(name, metadata, dimension_names, attributes or {})
+            metadata = replace(
+                metadata,
+                dimension_names=None if names is None else tuple(names),
+                attributes=dict(shown),
             )
             # The reader's checks are the writer's, so that a reader accepts what is written.
             document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
@@ -259,19 +381,100 @@ class ContainerWriter:
         self._write(member, [data])
         return metadata
 
+    def _shown(
+        self,
+        name: str,
+        metadata: ArrayMetadata,
+        dimension_names: Sequence[str | None] | None,
+        attributes: Mapping[str, Any],
+    ) -> tuple[Sequence[str | None] | None, Mapping[str, Any]]:
+        """Names of the axes and attributes of an array, those of the source where it has some."""
+        if name.startswith(COORDINATES):
+            return [self._path(name)], attributes
+        if name != TABLE:
+            return dimension_names, attributes
+        variable = self._current()
+        variable.shown = shows_values(metadata)
+        if not variable.shown:
+            return dimension_names, attributes
+        axes = zip(POSITIONS, metadata.shape, strict=True)
+        return [self._dimension(*axis) for axis in axes], {**variable.attributes, **attributes}
+
+    def _dimension(self, axis: str, length: int) -> str:
+        """The name of an axis of the table: that of the coordinate only with every position."""
+        variable = self._current()
+        name = self._node_of(axis)
+        if variable.lengths.get(axis, length) == length:
+            return name
+        if axis not in variable.boxes:
+            variable.boxes[axis] = self._free(f"{name}_box")
+        return variable.boxes[axis]
+
+    def _has_coordinate(
+        self, axis: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]
+    ) -> bool:
+        """Give an axis a name at the root; whether the coordinate is there already."""
+        variable = self._current()
+        variable.lengths[axis] = len(values)
+        if axis in variable.dimensions:
+            return False
+        content = (name, values.tobytes(), dict(attributes))
+        used = set(variable.dimensions.values())
+        for node, other in self._coordinates.items():
+            if other == content and node not in used:
+                variable.dimensions[axis] = node
+                return True
+        wish = free_node(name, ())
+        node = self._free(f"{wish}_of_{variable.node}" if wish in self._names_taken else wish)
+        variable.dimensions[axis] = node
+        self._coordinates[node] = content
+        return False
+
+    def _current(self) -> _Variable:
+        """The variable that is being written."""
+        if self._variable is None:
+            if self.one_of_several:
+                raise InputError(f"{self.path}: no variable has begun")
+            self.begin("values", {})
+        assert self._variable is not None
+        return self._variable
+
+    def _free(self, wish: str) -> str:
+        """A name at the root that nothing has, which is taken from now on."""
+        node = free_node(wish, self._names_taken)
+        self._names_taken.add(node)
+        return node
+
+    def _node_of(self, axis: str) -> str:
+        """The name of an axis at the root."""
+        dimensions = self._current().dimensions
+        if axis not in dimensions:
+            dimensions[axis] = self._free(axis)
+        return dimensions[axis]
+
     def preview(self, header: Mapping[str, Any]) -> Container:
-        """The container written so far, as if it were committed with this header.
+        """The variable as written so far, as if the file were committed with this header.
 
         The caller reads and closes it. `quality` and `history` may be left out of the header,
         because a preview is there to measure them.
         """
-        return self._open(self._tail({"quality": {}, "history": [], **header}))
+        container = self._open(self._tail({"quality": {}, "history": {}, **header}))
+        if not container.variables:
+            return container
+        return list(container.variables.values())[-1].closing_file()
 
-    def commit(self, header: Mapping[str, Any]) -> int:
-        """Write the groups, the root with its header and the directory; give the file its name.
+    def finish(self, header: Mapping[str, Any]) -> None:
+        """Take the header of a variable, which is then complete."""
+        self._headers.append(self._entry(header))
+        self._variable = None
 
-        `format`, `format_version` and, unless given, `required_features` are added to the header.
-        Figures that JSON cannot hold become null.
+    def commit(self, header: Mapping[str, Any] | None = None) -> int:
+        """Write the groups, the root with the headers and the directory; give the file its name.
+
+        `format` and `format_version` are added. Figures that JSON cannot hold become null.
+
+        Args:
+            header: of the only variable; None after `finish`.
 
         Returns:
             Number of bytes of the file.
@@ -280,6 +483,8 @@ class ContainerWriter:
             InputError: for a header that does not fit the arrays.
             OutputError: for a full disk.
         """
+        if self.one_of_several and header is not None:
+            raise InputError(f"{self.path} holds several variables; finish each and commit them")
         tail = self._tail(header)
         # A file that fhash's reader would refuse is not written.
         self._open(tail).close()
@@ -289,8 +494,9 @@ class ContainerWriter:
         return self._position
 
     def size(self, header: Mapping[str, Any]) -> int:
-        """Number of bytes of the file if it were committed with this header."""
-        return self._position + len(self._tail(header))
+        """Number of bytes by which the file grows by the variable, with this header."""
+        begun = 0 if self._variable is None else self._variable.begun
+        return self._position + len(self._tail(header)) - begun
 
     def mark(self) -> Mark:
         """The arrays written so far, for `rewind`."""
@@ -327,10 +533,46 @@ class ContainerWriter:
         except DamagedFileError as error:
             raise InputError(f"the container would not be readable: {error}") from error
 
-    def _tail(self, header: Mapping[str, Any]) -> bytes:
-        """The bytes after the arrays: groups, root and directory."""
+    def _entry(self, header: Mapping[str, Any]) -> dict[str, Any]:
+        """The header of the variable as the root has it, and features that it requires."""
+        variable = self._current()
+        entry: dict[str, Any] = plain_json(header)
+        if variable.name not in (None, entry.get("variable", {}).get("name")):
+            entry["name"] = variable.name
+        entry.pop(ARRAY, None)
+        if variable.node in self._arrays:
+            entry[ARRAY] = variable.node
+        entry[DIMENSIONS] = [self._node_of(axis) for axis in POSITIONS]
+        if variable.shares:
+            entry[SHARES] = variable.shares
+        return entry
+
+    def _root(self, groups: Collection[str], entries: Sequence[Mapping[str, Any]]) -> bytes:
+        """The document of the root."""
+        features = [name for entry in entries for name in entry.get("required_features", ())]
+        of_root = {
+            "format": FORMAT,
+            "format_version": list(FORMAT_VERSION),
+            "required_features": list(dict.fromkeys(features)),
+        }
+        variables = [
+            brief({key: value for key, value in entry.items() if key not in of_root})
+            for entry in entries
+        ]
+        attributes = {**plain_json(self.attributes), "fhash": {**of_root, VARIABLES: variables}}
+        root: dict[str, Any] = {**GROUP, "attributes": attributes}
+        if len(entries) > 1:
+            root[CONSOLIDATED] = consolidated({**dict.fromkeys(groups, GROUP), **self._arrays})
+        return strict_json.dumps(root, "the header")
+
+    def _tail(self, header: Mapping[str, Any] | None = None) -> bytes:
+        """The bytes after the arrays: groups, root and directory.
+
+        header: of the variable that is being written; None where all are finished.
+        """
         if self._file.closed:
             raise OutputError(f"{self.path}: the container is written already")
+        entries = [*self._headers, *([] if header is None else [self._entry(header)])]
         groups = {
             "/".join(folders[:depth])
             for folders in (name.split("/")[:-1] for name in self._arrays)
@@ -339,21 +581,7 @@ class ContainerWriter:
         documents = {
             f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)
         }
-        complete = {
-            "required_features": [],
-            **plain_json(header),
-            "format": FORMAT,
-            "format_version": list(FORMAT_VERSION),
-        }
-        if self.names is not None:
-            complete["required_features"] = [*complete["required_features"], NAMED]
-            complete.update(self.names.header())
-        attributes = {**plain_json(self.attributes), "fhash": complete}
-        root: dict[str, Any] = {**GROUP, "attributes": attributes}
-        if is_several(complete):
-            others = {**dict.fromkeys(groups, GROUP), **self._arrays}
-            root[CONSOLIDATED] = consolidated(others)
-        documents[DOCUMENT] = strict_json.dumps(root, "the header")
+        documents[DOCUMENT] = self._root(groups, entries)
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)
@@ -377,7 +605,12 @@ class ContainerWriter:
 
     def _path(self, name: str) -> str:
         """The path of an array in the hierarchy."""
-        return name if self.names is None else self.names.path(name)
+        if name.startswith(COORDINATES):
+            return self._node_of(name.removeprefix(COORDINATES))
+        variable = self._current()
+        return (
+            variable.node if name == TABLE and variable.shown else part_place(variable.number, name)
+        )
 
     def _add(self, name: str, key: str, parts: Sequence[bytes]) -> None:
         """Write the member of a chunk of an array, whose data are `parts`, one after the other."""

@@ -21,20 +21,20 @@ from fhash_formats.container.layout import (
     END_MARK,
     ENTRY,
     ENTRY_MARK,
-    LAYOUT_VERSION,
     LOCATOR_64,
     MAX_16,
     MAX_32,
     OFFSET_64,
     STORED,
     Member,
+    check_major,
     comment,
     directory_entry,
     end_records,
     local_header,
 )
 from fhash_formats.container.source import Source
-from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.errors import DamagedFileError
 
 MAX_DIRECTORY = 1 << 28
 """Bytes of the directory."""
@@ -58,7 +58,7 @@ _PIECE = 1 << 20
 
 
 def find_signature(source: Source) -> tuple[int, bytes] | None:
-    """Layout version and comment; None where the file does not end in a container's signature."""
+    """Major version of the format and comment; None for a file that ends in no signature."""
     start = max(0, source.size - _MAX_COMMENT)
     end = source.read(start, source.size - start)
     match = COMMENT.search(end)
@@ -69,29 +69,25 @@ def read_members(source: Source) -> dict[str, Member]:
     """Every member by name, in the order of the file.
 
     Raises DamagedFileError for a ZIP that `layout` could not have written, and
-    UnsupportedFileError for a newer layout.
+    UnsupportedFileError for another format.
     """
     signature = find_signature(source)
     if signature is None:
         raise DamagedFileError(
             "not an fhash container, or one that was cut short: no fhash signature at its end"
         )
-    version, signed = signature
+    major, signed = signature
     comment_at = source.size - len(signed)
-    if version > LAYOUT_VERSION:
-        raise UnsupportedFileError(
-            f"written by a newer fhash layout {version}; "
-            f"this version reads up to {LAYOUT_VERSION}; upgrade"
-        )
+    check_major(major, f"{major}.x")
     count, size, offset = _read_end(source, comment_at)
     directory = source.read(offset, comment_at - offset)
-    if comment(directory, version) != signed:
+    if comment(directory) != signed:
         raise DamagedFileError(
             "the ZIP directory is damaged: its SHA-256 differs from the one in the comment"
         )
     if directory[size:] != end_records(count, size, offset):
         raise DamagedFileError("the end record of the ZIP directory contradicts itself")
-    return _parse(directory[:size], count, offset, version)
+    return _parse(directory[:size], count, offset)
 
 
 def read_member(source: Source, member: Member) -> memoryview:
@@ -179,19 +175,18 @@ def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
     return count, size, offset
 
 
-def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[str, Member]:
+def _parse(directory: bytes, count: int, data_end: int) -> dict[str, Member]:
     """The members of a directory.
 
     Args:
         directory: bytes of its entries.
         count: number of entries that the end record declares.
         data_end: offset at which the members end and the directory begins.
-        version: of the layout.
     """
     members: dict[str, Member] = {}
     at = position = 0
     while at < len(directory):
-        member, length = _parse_entry(directory, at, version)
+        member, length = _parse_entry(directory, at)
         if member.name in members:
             raise DamagedFileError(f"member {member.name} is there twice")
         if member.offset != position or member.end > data_end:
@@ -210,7 +205,7 @@ def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[st
     return members
 
 
-def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
+def _parse_entry(directory: bytes, at: int) -> tuple[Member, int]:
     """The member whose entry starts at `at`, and the number of bytes of the entry.
 
     The fields that the format fixes are not checked one by one: the entry must equal the one that
@@ -229,11 +224,10 @@ def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
     name = _checked_name(directory[name_at:extra_at], name_size)
     if flags & 1:
         raise DamagedFileError(f"member {name} is encrypted")
-    may_be_deflated = version > 1 and name.rpartition("/")[2] == DOCUMENT
+    may_be_deflated = name.rpartition("/")[2] == DOCUMENT
     if method != STORED and not (may_be_deflated and method == DEFLATED):
         raise DamagedFileError(
-            f"member {name} is compressed by ZIP method {method}; "
-            "only metadata may be, by 8 from layout version 2 on"
+            f"member {name} is compressed by ZIP method {method}; only metadata may be, by 8"
         )
     _check_sizes(name, method, size, full_size)
     has_offset_64 = offset == MAX_32 and extra_size == OFFSET_64.size

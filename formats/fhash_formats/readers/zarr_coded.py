@@ -148,8 +148,6 @@ def _inner_coding(
         order = [order[place] for place in filtered.order]
     if not rest or not isinstance(rest[0], TransformCodec):
         return f"is coded by {names}, not by fhash.transform"
-    if rest[0].apart is not None:
-        return "has its head or masks in other arrays"
     return _Coding(
         order=tuple(order),
         codec=rest[0],

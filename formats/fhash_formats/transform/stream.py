@@ -10,9 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
-from fhash_formats.transform.apart import apart_message, without_names
-from fhash_formats.transform.array_axes import KEY, TILE_AXES, take_axes
-from fhash_formats.transform.tile.apart import join_mask
+from fhash_formats.transform.array_axes import TILE_AXES, take_axes
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.part import corrected_part, uncorrected
@@ -32,11 +30,8 @@ class TransformCoder:
 
     Attributes:
         settings: settings that all chunks share; None where each stream has its own.
-        features: features that a container with these settings requires besides `transform`.
         masked: whether the chunks say which of their values are occupied.
         parted: whether a part of a chunk may be had sooner than all of it.
-        apart: arrays that hold the head or the masks. Such a coder does not decode; a container
-            gives its coder these parts.
         axes: axis of the tile for each axis of a chunk; None for the last ones of t, z, y, x.
     """
 
@@ -65,11 +60,10 @@ class TransformCoder:
             raise DamagedFileError(
                 f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}"
             )
-        configuration, self.apart = without_names(codecs[0].get("configuration", {}))
         t, z, y, x = (1,) * (4 - len(shape)) + shape
         self._tile_shape: Shape = (t, z, y, x)
         try:
-            configuration, self.axes = take_axes(configuration)
+            configuration, self.axes = take_axes(codecs[0].get("configuration", {}))
             self.settings = (
                 TileSettings.from_dict(configuration) if "transform" in configuration else None
             )
@@ -77,8 +71,6 @@ class TransformCoder:
                 self._tile_shape = self.axes.tile_shape(shape)
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
-        own = () if self.settings is None else self.settings.features
-        self.features = own if self.axes is None else (*own, KEY)
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
         has_head = self.settings is not None and self.settings.head is not None
@@ -116,7 +108,6 @@ class TransformCoder:
 
         Raises DamagedFileError.
         """
-        self._check_complete()
         assert self.settings is not None, "the coder is parted"
         return uncorrected(data, self._tile_shape, self._dtype, self.settings, part)
 
@@ -125,15 +116,10 @@ class TransformCoder:
         assert self.settings is not None
         return corrected_part(table, part, self._dtype, self.settings)
 
-    def join(self, data: memoryview, mask: memoryview) -> bytes:
-        """The stream of a chunk whose mask lies in an array of its own; raises DamagedFileError."""
-        return join_mask(data, mask)
-
     def decode_masked(
         self, data: memoryview | bytes
     ) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk, and which of its values are occupied. Raises DamagedFileError."""
-        self._check_complete()
         values, mask = decode_tile_mask(data, self._tile_shape, self._dtype, self.settings)
         if self.axes is not None:
             return self.axes.from_tile(values), self.axes.from_tile(mask)
@@ -147,7 +133,6 @@ class TransformCoder:
         Tiles have less detail along their own z, y and x. Where one of these is the first axis of
         the array, along which a level of detail has every position, all of the tile is decoded.
         """
-        self._check_complete()
         whole = self.axes is not None and self.axes.names[0] != TILE_AXES[0]
         level = 0 if whole else lod
         values = decode(data, self._tile_shape, self._dtype, self.settings, level)
@@ -156,8 +141,3 @@ class TransformCoder:
         chunk = self.axes.from_tile(values)
         every = slice(None, None, 1 << lod)
         return chunk[..., every, every, every] if whole and lod else chunk
-
-    def _check_complete(self) -> None:
-        """Raise InputError where a head or masks are missing, so that no wrong value comes out."""
-        if self.apart:
-            raise InputError(apart_message(self.apart))

@@ -27,7 +27,6 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.apart import apart_message, without_names
 from fhash_formats.transform.array_axes import KEY, ArrayAxes, take_axes
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import (
@@ -74,8 +73,6 @@ class TransformCodec(ArrayBytesCodec):
             configuration with the key `center`.
         reading: whether the codec only decodes streams with their own settings, as in containers
             whose configuration is empty.
-        apart: a configuration that names arrays of the container for its head or masks. Such a
-            codec shows its array, but raises InputError when values are asked for.
         axes: for each axis of the array, the axis "t", "z", "y" or "x" of its tiles, or "" for one
             along which chunks have length 1. By default the last four axes are these, and those
             before them are taken together with t.
@@ -92,15 +89,12 @@ class TransformCodec(ArrayBytesCodec):
     effort: int = DEFAULT_EFFORT
     settings: TileSettings | None = None
     reading: bool = False
-    apart: Mapping[str, Any] | None = None
     axes: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         if self.axes is not None:
             object.__setattr__(self, "axes", ArrayAxes.of(self.axes).names)
-        if self.apart is not None:
-            TileSettings.from_dict(without_names(self.apart)[0])
-        elif self.settings is None and not self.reading:
+        if self.settings is None and not self.reading:
             Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
             check_effort(self.effort)
             if isinstance(self.transform, Mapping):
@@ -124,8 +118,6 @@ class TransformCodec(ArrayBytesCodec):
             )
         configuration, given = take_axes(configuration)
         axes = None if given is None else given.names
-        if without_names(configuration)[1]:
-            return cls(apart=configuration, axes=axes)
         if "center" in configuration:
             return cls(settings=TileSettings.from_dict(configuration), axes=axes)
         if not configuration:
@@ -140,9 +132,7 @@ class TransformCodec(ArrayBytesCodec):
     def to_dict(self) -> dict[str, JSON]:
         """The inverse of `from_dict`."""
         configuration: dict[str, Any]
-        if self.apart is not None:
-            configuration = dict(self.apart)
-        elif self.settings is not None:
+        if self.settings is not None:
             configuration = self.settings.to_dict()
         elif self.reading:
             configuration = {}
@@ -173,7 +163,7 @@ class TransformCodec(ArrayBytesCodec):
 
     def __repr__(self) -> str:
         """One line: the settings of tiles hold a base64 text of all weights of a head."""
-        shared = self.apart if self.settings is None else self.settings.to_dict()
+        shared = None if self.settings is None else self.settings.to_dict()
         given = {
             "max_error": self.max_error,
             "max_error_rel": self.max_error_rel,
@@ -198,7 +188,6 @@ class TransformCodec(ArrayBytesCodec):
         raise NotImplementedError
 
     def _encode_sync(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
-        self._check_complete()
         if self.reading:
             raise InputError(
                 f"{NAME} without a configuration only decodes: "
@@ -226,7 +215,6 @@ class TransformCodec(ArrayBytesCodec):
         return chunk_spec.prototype.buffer.from_bytes(data)
 
     def _decode_sync(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
-        self._check_complete()
         data, shape = chunk_data.to_bytes(), chunk_spec.shape
         dtype = chunk_spec.dtype.to_native_dtype()
         axes = None if self.axes is None else ArrayAxes.of(self.axes)
@@ -238,11 +226,6 @@ class TransformCodec(ArrayBytesCodec):
             values = values.astype(dtype, copy=False)
         values = values.reshape(shape) if axes is None else axes.from_tile(values)
         return chunk_spec.prototype.nd_buffer.from_numpy_array(values)
-
-    def _check_complete(self) -> None:
-        """Raise InputError where head or masks lie elsewhere: no wrong value may come out."""
-        if self.apart is not None:
-            raise InputError(apart_message(without_names(self.apart)[1]))
 
     async def _encode_single(self, chunk_data: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
         return await asyncio.to_thread(self._encode_sync, chunk_data, chunk_spec)

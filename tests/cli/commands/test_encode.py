@@ -63,7 +63,7 @@ def test_coded_tables_are_reported_with_their_loss(
         assert (result.exit_code, result.stderr) == (0, "")
         assert ("coded, for" in result.stdout) == (name == "coded")
     info = fhash("info", tmp_path / "coded")
-    assert "tables/level_1 to tables/level_" in info.stdout
+    assert "parts/0.tables.level_1 to parts/0.tables.level_" in info.stdout
     assert "fhash.transform" in info.stdout
     assert "of the PSNR" in info.stdout
     assert "of the PSNR" not in fhash("info", tmp_path / "plain").stdout

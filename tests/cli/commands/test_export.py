@@ -12,7 +12,7 @@ from click.testing import Result
 import fhash_codec
 
 Fhash = Callable[..., Result]
-GOLDEN = Path(__file__).resolve().parents[2] / "golden" / "compact-1.1-mask.fhz"
+GOLDEN = Path(__file__).resolve().parents[2] / "golden" / "compact-mask.fhz"
 
 
 def test_a_plain_file_is_written_and_described(fhash: Fhash, tmp_path: Path) -> None:
@@ -31,8 +31,8 @@ def test_a_plain_file_is_written_and_described(fhash: Fhash, tmp_path: Path) -> 
         }
     info = fhash("info", plain)
     assert info.exit_code == 0, info.output
-    assert "tables/level_1 to tables/level_" in info.stdout
-    assert "occupancy/bits, bytes," in info.stdout
+    assert "parts/0.tables.level_1 to parts/0.tables.level_" in info.stdout
+    assert "parts/0.occupancy.bits, bytes," in info.stdout
     assert fhash("verify", plain).exit_code == 0
 
 

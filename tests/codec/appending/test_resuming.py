@@ -27,7 +27,7 @@ def with_array(run, path, name, values, dimension_names):
         table = container.arrays["tables/level_1"]
         codec = {"name": "fhash.transform", "configuration": table.settings.to_dict()}
         writer.add_sharded(
-            table.name,
+            "tables/level_1",
             shape=table.shape,
             dtype=table.dtype,
             chunk_shape=table.chunk_shape,

@@ -246,30 +246,6 @@ def test_infinities_in_a_table_are_damage(way: int) -> None:
     assert np.isnan(model.read(1, ((0, 1), (0, 3), (0, 4)), np.ones((1, 3, 4), bool))).sum() == 1
 
 
-@pytest.mark.parametrize("way", range(5))
-def test_infinities_outside_the_coreset_of_older_files_are_no_values(way: int) -> None:
-    arrays = {"tables/level_1": Table(), "occupancy/bits": Table()}
-    result = reads(model_of(arrays))[way]()
-    assert np.isnan(result).any()
-    assert not np.isinf(result).any()
-
-
-def test_masks_of_other_numbers_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Any number other than 0 is a vertex of the coreset, also where two have no bit in common."""
-    golden = Path(__file__).parents[2] / "golden" / "compact-1.1-bound.fhz"
-    with fhash_codec.open(golden) as volume:
-        mask = volume.container.arrays["occupancy/mask"].read()
-        expected = volume[...]
-        between = volume.read(0.5)
-    numbers = mask * np.array([1, 2, 4, 128, 255], np.uint8).reshape(5, 1, 1, 1)
-    with fhash_codec.open(golden) as volume:
-        monkeypatch.setattr(
-            volume.container.arrays["occupancy/mask"], "read", lambda region: numbers[region]
-        )
-        np.testing.assert_array_equal(volume[...], expected)
-        np.testing.assert_array_equal(volume.read(0.5), between)
-
-
 def test_coarse_levels_of_labels_have_every_vertex_of_the_coreset(tmp_path: Path) -> None:
     """Tiles of odd lengths begin between the coarse vertices; their labels lie beside these."""
     t, z, y, x = np.indices((4, 9, 10, 11))
@@ -277,7 +253,7 @@ def test_coarse_levels_of_labels_have_every_vertex_of_the_coreset(tmp_path: Path
     config = EncodeConfig(effort=1, tile="2x3x4x5", features=("isosurface:2.5",), dilation=0)
     fhash_codec.encode(values, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert "labels" in volume.info["required_features"]
+        assert volume.container.arrays["tables/level_1"].settings.labels
         box = volume.box.slices()
         for step, lod in product(range(4), (1, 2)):
             coarse = volume.read_lod(step, lod)

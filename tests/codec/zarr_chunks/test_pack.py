@@ -143,7 +143,7 @@ def test_figures_that_nobody_measured_are_not_in_the_file(tmp_path: Path) -> Non
     report = fhash_codec.pack(write(tmp_path, dataset(), max_error=0.5), run)
     assert report["variables"]["u"]["codec"] == {"max_error": 0.5}
     with fhash_codec.open(run) as volume:
-        header = full_header(volume.container.header)
+        header = full_header(volume.container.header, volume.container.arrays)
         assert not {"psnr", "rmse", "max_abs_error", "ssim"} & header["quality"].keys()
         assert volume.config["max_error"] == 0.5
         assert header["encoder"]["codec"] == {"max_error": 0.5}

@@ -13,10 +13,10 @@ from fhash_codec.zarr_view import chunking
 from fhash_formats.series import ArraySeries, Coordinate
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
-LABELS = GOLDEN / "compact-1.2-labels.fhz"
+LABELS = GOLDEN / "compact-labels.fhz"
 """Integers whose missing values are -100, in a box that begins at vertex 2 along x."""
-COUNTS = GOLDEN / "compact-1.2-counts.fhz"
-PAPER = GOLDEN / "paper-1.6-sparse.fhz"
+COUNTS = GOLDEN / "compact-counts.fhz"
+PAPER = GOLDEN / "paper-sparse.fhz"
 
 
 def coordinates(shape: tuple[int, ...]) -> dict[str, Coordinate]:

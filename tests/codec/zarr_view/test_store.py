@@ -21,10 +21,10 @@ from fhash_formats.errors import DamagedFileError, MissingInputError
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 NAMES = {
-    "labels": GOLDEN / "compact-1.2-labels.fhz",
-    "counts": GOLDEN / "compact-1.2-counts.fhz",
-    "paper": GOLDEN / "paper-1.6-sparse.fhz",
-    "plain": GOLDEN / "compact-1.3-plain-labels.fhz",
+    "labels": GOLDEN / "compact-labels.fhz",
+    "counts": GOLDEN / "compact-counts.fhz",
+    "paper": GOLDEN / "paper-sparse.fhz",
+    "plain": GOLDEN / "compact-plain-labels.fhz",
 }
 
 

@@ -58,7 +58,7 @@ def make_header() -> dict[str, Any]:
         "config": {"epochs": 1},
         "training": {"seconds": None, "epochs": 1, "device": "cpu"},
         "quality": {"psnr": 48.5},
-        "history": [{"seconds": None, "epoch": 1, "psnr": 40.0}],
+        "history": {"seconds": [None], "epoch": [1], "psnr": [40.0]},
     }
 
 

@@ -76,7 +76,7 @@ def growing_header(steps: int, frame: tuple[int, int, int] = FRAME) -> dict[str,
         "config": {},
         "training": {"seconds": None, "epochs": 0, "device": "none"},
         "quality": {},
-        "history": [],
+        "history": {},
     }
 
 

@@ -16,7 +16,7 @@ from fhash_formats.container import Container
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 ROOT = "zarr.json"
-DOCUMENT = "coords/time/zarr.json"
+DOCUMENT = "time/zarr.json"
 METHOD = 10
 """Offsets of fields in a directory entry: this one and the next four."""
 FLAGS = 8

@@ -11,6 +11,8 @@ import numpy as np
 from fhash_formats.container import ContainerWriter, shard_order
 
 NAME = "extra/values"
+PATH = "parts/0.extra.values"
+"""Path of this array in the file."""
 
 
 def chunk_of(values: np.ndarray, index: Sequence[int], chunk_shape: Sequence[int]) -> np.ndarray:

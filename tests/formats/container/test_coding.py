@@ -128,7 +128,8 @@ def test_another_codec_is_added_in_one_place(tmp_path, samples, monkeypatch) -> 
         container.verify()
     monkeypatch.delitem(coding.ARRAY_CODECS, "test.negative")
     with pytest.raises(
-        DamagedFileError, match=r"extra/values/zarr[.]json: codecs 'test[.]negative, crc32c'"
+        DamagedFileError,
+        match=r"0[.]extra[.]values/zarr[.]json: codecs 'test[.]negative, crc32c'",
     ):
         Container.open(path)
 
@@ -165,8 +166,8 @@ def test_chunk_data(sample, samples, case) -> None:
     make, message = CHUNKS[case]
     coded = make(np.arange(4, dtype="<f8").tobytes())
     coded += struct.pack("<I", crc32c(coded))
-    data = replaced(sample, samples, "coords/time/c/0", coded)
-    refused(sample, data, f"member coords/time/c/0: {message}")
+    data = replaced(sample, samples, "time/c/0", coded)
+    refused(sample, data, f"member time/c/0: {message}")
 
 
 def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes() -> None:
@@ -184,8 +185,8 @@ def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes() -> None:
     "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"]
 )
 def test_chunk_without_its_crc(sample, samples, coded) -> None:
-    data = replaced(sample, samples, "coords/time/c/0", coded)
-    refused(sample, data, "member coords/time/c/0: .*CRC-32C")
+    data = replaced(sample, samples, "time/c/0", coded)
+    refused(sample, data, "member time/c/0: .*CRC-32C")
 
 
 def test_frame_made_by_hand_is_read(sample, samples) -> None:
@@ -193,6 +194,6 @@ def test_frame_made_by_hand_is_read(sample, samples) -> None:
     right = np.arange(4, dtype="<f8")
     coded = frame(right.tobytes(), size=32)
     coded += struct.pack("<I", crc32c(coded))
-    sample.write_bytes(replaced(sample, samples, "coords/time/c/0", coded))
+    sample.write_bytes(replaced(sample, samples, "time/c/0", coded))
     with Container.open(sample) as container:
         np.testing.assert_array_equal(container.arrays["coords/time"].read(), right)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +15,24 @@ import pytest
 from fhash_formats.container import (
     Container,
     ContainerWriter,
-    SeveralWriter,
     read_metadata,
-    validate_header,
 )
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import ARRAY_CODECS, PlainCoder, plain_codecs
-from fhash_formats.container.header import FORMAT_VERSION
+from fhash_formats.container.defaults import CONFIG_DEFAULTS, DEFAULTS
+from fhash_formats.container.header import LOWEST, STEPS
+from fhash_formats.container.layout import FORMAT_VERSION
 from fhash_formats.container.sharding import sharding_codecs
+from fhash_formats.container.variables import (
+    ARRAY,
+    CONSOLIDATED,
+    DIMENSIONS,
+    NODE,
+    SHARES,
+    VARIABLES,
+    part_place,
+    read_variables,
+)
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.number_types import DTYPES
@@ -34,28 +46,35 @@ def example(name: str) -> dict[str, Any]:
     return json.loads(text)
 
 
+def shown(path: Path) -> dict[str, Any]:
+    """The attribute of the root of a file."""
+    with zipfile.ZipFile(path) as file:
+        return json.loads(file.read("zarr.json"))["attributes"]["fhash"]
+
+
 def test_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
-    header = example("header")
-    validate_header(header)
-    assert tuple(header["format_version"]) == FORMAT_VERSION
+    root = example("header")
+    assert tuple(root["format_version"]) == FORMAT_VERSION
+    (header,) = root["variables"]
     arrays = samples.arrays(header)
     samples.write(tmp_path / "a.fhz", header, arrays)
+    assert shown(tmp_path / "a.fhz") == root
     with Container.open(tmp_path / "a.fhz") as container:
-        assert container.header == header
         container.verify()
     for name in arrays:
         assert re.sub("_[0-9]$", "_1", name) in DOCUMENT
 
 
 def test_compact_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
-    header = example("compact-header")
-    validate_header(header)
+    root = example("compact-header")
+    (header,) = root["variables"]
     with ContainerWriter(tmp_path / "a.fhz") as writer:
+        writer.name_axes(header["dimensions"], header["domain"]["shape"])
         writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
         writer.add_whole("auxiliary/area", np.ones((5, 6), dtype=np.float32))
-        writer.commit(header)
+        writer.commit({**header, "required_features": root["required_features"]})
+    assert shown(tmp_path / "a.fhz") == root
     with Container.open(tmp_path / "a.fhz") as container:
-        assert container.header == header
         assert container.coordinate("x").name == "lon"
         coords = {axis: container.coordinate(name) for axis, name in AXIS_NAMES.items()}
         metadata = read_metadata(header, container.arrays, coords)
@@ -64,40 +83,28 @@ def test_compact_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
     assert metadata.named("lon").values.dtype == np.float32
     assert metadata.variable_attributes["missing_value"] == np.float32(1e20)
     for key in (
-        "coordinates",
+        *header,
         *header["model"],
         *header["coordinates"]["x"],
         *header["source"],
+        *header["quality"],
         *(key for each in header["source"]["variables"] for key in each),
-        "values",
-        "attributes",
+        *(ARRAY, DIMENSIONS, SHARES, VARIABLES, LOWEST, CONSOLIDATED),
     ):
         assert f"`{key}`" in DOCUMENT
-    assert "`auxiliary/" in DOCUMENT
-    for name in ("occupancy/bits", "occupancy/mask", "tables/level_1"):
+    for name in ("occupancy/bits", "occupancy/mask", "tables/level_1", "missing/bits", STEPS):
         assert f"`{name}`" in DOCUMENT
 
 
-def test_variables_are_valid_and_can_be_written(tmp_path) -> None:
-    root = example("variables")
-    with ContainerWriter(tmp_path / "a.fhz") as writer:
-        several = SeveralWriter(writer, [header["name"] for header in root["variables"]])
-        for header in root["variables"]:
-            variable = several.variable(header["name"])
-            axes, lengths = ("time", "z", "y", "x"), header["domain"]["shape"]
-            for axis, name, length in zip(axes, header["dimensions"], lengths, strict=True):
-                variable.add_whole(f"coords/{axis}", np.zeros(length), attributes={"name": name})
-            levels = header["model"]["levels"][0]
-            variable.add_whole("tables/level_1", np.zeros(levels, dtype=np.float32))
-            variable.finish(header)
-        several.commit()
-    with Container.open(tmp_path / "a.fhz") as container:
-        assert container.header == root
-        assert list(container.variables) == ["u", "surface/rain rate"]
-        # Tables of plain numbers need not be values: they lie with the parts.
-        assert "parts/surface_rain_rate.tables.level_1" in container.arrays
-    for key in ("variables", "name", "array", "dimensions"):
-        assert f"`{key}`" in DOCUMENT
+def test_paths_are_those_of_the_document(tmp_path) -> None:
+    assert f"`{part_place(0, 'mlp/weight_1')}` is `mlp/weight_1`" in DOCUMENT
+    assert f"`{NODE.pattern}`" in DOCUMENT
+
+
+def test_defaults_are_those_of_the_document() -> None:
+    assert example("config-defaults") == CONFIG_DEFAULTS
+    for key in DEFAULTS:
+        assert f"| `{key}` |" in DOCUMENT
 
 
 def test_sharded_array_is_what_the_writer_writes(monkeypatch) -> None:
@@ -115,11 +122,15 @@ def test_sharded_array_is_what_the_writer_writes(monkeypatch) -> None:
     assert sharding_codecs(inner["chunk_shape"], inner["codecs"]) == values["codecs"]
 
 
-def test_no_key_of_the_example_can_be_left_out() -> None:
-    header = example("header")
+def test_no_key_of_the_example_can_be_left_out_but_defaults() -> None:
+    (header,) = example("header")["variables"]
     for key in header:
-        with pytest.raises(DamagedFileError, match=key):
-            validate_header({k: v for k, v in header.items() if k != key})
+        root = {**example("header"), "variables": [{k: v for k, v in header.items() if k != key}]}
+        if key in DEFAULTS:
+            read_variables(root, [])
+        else:
+            with pytest.raises(DamagedFileError, match=key):
+                read_variables(root, [])
         assert f"| `{key}` |" in DOCUMENT
 
 

@@ -112,7 +112,7 @@ def test_zarr_reads_every_state(tmp_path) -> None:
         for number in range(2):
             add_layer(growing, number)
             with zarr.storage.ZipStore(path, mode="r") as store:
-                array = zarr.open_array(store, path="tables/level_1", mode="r")
+                array = zarr.open_array(store, path="values", mode="r")
                 assert array.shape[0] == 2 * number + 2
 
 

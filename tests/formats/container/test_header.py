@@ -8,8 +8,8 @@ from hostile_files import ROOT, edited, edited_header, read_everything, refused
 from fhash_formats.container import Container, validate_header
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
-FIXED = {"format": "fhash", "format_version": [1, 0], "required_features": []}
-VERSION_1_1 = {"format": "fhash", "format_version": [1, 1]}
+FIXED = {"format": "fhash", "format_version": [2, 0], "required_features": []}
+VERSION = {"format": "fhash", "format_version": [2, 0]}
 
 
 BAD = [
@@ -128,10 +128,10 @@ def test_wrong_key_is_named(samples, path, value) -> None:
         ("quality.bulk", {"psnr": 40, "range": [0, 1]}),
         ("quality.bulk", {"psnr": None, "range": [1, 1.5]}),
         ("training.seconds", 0.5),
-        ("history", []),
-        ("history", [{"epoch": 1}, {"seconds": None, "epoch": 2, "psnr": 1}]),
+        ("history", {}),
+        ("history", {"epoch": [1, 2], "seconds": [None, 0.5]}),
         ("variable.units", ""),
-        ("format_version", [1, 3]),
+        ("format_version", [2, 3]),
     ],
 )
 def test_allowed(samples, path, value) -> None:
@@ -171,12 +171,12 @@ def test_a_table_that_overflows_the_type_of_decoded_values_is_refused(samples) -
         ("history", 1),
         ("history", {"psnr": [1]}),
         ("history", {"epoch": [1, 2], "psnr": [1]}),
-        ("history", {"epoch": [1, None]}),
+        ("history", {"epoch": [1, "2"]}),
     ],
 )
 def test_wrong_key_of_the_profile_compact_is_named(samples, path, value) -> None:
     with pytest.raises(DamagedFileError, match=rf"header key {path.replace('.', '[.]')}\b"):
-        validate_header(edited_header(samples.compact_header() | VERSION_1_1, path, value))
+        validate_header(edited_header(samples.compact_header() | VERSION, path, value))
 
 
 @pytest.mark.parametrize(
@@ -188,28 +188,32 @@ def test_wrong_key_of_the_profile_compact_is_named(samples, path, value) -> None
         ("model.tiling", {}),
         ("model.tiling", {"price": 1, "best": [4, 3, 4, 6]}),
         ("coordinates", ...),
-        ("history", []),
-        ("history", {"epoch": [1, 2], "psnr": [40.5, 41]}),
+        ("history", {}),
+        ("history", {"epoch": [1, 2], "psnr": [40.5, None]}),
     ],
 )
 def test_allowed_in_the_profile_compact(samples, path, value) -> None:
-    validate_header(edited_header(samples.compact_header() | VERSION_1_1, path, value))
+    validate_header(edited_header(samples.compact_header() | VERSION, path, value))
 
 
 ROOTS = {
     "newer major": (
-        lambda v: v.update(format_version=[2, 0]),
-        "newer fhash format 2.0; this version reads 1.x; upgrade",
+        lambda v: v.update(format_version=[3, 1]),
+        "the file is of format 3.1; this fhash reads format 2.x: upgrade",
         UnsupportedFileError,
     ),
-    "older major": (lambda v: v.update(format_version=[0, 9]), "format_version", DamagedFileError),
+    "older major": (
+        lambda v: v.update(format_version=[1, 8]),
+        "the file is of format 1.8; this fhash reads format 2.x: encode the source again",
+        UnsupportedFileError,
+    ),
     "feature": (
         lambda v: v.update(required_features=["teleport"]),
         "feature 'teleport'",
         UnsupportedFileError,
     ),
     "profile": (
-        lambda v: v["model"].update(profile="magic"),
+        lambda v: v["variables"][0]["model"].update(profile="magic"),
         "profile is 'magic'",
         UnsupportedFileError,
     ),
@@ -229,14 +233,23 @@ def test_root(sample, samples, case) -> None:
 
 
 def test_newer_minor_is_read(sample, samples) -> None:
-    sample.write_bytes(
-        edited(
-            sample,
-            samples,
-            ROOT,
-            lambda v: v["attributes"]["fhash"].update(format_version=[1, 7], novelty={"a": 1}),
-        )
-    )
+    def newer(document) -> None:
+        root = document["attributes"]["fhash"]
+        root["format_version"] = [2, 7]
+        root["variables"][0]["novelty"] = {"a": 1}
+
+    sample.write_bytes(edited(sample, samples, ROOT, newer))
     read_everything(sample)
     with Container.open(sample) as container:
         assert container.header["novelty"] == {"a": 1}
+        assert container.header["format_version"] == [2, 7]
+
+
+def test_a_file_of_format_1_is_named(sample, samples) -> None:
+    """Its header has no variables."""
+
+    def older(document) -> None:
+        document["attributes"]["fhash"] = {"format": "fhash", "format_version": [1, 8]}
+
+    message = "sample.fhz: the file is of format 1.8; this fhash reads format 2.x: encode the"
+    refused(sample, edited(sample, samples, ROOT, older), message, UnsupportedFileError)

@@ -30,33 +30,33 @@ def extra_array(shape):
 
 PLACES = {
     "chunk missing": (
-        lambda p: [part for part in p if part[0] != "coords/time/c/0"],
-        "coords/time has 0 chunks",
+        lambda p: [part for part in p if part[0] != "time/c/0"],
+        "time has 0 chunks",
     ),
     "all but the root missing": (lambda p: p[-1:], "array coords/time is missing"),
     "root missing": (lambda p: p[:-1], "zarr.json is missing"),
     "nothing": (lambda p: [], "zarr.json is missing"),
     "group missing": (
-        lambda p: [part for part in p if part[0] != "coords/zarr.json"],
+        lambda p: [part for part in p if part[0] != "parts/zarr.json"],
         "lies in no group",
     ),
-    "chunk outside the grid": (lambda p: [("coords/time/c/1", b"x"), *p], "member coords/time/c/1"),
+    "chunk outside the grid": (lambda p: [("time/c/1", b"x"), *p], "member time/c/1"),
     "chunk of other rank": (
-        lambda p: [("coords/time/c/0/0", b"x"), *p],
-        "member coords/time/c/0/0",
+        lambda p: [("time/c/0/0", b"x"), *p],
+        "member time/c/0/0",
     ),
     "chunk under another name": (
-        lambda p: [("coords/time/c/00", b"x"), *p],
-        "member coords/time/c/00",
+        lambda p: [("time/c/00", b"x"), *p],
+        "member time/c/00",
     ),
     "chunk number too long": (
-        lambda p: [("coords/time/c/" + "9" * 400, b"x"), *p],
-        "member coords/time/c/999",
+        lambda p: [("time/c/" + "9" * 400, b"x"), *p],
+        "member time/c/999",
     ),
-    "chunk of no array": (lambda p: [("coords/none/c/0", b"x"), *p], "belongs to no array"),
+    "chunk of no array": (lambda p: [("none/c/0", b"x"), *p], "belongs to no array"),
     "file of no array": (lambda p: [("readme.txt", b"x"), *p], "belongs to no array"),
     "array in an array": (
-        lambda p: [("coords/time/a/zarr.json", extra_array([1])), *p],
+        lambda p: [("time/a/zarr.json", extra_array([1])), *p],
         "lies in no group",
     ),
     "many chunks declared": (
@@ -64,7 +64,7 @@ PLACES = {
         "has 0 chunks",
     ),
     "table missing": (
-        lambda p: [part for part in p if not part[0].startswith("tables/level_2")],
+        lambda p: [part for part in p if not part[0].startswith("parts/0.tables.level_2")],
         "tables/level_2 is missing",
     ),
 }

@@ -197,6 +197,6 @@ def test_damage_without_a_change_is_damage(sample, range_server) -> None:
     data[member.data_offset] ^= 1
     with (
         Container.open(range_server.put("run.fhz", bytes(data))) as container,
-        pytest.raises(DamagedFileError, match=r"run\.fhz: member mlp/weight_1"),
+        pytest.raises(DamagedFileError, match=r"run\.fhz: member parts/0\.mlp\.weight_1"),
     ):
         values(container)

@@ -11,13 +11,15 @@ from hostile_files import refused, replaced
 
 from fhash_formats.container import FORMAT_VERSION, Container, is_container
 from fhash_formats.container.coding import crc32c
+from fhash_formats.container.defaults import complete
 from fhash_formats.errors import DamagedFileError
 
 
 def test_header_comes_back(sample, samples) -> None:
     with Container.open(sample) as container:
         assert container.header == {
-            **samples.header(),
+            **complete(samples.header()),
+            "dimensions": ["time", "z", "y", "x"],
             "format": "fhash",
             "format_version": list(FORMAT_VERSION),
             "required_features": [],
@@ -81,7 +83,7 @@ def test_is_container(sample, tmp_path) -> None:
         b"",
         b"PK\x05\x06" + bytes(18),
         b"\x89HDF\r\n\x1a\n" + bytes(500),
-        b"fhash 1 sha256=" + b"0" * 64,
+        b"fhash 2 sha256=" + b"0" * 64,
     ],
 )
 def test_another_file_is_refused(tmp_path, content) -> None:
@@ -94,4 +96,4 @@ def test_another_file_is_refused(tmp_path, content) -> None:
 def test_key_frames_increase_within_the_domain(sample, samples, steps) -> None:
     coded = numcodecs.zstd.compress(np.array(steps, dtype="<i8"), 1)
     coded += struct.pack("<I", crc32c(coded))
-    refused(sample, replaced(sample, samples, "key_frames/c/0", coded), "key_frames")
+    refused(sample, replaced(sample, samples, "parts/0.key_frames/c/0", coded), "key_frames")

@@ -9,7 +9,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from sharded_files import NAME, random_values, write_sharded
+from sharded_files import NAME, PATH, random_values, write_sharded
 
 from fhash_formats.container import Container, coding, shard_order, shard_shape
 from fhash_formats.container.coding import crc32c
@@ -85,7 +85,7 @@ def line(tmp_path, samples):
     """
     path = write_sharded(tmp_path / "a.fhz", samples, random_values((5,)), (2,), (8,))
     parts = samples.unpack(path.read_bytes())
-    return path, parts, [name for name, _ in parts].index(f"{NAME}/c/0")
+    return path, parts, [name for name, _ in parts].index(f"{PATH}/c/0")
 
 
 def refused_shard(path, samples, parts, message, kind=DamagedFileError):
@@ -114,27 +114,27 @@ def test_hostile_index(line, samples, case) -> None:
     change(table)
     index = b"".join(struct.pack("<2Q", *entry) for entry in table)
     parts[at] = name, data[:-68] + index + struct.pack("<I", crc32c(index))
-    refused_shard(path, samples, parts, f"member {NAME}/c/0: .*{message}")
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: .*{message}")
 
 
 def test_index_with_a_wrong_checksum(line, samples) -> None:
     path, parts, at = line
     name, data = parts[at]
     parts[at] = name, data[:-1] + bytes([data[-1] ^ 1])
-    refused_shard(path, samples, parts, f"member {NAME}/c/0: the CRC-32C of the shard's index")
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: the CRC-32C of the shard's index")
 
 
 @pytest.mark.parametrize("data", [b"", b"x" * 67])
 def test_shard_shorter_than_its_index(line, samples, data) -> None:
     path, parts, at = line
     parts[at] = parts[at][0], data
-    refused_shard(path, samples, parts, f"member {NAME}/c/0: {len(data)} bytes are too few")
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: {len(data)} bytes are too few")
 
 
 def test_shards_that_declare_much(line, samples) -> None:
     """A million inner chunks of a gibibyte each, in a few bytes."""
     path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{NAME}/zarr.json")
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
     text = parts[place][1].decode()
     many = text.replace('"chunk_shape":[8]', f'"chunk_shape":[{2**48}]').replace(
         '"chunk_shape":[2]', f'"chunk_shape":[{2**28}]'
@@ -173,11 +173,11 @@ SETTINGS = {
 def test_settings_that_are_refused(line, samples, case) -> None:
     changes, kind = SETTINGS[case]
     path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{NAME}/zarr.json")
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
     document = json.loads(parts[place][1])
     document["codecs"][0]["configuration"].update(changes)
     parts[place] = parts[place][0], json.dumps(document).encode()
-    refused_shard(path, samples, parts, f"member {NAME}/zarr.json: ", kind)
+    refused_shard(path, samples, parts, f"member {PATH}/zarr.json: ", kind)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_settings_that_are_refused(line, samples, case) -> None:
 )
 def test_sharding_stands_alone(line, samples, change) -> None:
     path, parts, _ = line
-    place = [name for name, _ in parts].index(f"{NAME}/zarr.json")
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
     document = json.loads(parts[place][1])
     change(document["codecs"])
     parts[place] = parts[place][0], json.dumps(document).encode()
@@ -203,13 +203,13 @@ def test_every_flip_in_a_shard_is_found(sharded_file) -> None:
             damaged[at] ^= 4
             path.write_bytes(damaged)
             with (
-                pytest.raises(DamagedFileError, match=f"member {NAME}/c/"),
+                pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
                 Container.open(path) as container,
             ):
                 container.verify()
             if at >= member.data_offset:
                 with (
-                    pytest.raises(DamagedFileError, match=f"member {NAME}/c/"),
+                    pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
                     Container.open(path) as container,
                 ):
                     container.arrays[NAME].read()

@@ -41,7 +41,7 @@ def through(metadata: SourceMetadata, attributes: dict[str, Any] | None = None) 
     """The metadata after a file, the header's entry, and the arrays."""
     entry, arrays = describe_metadata(metadata, COORDS, attributes or {})
     header = {
-        "format_version": [1, 7],
+        "format_version": [2, 0],
         "variable": {"name": "u", "attributes": attributes or {}},
         "domain": {"shape": list(SHAPE)},
         "coordinates": {

@@ -62,7 +62,7 @@ def test_a_file_of_sparse_tables_is_read(tmp_path, samples, header) -> None:
 def test_a_header_that_does_not_fit_is_refused(samples, header, changes, message) -> None:
     header["model"].update(changes)
     header["required_features"].append("transform")
-    header |= {"format": "fhash", "format_version": [1, 6]}
+    header |= {"format": "fhash", "format_version": [2, 0]}
     with pytest.raises(DamagedFileError, match=message):
         validate_header(header)
 
@@ -112,7 +112,6 @@ def test_a_missing_table_is_named(tmp_path, samples, header) -> None:
 
 def test_the_occupancy_must_be_bits(tmp_path, samples, header) -> None:
     arrays = samples.arrays(header)
-    header["required_features"].append("coded-occupancy")
     mask = np.ones(header["model"]["levels"][0], np.uint8)
     with pytest.raises(InputError, match="occupancy/mask is there in a file of sparse tables"):
         write(tmp_path / "a.fhz", header, arrays | {"occupancy/mask": mask})

@@ -9,7 +9,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import zarr
-from sharded_files import NAME, random_values, write_sharded
+from sharded_files import NAME, PATH, random_values, write_sharded
 
 from fhash_formats.container import Container, coding
 from fhash_formats.container.coding import crc32c
@@ -63,7 +63,7 @@ def test_zarr_library_reads_equal(tmp_path, samples, case) -> None:
     values = random_values(shape)
     path = write_sharded(tmp_path / "a.fhz", samples, values, chunk_shape, shard_shape)
     with zarr.storage.ZipStore(path, read_only=True) as store:
-        array = zarr.open_array(store, path=NAME, mode="r")
+        array = zarr.open_array(store, path=PATH, mode="r")
         assert (array.chunks, array.shards) == (chunk_shape, shard_shape)
         np.testing.assert_array_equal(array[...], values)
 
@@ -198,7 +198,7 @@ def test_damage_in_one_inner_chunk_leaves_the_others(sharded_file) -> None:
             container.arrays[NAME].read((slice(2, 7), slice(0, 6))), values[2:]
         )
         with pytest.raises(
-            DamagedFileError, match=f"member {NAME}/c/0/0: inner chunk 0: its CRC-32C"
+            DamagedFileError, match=f"member {PATH}/c/0/0: inner chunk 0: its CRC-32C"
         ):
             container.arrays[NAME].read((slice(0, 1), slice(0, 1)))
 
@@ -220,7 +220,7 @@ def test_hostile_entry_that_is_read_alone(tmp_path, samples, case) -> None:
     (offset, size), message = ENTRIES[case]
     path = write_sharded(tmp_path / "a.fhz", samples, random_values((40,)), (2,), (40,))
     parts = samples.unpack(path.read_bytes())
-    at = [name for name, _ in parts].index(f"{NAME}/c/0")
+    at = [name for name, _ in parts].index(f"{PATH}/c/0")
     name, data = parts[at]
     index = 20 * 16 + 4
     table = [list(entry) for entry in struct.iter_unpack("<2Q", data[-index:-4])]
@@ -234,10 +234,10 @@ def test_hostile_entry_that_is_read_alone(tmp_path, samples, case) -> None:
             container.arrays[NAME].read((slice(16, 18),)), random_values((40,))[16:18]
         )
         tracemalloc.start()
-        with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0: .*{message}"):
+        with pytest.raises(DamagedFileError, match=f"member {PATH}/c/0: .*{message}"):
             container.arrays[NAME].read((slice(18, 20),))
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert peak < 1 << 20
-        with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0: "):
+        with pytest.raises(DamagedFileError, match=f"member {PATH}/c/0: "):
             container.verify()

@@ -48,7 +48,6 @@ def test_the_mask_comes_with_the_values() -> None:
     settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
     masked = coder(settings)
     assert masked.masked
-    assert masked.features == ("mask",)
     coded = encode_tile(wave(), settings, in_coreset=occupied)
     values, mask = masked.decode_masked(memoryview(coded.data))
     assert same(values, coded.decoded)
@@ -80,7 +79,6 @@ def test_a_chunk_is_coded_along_the_axes_that_are_named(settings: TileSettings |
     configuration = {**({} if settings is None else settings.to_dict()), "axes": list(AXES)}
     named = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
     coded = encode_tile(wave(), SETTINGS, Coding(own_settings=settings is None))
-    assert "axes" in named.features
     assert not named.parted
     assert same(named.decode(coded.data), coded.decoded.transpose(order))
     if settings is not None:

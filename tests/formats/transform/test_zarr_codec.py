@@ -246,12 +246,10 @@ def test_unsuitable_configurations_are_refused() -> None:
 
 
 def test_a_codec_is_shown_in_one_short_line() -> None:
-    head = SHARED.to_dict() | {"head": {"array": "mlp/parameters"}}
     for codec, shown in (
         (TransformCodec(max_error=0.5), "TransformCodec(max_error=0.5)"),
         (TransformCodec(reading=True), "TransformCodec(reading=True)"),
         (TransformCodec(settings=SHARED), "TransformCodec(step=0.05)"),
-        (TransformCodec(apart=head), "TransformCodec(step=0.05, head=True)"),
     ):
         assert repr(codec) == shown
 

@@ -27,7 +27,6 @@ from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, pa
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
 from fhash_formats.transform.entropy.trellis import choose_levels
-from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.transform.tile.sections import parse_stream, unpack_settings
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -226,8 +225,6 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
                 )
                 for index in np.ndindex(*array.grid):
                     stream = bytes(array.coded(index))
-                    if array.masks is not None:
-                        stream = join_mask(stream, array.masks.coded(index))
                     own = parse_stream(stream).settings
                     settings = array.settings if own is None else unpack_settings(own)
                     if settings is not None:  # else the stream has no coded integers

@@ -138,22 +138,6 @@ class TileSettings:
             raise InputError(f"an array of {dtype} has no values about the origin {self.origin}")
         return np.dtype(np.int64)
 
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Features that a reader must support besides the codec, by their names in containers."""
-        cross = self.head is not None and self.head.cross
-        used = {
-            "cross": cross,
-            "mask": self.mask is not None,
-            "predictor": self.predictor is not None,
-            "clip": self.clip,
-            "labels": self.labels,
-            "many-labels": self.many_labels,
-            "trellis": self.trellis,
-            "origin": self.origin != 0,
-        }
-        return tuple(name for name, is_used in used.items() if is_used)
-
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without the settings that have their default."""
         result: dict[str, Any] = {

@@ -44,7 +44,9 @@ def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.
     config = EncodeConfig(timings=False, **{"effort": 2, **promise, **changes})
     figures = fhash_codec.encode(values, path, config, force=True)
     with fhash_codec.open(path) as volume:
-        return figures["bytes"], set(volume.info["required_features"]), volume[...]
+        settings = volume.container.arrays["tables/level_1"].settings
+        used = {name for name in ("labels", "many_labels", "mask") if getattr(settings, name)}
+        return figures["bytes"], used, volume[...]
 
 
 def test_labels_take_fewer_bytes_than_xz(tmp_path) -> None:
@@ -148,11 +150,11 @@ def grains(count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("count", "many"), [(256, False), (257, True), (600, True)])
-def test_many_labels_need_their_feature(tmp_path, count, many) -> None:
+def test_many_labels_are_a_setting(tmp_path, count, many) -> None:
     values = grains(count)
     size, features, decoded = encoded(tmp_path, values)
     assert "labels" in features
-    assert ("many-labels" in features) is many
+    assert ("many_labels" in features) is many
     np.testing.assert_array_equal(decoded, values)
     assert 20 * size < values.nbytes
 

@@ -38,8 +38,7 @@ def test_the_occupancy_is_exact_at_every_step(
     selected = [parse_feature(text).select(frame, step) for step, frame in enumerate(source)]
     requested = np.stack([dilate(frame, 1) for frame in selected])
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        clip = ["clip"] if "max_error" in promise else []
-        assert volume.info["required_features"] == ["transform", "mask", *clip, "named"]
+        assert volume.info["required_features"] == ["transform"]
         assert volume.container.arrays["tables/level_1"].masked
         occupied = np.stack([volume.occupancy(t) for t in range(3)])
         values = volume[...]

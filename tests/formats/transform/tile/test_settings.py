@@ -81,9 +81,3 @@ def test_a_missing_key_is_named() -> None:
     del values["center"]
     with pytest.raises(InputError, match="setting center is missing"):
         TileSettings.from_dict(values)
-
-
-def test_features_name_what_a_reader_must_support() -> None:
-    assert SETTINGS.features == ()
-    assert replace(SETTINGS, mask=MaskLevels()).features == ("mask",)
-    assert replace(SETTINGS, trellis=True, offsets=(0,) * 6).features == ("trellis",)
