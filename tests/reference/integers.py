@@ -41,10 +41,8 @@ LANES = 12
 """Weights of a set for magnitudes."""
 BY_LEVEL = DECISIONS * KINDS * LANES
 """First weight of the sets chosen by the expected magnitude, after those chosen by the kind."""
-PLAIN_SIGNS = BY_LEVEL + DECISIONS * 64 * LANES
-"""First weight of signs without a linear predictor."""
-SIGN_SETS = PLAIN_SIGNS + KINDS * LANES
-"""First weight of signs with one; a set has 24."""
+SIGN_SETS = BY_LEVEL + DECISIONS * 64 * LANES
+"""First weight of signs; a set has 24."""
 LINEAR = SIGN_SETS + KINDS * 24
 """First weight of the linear predictors of signs."""
 INPUTS = 96
@@ -102,22 +100,18 @@ class BandNumbers:
 
 def decode_block(data: bytes | memoryview, shape: Sequence[int]) -> npt.NDArray[np.int32]:
     """Integers (t, z, y, x) that were not transformed."""
-    return decode_integers(data, shape, single_band(shape), "contexts")
+    return decode_integers(data, shape, single_band(shape))
 
 
 def decode_integers(
     data: bytes | memoryview,
     shape: Sequence[int],
     bands: Sequence[Band],
-    coder: str,
     two_quantisers: bool = False,
 ) -> npt.NDArray[np.int32]:
-    """Integers (t, z, y, x) of a shape, 0 outside the bands.
-
-    coder: "signs" for linear predictors of signs; "contexts" without.
-    """
+    """Integers (t, z, y, x) of a shape, 0 outside the bands."""
     result = np.zeros(tuple(shape), np.int32)
-    decoder = IntegerDecoder(data, coder, two_quantisers)
+    decoder = IntegerDecoder(data, two_quantisers)
     for band in bands:
         decoder.decode_band(band, result)
     return result
@@ -126,12 +120,10 @@ def decode_integers(
 class IntegerDecoder:
     """The decoder of a tile: the bands known so far, and what was learned from them."""
 
-    def __init__(self, data: bytes | memoryview, coder: str, two_quantisers: bool) -> None:
-        prior = prior_state(coder, two_quantisers)
+    def __init__(self, data: bytes | memoryview, two_quantisers: bool) -> None:
+        prior = prior_state(two_quantisers)
         self.adaptive = Adaptive(data, prior.slots, prior.weights, prior.simples)
-        self.signs = (
-            [LinearSigns(self.adaptive, k) for k in range(KINDS)] if coder == "signs" else []
-        )
+        self.signs = [LinearSigns(self.adaptive, kind) for kind in range(KINDS)]
         self.two_quantisers = two_quantisers
         self.state = 0
         self.known: list[BandNumbers] = []
@@ -281,20 +273,8 @@ class IntegerDecoder:
 
     def sign(self, t: int, z: int, y: int, x: int, at: int) -> int:
         """Whether the integer at a vertex is negative."""
-        if self.signs:
-            inputs = self.sign_inputs(t, z, y, x, at)
-            return self.signs[self.kind].decode(inputs, t, y, x)
-        left, left2, up, up2, below, before = (
-            sign_class(self.present.numbers[at + self.present.offset(*by)])
-            for by in (*LEFT, (0, 0, -1, 0), *ABOVE2, (0, -1, 0, 0), (-1, 0, 0, 0))
-        )
-        contexts = (
-            self.kind * 27 + in_threes(left, up, before),
-            self.kind * 81 + in_threes(left, left2, up, up2),
-            self.kind * 27 + in_threes(before, below, left),
-        )
-        slots = [start + context for start, context in zip(SIGN_STARTS, contexts, strict=False)]
-        return self.adaptive.mixed(slots, (PLAIN_SIGNS + self.kind * LANES,), most_uses=255)
+        inputs = self.sign_inputs(t, z, y, x, at)
+        return self.signs[self.kind].decode(inputs, t, y, x)
 
     def sign_inputs(self, t: int, z: int, y: int, x: int, at: int) -> list[int]:
         """The 96 inputs of a linear predictor of a sign: logarithms with signs."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reference.bands import bands_of, single_band
+from reference.bands import bands_of
 from reference.head import apply_head, unpack_head
 from reference.integers import decode_block, decode_integers
 from reference.labels import unpack_labelled
@@ -152,13 +152,11 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by transform: before head and residual, and in their type."""
     settings, shape, number = stream.settings, stream.shape, stream.working.type
     axes = [axis_of(settings["transform"][name], base64.b64decode) for name in "tzyx"]
-    coded, coder = stream.sections["coefficients"], settings.get("coder", "contexts")
-    bands, trellis = bands_of(axes, shape), settings.get("trellis", False)
-    integers = decode_integers(coded, shape, bands, coder, trellis)
+    coded, trellis = stream.sections["coefficients"], settings.get("trellis", False)
+    integers = decode_integers(coded, shape, bands_of(axes, shape), trellis)
     residual = None
     if "residual" in stream.sections:
-        coder = settings.get("residual_coder", "contexts")
-        residual = decode_integers(stream.sections["residual"], shape, single_band(shape), coder)
+        residual = decode_block(stream.sections["residual"], shape)
     check(integers, stream.digest, residual)
     with np.errstate(all="ignore"):
         coefficients = dequantised(integers, settings, stream.working)
