@@ -1,7 +1,7 @@
 """The native extensions: C++ of `fhash_formats.native`, `fhash_codec.native`, its `network`.
 
-The rest of the build is described in pyproject.toml. The extensions are optional. Without a C++17
-compiler the build says so and goes on: the package then computes the same in numpy, more slowly.
+The rest of the build is described in pyproject.toml. Without a C++17 compiler the installation
+fails in one line.
 """
 
 import os
@@ -12,6 +12,7 @@ from typing import Any
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.errors import BaseError, CCompilerError, CompileError
 
 FORMATS = Path("formats/fhash_formats/native")
 """Sources of the file format's library; the codec's library includes core.hpp and guard.hpp."""
@@ -59,6 +60,15 @@ class BuildNative(build_ext):
         self.compiler.compile = compile_each
 
     def _build_extensions(self) -> None:
+        named = getattr(self.compiler, "compiler_cxx", None) or ["cl.exe"]
+        try:
+            self._build_with_flags()
+        except (CCompilerError, BaseError) as error:
+            raise CompileError(
+                f"fhash needs a C++17 compiler, and '{named[0]}' did not build it: {error}"
+            ) from error
+
+    def _build_with_flags(self) -> None:
         for extension in self.extensions:
             msvc = self.compiler.compiler_type == "msvc"
             own = extension.extra_compile_args
@@ -82,7 +92,6 @@ def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension
         define_macros=[("Py_LIMITED_API", "0x030B0000")],
         py_limited_api=True,
         language="c++",
-        optional=True,
     )
 
 

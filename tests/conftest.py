@@ -15,7 +15,8 @@ import pytest
 if TYPE_CHECKING:
     from range_server import RangeServer
 
-sys.path.insert(0, str(Path(__file__).parent / "helpers"))
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE / "helpers"), str(HERE)]  # helpers, and the package `reference`
 
 # The tests' models are tiny: a second thread costs more than it brings, above all where several
 # test runs share a machine.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
@@ -35,9 +34,7 @@ from fhash_codec.header import (
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
-from fhash_formats import native
 from fhash_formats.container import ContainerWriter, coordinate_features
-from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Series
 
 HEADER_BYTES = 750
@@ -64,16 +61,7 @@ def encode_compact(
     mask: booleans (t, z, y, x) or (z, y, x), one more feature.
     complete: measures what is written, and returns a header with its quality. Its second argument
         are the tiles whose decoded values are known.
-
-    Warns (FhashWarning) where the native library is missing.
     """
-    if native.library() is None:
-        warnings.warn(
-            "the native core is not there (no compiler at installation?): coding takes 2 to 3"
-            " times as long with numba, some 1000 times as long without; the bytes are the same",
-            FhashWarning,
-            stacklevel=3,
-        )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
     gaps = selection.extent.fraction < 1

@@ -39,11 +39,8 @@ K1 = 0.01
 K2 = 0.03
 """Constant of the variance, as a fraction of the range (Wang et al. 2004)."""
 
-TILE = (32, 32, 32)
-"""Vertices (z, y, x) that numpy compares at once: with the window around, they fit the cache."""
-
-NATIVE_TILE = (64, 32, 64)
-"""Vertices (z, y, x) that native code compares at once."""
+TILE = (64, 32, 64)
+"""Vertices (z, y, x) that native code (fhash_codec/native/quality.cpp) compares at once."""
 
 BUDGET = 2**25
 """Vertices of all steps that are measured together, by default."""
@@ -96,8 +93,7 @@ def ssim(
         mask = None
     margins = [RADIUS if mask is None and size >= WINDOW else 0 for size in original.shape]
     frames = _Frames(original, decoded, data_range, mask)
-    tile_shape = TILE if native.library() is None else NATIVE_TILE
-    spans = zip(margins, original.shape, tile_shape, strict=True)
+    spans = zip(margins, original.shape, TILE, strict=True)
     tiles = list(product(*(_cuts(margin, size - margin, limit) for margin, size, limit in spans)))
     results: dict[Tile, tuple[float, int]] = {}
 
@@ -134,35 +130,25 @@ class _Frames:
         data_range: float,
         mask: Mask | None,
     ) -> None:
-        self.original, self.decoded, self.mask = original, decoded, mask
         self.scale = np.float64(power_of_two(data_range))
         self.c1, self.c2 = (K1 * data_range * self.scale) ** 2, (K2 * data_range * self.scale) ** 2
-        self._library = native.library()
-        if self._library is not None:
-            narrow = decoded.dtype == np.float32 and (
-                original.dtype == np.float32 or original.dtype.itemsize <= 2
-            )
-            kind = np.float32 if narrow else np.float64
-            self.original, self.decoded = (
-                np.ascontiguousarray(frame, dtype=kind) for frame in (original, decoded)
-            )
-            self.mask = None if mask is None else np.ascontiguousarray(mask)
+        narrow = decoded.dtype == np.float32 and (
+            original.dtype == np.float32 or original.dtype.itemsize <= 2
+        )
+        kind = np.float32 if narrow else np.float64
+        self.original, self.decoded = (
+            np.ascontiguousarray(frame, dtype=kind) for frame in (original, decoded)
+        )
+        self.mask = None if mask is None else np.ascontiguousarray(mask)
         count, total = 0, 0.0
         for piece in pieces(self.original):
-            if piece.dtype not in (np.float32, np.float64):
-                piece = piece.astype(np.float64)
             piece_count, _, _, piece_total = range_and_sum(piece, float(self.scale))
             count, total = count + piece_count, total + piece_total
         self.mean = np.float64(total / count if count else 0.0)
 
     def similarity(self, tile: Tile) -> tuple[float, int]:
         """Sum of the similarity over a tile, and the number of vertices in the sum."""
-        return self._portable(tile) if self._library is None else self._native(self._library, tile)
-
-    def _native(self, library: ctypes.CDLL, tile: Tile) -> tuple[float, int]:
-        function = (
-            library.fhash_ssim_f32 if self.original.dtype == np.float32 else library.fhash_ssim_f64
-        )
+        function = getattr(native.library(), f"fhash_ssim_f{8 * self.original.dtype.itemsize}")
         total = ctypes.c_double()
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(
@@ -181,36 +167,6 @@ class _Frames:
             raise MemoryError(f"no memory to compare the frames' tile {tile}")
         return total.value, count
 
-    def _portable(self, tile: Tile) -> tuple[float, int]:
-        inner = tuple(slice(start, stop) for start, stop in tile)
-        counted = np.isfinite(self.original[inner])
-        if self.mask is not None:
-            counted &= self.mask[inner]
-        if not counted.any():
-            return 0.0, 0
-        a, b = self._read(tile)
-        mean_a, mean_b, squares, products = _filtered(np.stack([a, b, a * a + b * b, a * b]))
-        covariance = products - mean_a * mean_b
-        variances = squares - mean_a * mean_a - mean_b * mean_b
-        mean_a += self.mean
-        mean_b += self.mean
-        above = (2 * mean_a * mean_b + self.c1) * (2 * covariance + self.c2)
-        below = (mean_a * mean_a + mean_b * mean_b + self.c1) * (variances + self.c2)
-        return float((above / below)[counted].sum()), int(counted.sum())
-
-    def _read(self, tile: Tile) -> tuple[Doubles, Doubles]:
-        """Both frames in a tile and RADIUS vertices around it, scaled and shifted."""
-        a = _around(self.original, tile) * self.scale - self.mean
-        b = _around(self.decoded, tile) * self.scale - self.mean
-        missing = ~np.isfinite(a)
-        if missing.any():
-            a[missing] = b[missing] = 0.0
-        if self.mask is not None:
-            b = np.where(_around(self.mask, tile), b, a)
-        if not np.isfinite(b).all():
-            raise InputError(_NOT_FINITE)
-        return a, b
-
 
 def _cuts(start: int, stop: int, limit: int) -> list[tuple[int, int]]:
     """Spans of at most `limit` vertices that split an axis evenly."""
@@ -219,45 +175,9 @@ def _cuts(start: int, stop: int, limit: int) -> list[tuple[int, int]]:
     return list(pairwise(ends))
 
 
-def _around(values: npt.NDArray[Any], tile: Tile) -> npt.NDArray[Any]:
-    """The values of a tile and of RADIUS vertices more on every side.
-
-    They are mirrored beyond the frame, with the end vertices repeated: d c b a | a b c d | d c b a.
-    """
-    ends = [
-        (max(start - RADIUS, 0), min(stop + RADIUS, size))
-        for (start, stop), size in zip(tile, values.shape, strict=True)
-    ]
-    around = values[tuple(slice(*end) for end in ends)]
-    for axis, ((start, stop), (first, _), size) in enumerate(
-        zip(tile, ends, values.shape, strict=True)
-    ):
-        if around.shape[axis] < stop - start + 2 * RADIUS:
-            index = np.arange(start - RADIUS, stop + RADIUS) % (2 * size)
-            around = around.take(np.minimum(index, 2 * size - 1 - index) - first, axis=axis)
-    return around
-
-
-@lru_cache(maxsize=64)
-def _window(length: int) -> Doubles:
-    """The Gaussian window as a banded matrix (length, length + 2 RADIUS)."""
-    matrix = np.zeros((length, length + 2 * RADIUS))
-    for row in range(length):
-        matrix[row, row : row + WINDOW] = _weights()
-    return matrix
-
-
 @lru_cache(maxsize=1)
 def _weights() -> Doubles:
     """The Gaussian window along one axis (WINDOW,); its sum is 1."""
     weights = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
     normalised: Doubles = weights / weights.sum()
     return normalised
-
-
-def _filtered(fields: Doubles) -> Doubles:
-    """Windowed means (fields, z, y, x) of fields that reach RADIUS further on every side."""
-    z, y, x = (_window(length - 2 * RADIUS) for length in fields.shape[1:])
-    planes = y @ (fields @ x.T)
-    result: Doubles = (z @ planes.swapaxes(1, 2)).swapaxes(1, 2)
-    return result

@@ -1,9 +1,10 @@
 """Range, sum and squared errors of many values.
 
-They are computed by native code (fhash_codec/native/quality.cpp), or by numpy with the same bits.
-Both add in one fixed order: value i of a piece of PIECE values goes to lane i % LANES, and each
-lane is summed in order, then the lanes, then the pieces. The order is fixed because these figures
-steer the encoder, and its bytes must not depend on the machine.
+They are computed by native code (fhash_codec/native/quality.cpp); by numpy for 64-bit integers,
+whose differences float64 would round. Both add in one fixed order: value i of a piece of PIECE
+values goes to lane i % LANES, and each lane is summed in order, then the lanes, then the pieces.
+The order is fixed because these figures steer the encoder, and its bytes must not depend on the
+machine.
 """
 
 from __future__ import annotations
@@ -54,22 +55,7 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
     it is added to the sum. A sum beyond float64 is infinite.
     """
     flat = np.ascontiguousarray(values).reshape(-1)
-    library = native.library()
-    if library is not None:
-        count, low, high, total = _call(
-            library, "scan", flat, ctypes.c_int64(flat.size), factor, results=3
-        )
-        return count, low + 0.0, high + 0.0, total
-    count, low, high, total = 0, np.inf, -np.inf, 0.0
-    for start in range(0, flat.size, PIECE):
-        piece = flat[start : start + PIECE]
-        is_finite = np.isfinite(piece)
-        finite = piece[is_finite]
-        if finite.size:
-            count += finite.size
-            low, high = min(low, float(finite.min())), max(high, float(finite.max()))
-        with np.errstate(over="ignore"):
-            total += _lane_sum(np.where(is_finite, piece, 0).astype(np.float64) * factor)
+    count, low, high, total = _call("scan", flat, ctypes.c_int64(flat.size), factor, results=3)
     return count, low + 0.0, high + 0.0, total
 
 
@@ -101,18 +87,13 @@ def error_sums(
     The number is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
     compared exactly; float64 would round their differences to 0.
     """
-    library = native.library()
-    if (
-        library is not None
-        and original.dtype == decoded.dtype
-        and original.dtype in (np.float32, np.float64)
-    ):
-        return _native_sums(library, original, decoded, mask, scale, bulk)
+    if original.dtype == decoded.dtype and original.dtype in (np.float32, np.float64):
+        return _native_sums(original, decoded, mask, scale, bulk)
     exact = is_wide_integer(original.dtype)
     total = ErrorSums(0, 0.0, 0.0)
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
     for source, result, counted in zip(pieces(original), pieces(decoded), masks, strict=True):
-        if library is not None and not exact:
+        if not exact:
             sums = error_sums(
                 source.astype(np.float64),
                 result.astype(np.float64),
@@ -136,25 +117,16 @@ def histogram(
     A value goes to bin (value * scale - low) * factor of `counts`, rounded down, and a value beyond
     either end to the bin there: so the order of the values stays. Computed in float64.
     """
-    library = native.library()
     native_type = values.dtype in (np.float32, np.float64)
     for piece in pieces(values):
-        wide = piece if native_type else piece.astype(np.float64)
-        if library is not None:
-            wide = np.ascontiguousarray(wide)
-            function = getattr(library, f"fhash_histogram_f{wide.dtype.itemsize * 8}")
-            numbers = (ctypes.c_double(number) for number in (scale, low, factor))
-            size, bins = ctypes.c_int64(wide.size), ctypes.c_int64(counts.size)
-            function(_pointer(wide), size, *numbers, bins, _pointer(counts))
-        else:
-            wide = wide[np.isfinite(wide)].astype(np.float64)
-            with np.errstate(over="ignore"):
-                places = np.clip((wide * scale - low) * factor, 0, counts.size - 1)
-            counts += np.bincount(places.astype(np.int64), minlength=counts.size)
+        wide = np.ascontiguousarray(piece if native_type else piece.astype(np.float64))
+        function = getattr(native.library(), f"fhash_histogram_f{wide.dtype.itemsize * 8}")
+        numbers = (ctypes.c_double(number) for number in (scale, low, factor))
+        size, bins = ctypes.c_int64(wide.size), ctypes.c_int64(counts.size)
+        function(_pointer(wide), size, *numbers, bins, _pointer(counts))
 
 
 def _native_sums(
-    library: ctypes.CDLL,
     original: Values,
     decoded: Values,
     mask: Mask | None,
@@ -167,10 +139,10 @@ def _native_sums(
     size = ctypes.c_int64(original.size)
     arguments = (original, _pointer(decoded), _pointer(mask), size, float(scale))
     if bulk is None:
-        return ErrorSums(*_call(library, "errors", *arguments, results=2))
+        return ErrorSums(*_call("errors", *arguments, results=2))
     low, high = map(float, bulk)
     count, squares, largest, bulk_squares, bulk_count = _call(
-        library, "bulk_errors", *arguments, low, high, results=4
+        "bulk_errors", *arguments, low, high, results=4
     )
     if count < 0:
         return ErrorSums(-1, 0.0, 0.0)
@@ -188,14 +160,12 @@ def _joined(first: ErrorSums, second: ErrorSums) -> ErrorSums:
     )
 
 
-def _call(
-    library: ctypes.CDLL, name: str, values: Values, *arguments: Any, results: int
-) -> tuple[Any, ...]:
+def _call(name: str, values: Values, *arguments: Any, results: int) -> tuple[Any, ...]:
     """The count that a native function returns, and the `results` numbers that it writes.
 
     name: `scan`, `errors` or `bulk_errors`; the function of the type of the values is called.
     """
-    function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
+    function = getattr(native.library(), f"fhash_{name}_f{values.dtype.itemsize * 8}")
     output = (ctypes.c_double * results)()
     numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
     return function(_pointer(values), *numbers, output), *output
@@ -225,7 +195,7 @@ def _numpy_sums(
     scale: np.float64,
     bulk: tuple[float, float] | None,
 ) -> ErrorSums:
-    """`error_sums` of one-dimensional arrays by numpy."""
+    """`error_sums` of one-dimensional arrays of 64-bit integers."""
     total = ErrorSums(0, 0.0, 0.0)
     for start in range(0, original.size, PIECE):
         piece = slice(start, start + PIECE)

@@ -1,10 +1,7 @@
 """Loader of the codec's native library: the C++ of the ray marcher, of the quality figures,
 of the products of lines and of the training of heads.
 
-It is a library beside that of `fhash_formats.native`, loaded in the same way and switched off by
-the same `FHASH_NATIVE=0`. Each of the two may be missing without the other: whoever calls a
-function of a library also has a way without it. Figures and heads then have the same bits; pictures
-agree within rounding.
+It is a library beside that of `fhash_formats.native`, loaded in the same way.
 """
 
 from __future__ import annotations
@@ -67,8 +64,8 @@ PROTOTYPES: Prototypes = {
 _FOLDER = Path(__file__).parent
 
 
-def library() -> ctypes.CDLL | None:
-    """The native library of this package, or None; see `fhash_formats.native.load_library`."""
+def library() -> ctypes.CDLL:
+    """The native library of this package; see `fhash_formats.native.load_library`."""
     return load_library(
         _FOLDER, "_codec", ABI_VERSION, PROTOTYPES, version_symbol="fhash_codec_abi_version"
     )

@@ -1,6 +1,5 @@
 // Inputs of the neighbourhood head for voxels drawn from a tile. compact/choices/head_samples.py
-// states where they go, and computes the same numbers in numpy; head_portable.py in fhash_formats
-// states what they are.
+// states where they go; they are the numbers that head.cpp of fhash_formats computes.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

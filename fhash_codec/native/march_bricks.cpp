@@ -1,5 +1,5 @@
 // The value ranges of a frame's bricks, their distances to the nearest that matters, and the
-// visible cells in them. fhash_codec/rendering/task/bricks.py has the portable twins.
+// visible cells in them.
 #include <algorithm>
 #include <cstdint>
 #include <cstring>

@@ -1,5 +1,4 @@
-// The light that the volume takes away. fhash_codec/rendering/task/light.py has the portable twins,
-// which agree within rounding.
+// The light that the volume takes away.
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>

@@ -1,6 +1,5 @@
 // What a frame's gradients give before rays are marched: smoother values to shade by, and factors
-// of opacity by gradient. fhash_codec/rendering/task/smoothing.py and grading.py have the portable
-// twins, which agree within rounding.
+// of opacity by gradient.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

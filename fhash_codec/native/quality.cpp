@@ -1,9 +1,9 @@
 // Figures of how far decoded values are from the original: sums of squared errors, and structural
 // similarity (Wang et al. 2004).
 //
-// fhash_scan and fhash_errors add in a stated order, so that their numpy twins give the same bits:
+// fhash_scan and fhash_errors add in a stated order, so that every machine gets the same bits:
 // value i of a piece of PIECE values goes to lane i % LANES; the lanes are added up in order, then
-// the pieces. The similarity agrees with its numpy twin within rounding.
+// the pieces.
 #include <algorithm>
 #include <cfloat>
 #include <cmath>

@@ -1,6 +1,5 @@
 // Training of the neighbourhood head: Adam on the squared errors of batches of voxels.
-// compact/choices/head_network.py states the arithmetic, and head_network_portable.py computes the
-// same numbers in numpy.
+// compact/choices/head_network.py states the arithmetic.
 #include "train_head.hpp"
 
 #include "guard.hpp"

@@ -18,9 +18,8 @@ promise, both by construction and on every machine:
   fixed places, and a block in products of exactly `COLUMNS` columns. So a vertex always lies in the
   same column of a product of the same shape. Where few vertices of a block are asked for, they move
   to fewer products (`run_some`), each within its column.
-* `PointwiseLayers` (`pointwise.py`), for samples at free positions (`points.py`, rendering), which
-  may come in any column. It adds without BLAS. So does the native library (`native_points.py`),
-  which replaces it where it is built.
+* The native library (`native_points.py`), for samples at free positions (`points.py`, rendering),
+  which may come in any order. It adds without BLAS.
 
 The bits may differ between machines, because their BLAS libraries and their vectors do.
 """

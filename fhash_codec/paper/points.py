@@ -1,7 +1,6 @@
 """Decoding at points between vertices, with the analytic gradient.
 
-The native library evaluates the points (native_points.py); where it is missing, numpy does, with
-the same values within rounding.
+The native library evaluates the points (native_points.py).
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from fhash_codec.native import network as native
 from fhash_codec.paper.native_points import NativePoints
 from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
 from fhash_codec.paper.point_tables import Patch, PointTables, locate
-from fhash_codec.paper.pointwise import PointwiseLayers
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -80,8 +78,8 @@ def sample_points(
     * On a ReLU's kink they are those of its flat side.
 
     Points that lie close together share one read of a part of each table. A point has the same
-    bits whatever other points are given with it, in whatever order (pointwise.py,
-    native_points.py). Where all points share one time, the tables are interpolated in time once.
+    bits whatever other points are given with it, in whatever order (native_points.py). Where all
+    points share one time, the tables are interpolated in time once.
 
     Args:
         network: the trained network.
@@ -128,14 +126,8 @@ class PointSampler:
             key_index: the time of all points, at which the tables are interpolated once. The
                 points' own time is then 0, and their derivative by time.
         """
-        library = native.library()
-        path = 0 if library is None else native.best_path(library)
-        self._native: NativePoints | None = None
-        if library is not None and path:
-            points = NativePoints(library, tables, path)
-            self._native = points if key_index is None else points.at(key_index)
-        else:
-            self._tables = tables if key_index is None else tables.at(key_index)
+        points = NativePoints(native.library(), tables)
+        self._native = points if key_index is None else points.at(key_index)
 
     def sample(
         self,
@@ -157,10 +149,7 @@ class PointSampler:
             for chunk in chunks:
                 places = [column[chunk] if len(column) > 1 else column for column in columns]
                 some = None if slopes is None else slopes[chunk]
-                if self._native is None:
-                    _evaluate(self._tables, places, values[chunk], some)
-                else:
-                    self._native.evaluate(places, values[chunk], some)
+                self._native.evaluate(places, values[chunk], some)
 
         starts = range(0, len(values), CHUNK_POINTS)
         share_out(evaluate, [slice(start, start + CHUNK_POINTS) for start in starts], threads)
@@ -219,48 +208,14 @@ def _between(pair: Floats, after_weight: Floats) -> Floats:
     return result
 
 
-def _evaluate(
-    tables: PointTables,
-    columns: Sequence[npt.NDArray[np.float64]],
-    values: Floats,
-    slopes: Floats | None,
-) -> None:
-    """Write values (n,) and derivatives (n, 4) at points by numpy; `PointSampler.sample`."""
-    points, count = np.stack(np.broadcast_arrays(*columns)), len(values)
-    if points.shape[1] != count:
-        points = np.broadcast_to(points, (4, count))
-    layers = PointwiseLayers(tables.network, count)
-    by_place = _encode(tables, points, layers.inputs, gradient=slopes is not None)
-    values[:] = layers.run()[:count]
-    if slopes is not None:
-        slopes[:] = layers.slopes(by_place)[:, :count].T
-
-
-def _encode(
-    tables: PointTables,
-    points: npt.NDArray[np.float64],
-    inputs: Floats,
-    *,
-    gradient: bool = False,
-) -> Floats:
-    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`.
-
-    Return their derivatives (4, inputs, columns) by the position; with `gradient` unset, none.
-    """
+def _encode(tables: PointTables, points: npt.NDArray[np.float64], inputs: Floats) -> None:
+    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`."""
     size, count = tables.network.embedding_size, points.shape[1]
-    slopes = np.zeros((4 if gradient else 0, len(inputs) - 1, inputs.shape[1]), np.float32)
-    # Tables of one time have no corners after it.
-    first_axis = 1 if tables.still else 0
     for level, (patch, resolution) in enumerate(zip(tables.patches, tables.levels, strict=True)):
-        rows = slice(level * size, (level + 1) * size)
-        before, after_weights, pace = locate(tables.sizes, resolution, points)
+        before, after_weights, _ = locate(tables.sizes, resolution, points)
         corners = _corners(patch, before, resolution)
-        if tables.still:
-            corners = corners[0]
-        inputs[rows, :count], changes = interpolate(corners, after_weights[first_axis:], gradient)
-        for axis, change in enumerate(changes, start=first_axis):
-            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows, :count])
-    return slopes
+        rows = slice(level * size, (level + 1) * size)
+        inputs[rows, :count] = interpolate(corners, after_weights, gradient=False)[0]
 
 
 def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float64]], int]:

@@ -1,7 +1,6 @@
 """Marching rays through a frame of values.
 
-Rays are marched natively in packets, or, more slowly, streamed in numpy where there is no native
-library.
+Rays are marched natively in packets. Frames too large for that are streamed in numpy.
 """
 
 from __future__ import annotations
@@ -59,13 +58,12 @@ def march(
 
 
 def _march(frame: Frame, task: Task, bricks: Bricks, threads: int | None) -> Marched:
-    """March natively if possible, else streamed."""
-    library = native.library()
-    if library is None or bricks.values.size > MAX_VALUES:
+    """March natively, or streamed where the frame is too large."""
+    if bricks.values.size > MAX_VALUES:
         streamed = stream(FrameField(frame, task.rays.grid, bricks), task, adaptive=True)
         # Looking up a decoded frame is not an evaluation of the model.
         return dataclasses.replace(streamed, counters={**streamed.counters, "evaluations": 0})
-    return march_native(library, frame, task, bricks, threads)
+    return march_native(native.library(), frame, task, bricks, threads)
 
 
 def _over(front: Marched, back: Marched) -> Marched:

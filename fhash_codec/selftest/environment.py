@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 
-import fhash_codec.native as codec_native
-import fhash_formats.native as formats_native
 from fhash_codec.training.devices import choose_device, has_torch
 from fhash_formats.support.threads import usable_threads
 
@@ -26,21 +24,15 @@ def describe_machine() -> str:
         f"torch {version('torch')}" if has_torch() else "no torch",
         f"{platform.system()} {platform.machine()}",
         f"{usable_threads()} processors",
-        "native core" if native_code() else "without the native core",
         "CUDA" if has_torch() and choose_device("auto").type == "cuda" else "no CUDA",
     ]
     return ", ".join(facts)
 
 
-def native_code() -> bool:
-    """Whether both native libraries are there: that of the file format and that of the codec."""
-    return formats_native.library() is not None and codec_native.library() is not None
-
-
 @contextmanager
 def environment(**variables: str) -> Iterator[None]:
-    """Sets environment variables of this process, such as FHASH_NATIVE and FHASH_THREADS, within a
-    `with` block.
+    """Sets environment variables of this process, such as FHASH_THREADS, within a `with`
+    block.
 
     Not for several threads at once: the environment belongs to the process.
     """

@@ -13,7 +13,6 @@ from click.testing import Result
 
 from fhash_cli import gallery
 from fhash_cli.gallery import commands, page
-from fhash_codec import native
 from fhash_codec.demo.gallery import PICTURES
 
 Fhash = Callable[..., Result]
@@ -28,7 +27,6 @@ def test_the_page_in_docs_is_that_of_the_command() -> None:
         assert 1000 < path.stat().st_size < MAX_BYTES
 
 
-@pytest.mark.skipif(native.library() is None, reason="marched natively")
 def test_the_commands_of_the_page_give_its_pictures(
     fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "formats"), str(ROOT / "cli"), str(Path(__file__).parent)]
-NEEDED = ("zarr", "numcodecs", "google_crc32c")
+NEEDED = ("zarr", "numcodecs")
 """Packages without which no file can be written."""
 FHASH = "import sys; from fhash_cli.main import main; sys.argv[0] = 'fhash'; sys.exit(main())"
 """Program of the command line, which need not be installed."""

@@ -14,7 +14,7 @@ import fhash_codec
 SCRIPT = Path(__file__).parent / "run.py"
 WITHOUT_ZARR = """
 import runpy, sys
-for name in ("zarr", "numcodecs", "google_crc32c", "xarray", "h5netcdf"):
+for name in ("zarr", "numcodecs", "xarray", "h5netcdf"):
     sys.modules[name] = None
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -15,7 +18,7 @@ LIBRARIES = (
     "fhash_codec/native/_codec.abi3.so",
     "fhash_codec/native/network/_network.abi3.so",
 )
-HEAVY = ("torch", "vtkmodules", "matplotlib", "numba", "hdf5plugin", "skimage", "dask")
+HEAVY = ("torch", "vtkmodules", "matplotlib", "hdf5plugin", "skimage", "dask")
 """Packages of the extras, which a plain install leaves out."""
 
 
@@ -39,6 +42,19 @@ def test_the_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> No
         "True",
         str(site / "fhash_codec" / "__init__.py"),
     ]
+
+
+def test_without_a_compiler_the_installation_fails_in_one_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "setup.py", "-q", "build_ext", "-b", tmp_path / "b", "-t", tmp_path / "t"],
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "CC": "no-gcc", "CXX": "no-g++"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("error: fhash needs a C++17 compiler, and 'no-g++' did not build it")
 
 
 def test_the_wheel_holds_the_stripped_abi3_libraries(wheel: Path) -> None:

@@ -81,12 +81,8 @@ def test_golden_containers_decode_to_their_values(name: str) -> None:
         volume.verify()
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("name", COMPACT)
-def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
-    name: str, native: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", native)
+def test_compact_goldens_decode_to_the_same_bits(name: str) -> None:
     with (
         np.load(HERE / f"{name}.npz") as expected,
         fhash_codec.open(HERE / f"{name}.fhz") as volume,
@@ -94,7 +90,6 @@ def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
         np.testing.assert_array_equal(volume[...], expected["whole"])
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize(
     ("name", "variable"),
     [
@@ -103,9 +98,8 @@ def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
     ],
 )
 def test_variables_files_that_grew_and_parts_decode_to_their_values(
-    name: str, variable: str | None, native: str, monkeypatch: pytest.MonkeyPatch
+    name: str, variable: str | None
 ) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", native)
     start = f"{variable}:" if variable else ""
     with (
         np.load(HERE / f"{name}.npz") as expected,

@@ -1,50 +1,28 @@
-"""Labels, clipped values and the training of heads: any numbers, on both engines.
+"""Labels and clipped values: any numbers.
 
-Tiles of labels come back bit by bit, clipped values lie in their range and within their bound, and
-the native and the portable engine give the same bits.
+Tiles of labels come back bit by bit, clipped values lie in their range and within their bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import numpy.typing as npt
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import NUMBERS, Draw, looking
 
-from fhash_codec import native as codec_native
-from fhash_codec.compact.choices.head_network import Network, adam_factors
-from fhash_codec.compact.choices.head_samples import Batches
-from fhash_formats import native
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels, encode_labels
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.head.inputs import INPUTS
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.labelled import build_labelled_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
-NATIVE = pytest.mark.skipif(
-    native.library() is None or codec_native.library() is None,
-    reason="the native library was not built here",
-)
 _T, _Z, _Y, _X = (AxisTransform(kind="5/3", depth=1) for _ in range(4))
 SPEC = TransformSpec(axes=(_T, _Z, _Y, _X))
 SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 3), st.integers(1, 4), st.integers(1, 20))
-
-
-@contextmanager
-def portable() -> Iterator[None]:
-    """Use the portable engine within a block."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FHASH_NATIVE", "0")
-        yield
 
 
 @st.composite
@@ -59,30 +37,14 @@ def labels(draw: Draw) -> tuple[npt.NDArray[np.uint8], int]:
     return np.where(alone, random.integers(0, count, shape), regions).astype(np.uint8), count
 
 
-@NATIVE
 @looking(20)
 @given(drawn=labels())
-def test_any_labels_have_the_same_bytes_on_both_engines(
+def test_any_labels_come_back(
     drawn: tuple[npt.NDArray[np.uint8], int],
 ) -> None:
     source, count = drawn
     data = encode_labels(source, count)
     np.testing.assert_array_equal(decode_labels(data, count, source.shape), source)
-    with portable():
-        assert encode_labels(source, count) == data
-        np.testing.assert_array_equal(decode_labels(data, count, source.shape), source)
-
-
-@NATIVE
-@looking(20)
-@given(data=st.binary(max_size=80), shape=SHAPES, count=st.integers(1, MAX_LABELS))
-def test_any_bytes_are_the_same_labels_on_both_engines(
-    data: bytes, shape: tuple[int, ...], count: int
-) -> None:
-    decoded = decode_labels(data, count, shape)
-    assert int(decoded.max()) < count
-    with portable():
-        np.testing.assert_array_equal(decode_labels(data, count, shape), decoded)
 
 
 @looking(60)
@@ -156,47 +118,3 @@ def test_clipped_values_lie_in_their_range_and_bound(
     assert decoded.min() >= values.min()
     assert decoded.max() <= values.max()
     assert np.abs(decoded.astype(np.float64) - values.astype(np.float64)).max() <= error
-
-
-@NATIVE
-@looking(12, 400)
-@given(
-    looked_at=st.sampled_from([1, 9]),
-    widths=st.tuples(st.integers(1, 9), st.integers(1, 9)),
-    as_in_file=st.booleans(),
-    largest=st.sampled_from([1, 300, 4095]),
-    exponent=st.integers(-30, 6),
-    rate=st.sampled_from([0.0, 1e-3, 0.5, 100.0]),
-    seed=st.integers(0, 2**32),
-)
-def test_any_training_has_the_same_bits_on_both_engines(
-    looked_at: int,
-    widths: tuple[int, int],
-    as_in_file: bool,
-    largest: int,
-    exponent: int,
-    rate: float,
-    seed: int,
-) -> None:
-    random = np.random.default_rng(seed)
-    size, limit = (2, 2 * 64), 1 << 30
-    shifts = random.integers(0, 28, size, np.int32)
-    voxels = Batches(
-        inputs=random.integers(-largest, largest + 1, (2, 2, INPUTS, looked_at, 64), np.int16),
-        targets=random.integers(-limit, limit, size, np.int32) >> shifts,
-        lowest=-(random.integers(0, limit, size, np.int32) >> 10),
-        highest=random.integers(0, limit, size, np.int32) >> 10,
-    )
-    start = np.random.default_rng(seed)
-    one, other = (Network(widths, looked_at, np.random.default_rng(seed)) for _ in range(2))
-    scale = 2.0**exponent * start.uniform(0.5, 1)
-    factors = adam_factors(np.full(3, rate))
-    for network in (one, other):
-        network.parameters[:] = np.clip(network.parameters * scale, -64, 64)
-    one.learn(voxels, 1, *factors, as_in_file=as_in_file)
-    sums = one.squared_errors(voxels, as_in_file=as_in_file)
-    with portable():
-        other.learn(voxels, 1, *factors, as_in_file=as_in_file)
-        assert other.squared_errors(voxels, as_in_file=as_in_file) == sums
-    for name in ("parameters", "means", "squares"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))

@@ -1,7 +1,4 @@
-"""The transform and its coder keep their bound for any numbers of any shape.
-
-The native and the portable engine write the same bytes.
-"""
+"""The transform and its coder keep their bound for any numbers of any shape."""
 
 from __future__ import annotations
 
@@ -10,19 +7,16 @@ import math
 from fractions import Fraction
 
 import numpy as np
-import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import Draw, arrays, looking, same
 
-from fhash_formats import native
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.axes.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.coder import (
     MAX_INTEGER,
     decode_block,
@@ -32,10 +26,6 @@ from fhash_formats.transform.entropy.coder import (
 )
 from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
-
-NATIVE = pytest.mark.skipif(
-    native.library() is None, reason="the native library was not built here"
-)
 
 
 @st.composite
@@ -137,22 +127,6 @@ def test_any_integers_in_any_bands_come_back(integers: np.ndarray, data: Draw) -
         box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
         kept[box] = integers[box]
     assert (again == kept).all()
-
-
-@NATIVE
-@looking(12, 300)
-@given(integers=INTEGERS.filter(lambda integers: integers.size <= 60), data=st.data())
-def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> None:
-    table = band_table(data.draw(specs(integers.shape)), integers.shape)
-    fast = encode_integers(integers, table)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FHASH_NATIVE", "0")
-        # Plain Python, since compiling takes longer than all examples.
-        patch.setattr(mixing_portable, "_numba", lambda: None)
-        slow = encode_integers(integers, table)
-        assert slow.data == fast.data
-        crossed = decode_integers(fast.data, integers.shape, table)
-    assert (crossed == decode_integers(slow.data, integers.shape, table)).all()
 
 
 @looking(60)

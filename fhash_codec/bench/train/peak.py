@@ -1,8 +1,7 @@
 """The peaks of the machine: arithmetic and copies of memory, by the clocks of the engines.
 
 The arithmetic of a CPU is that of fused multiply-adds in registers, by the native library, for each
-of the machine's instructions; without the library, that of torch's float32 matrix product. The
-arithmetic of a GPU is that of torch's matrix product, timed by events of the device.
+of the machine's instructions. That of a GPU is torch's matrix product, timed by its events.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ FMA_ROUNDS = 400_000
 """Rounds of multiply-adds of a measurement, some tens of milliseconds."""
 COPY_BYTES = 1 << 27
 """Bytes that are copied in a measurement, more than a cache holds."""
-CPU_SIZE = 1536
-"""Side of the matrices multiplied on a CPU."""
 GPU_SIZE = 8192
 """Side of the matrices multiplied on a GPU: smaller ones do not keep it busy."""
+PRECISIONS = ("float32", "tf32")
+"""Precisions of matrix products on a GPU."""
 GPU_PRODUCTS = 10
 """Products of a measurement on a GPU."""
 
@@ -56,11 +55,10 @@ class Peaks:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._library = native.library() if device.type == "cpu" else None
-        self._paths = [] if self._library is None else native.machine_paths()
+        self._paths = native.machine_paths() if device.type == "cpu" else []
         self.peaks = [_multiply_adds(name) for name in self._paths]
-        if not self._paths:
-            self.peaks += [_product(name, device) for name in _precisions(device)]
+        if device.type == "cuda":
+            self.peaks += [_product(name) for name in PRECISIONS]
         self.peaks.append(
             Peak(
                 what="copy", path=None, precision=None, gb_s=0.0,
@@ -78,8 +76,8 @@ class Peaks:
         try:
             for number, path in enumerate(self._paths):
                 self._raise(number, "gflops", self._fma(path))
-            if not self._paths:
-                for number, precision in enumerate(_precisions(self._device)):
+            if self._device.type == "cuda":
+                for number, precision in enumerate(PRECISIONS):
                     self._raise(number, "gflops", self._matrix_product(precision))
             self._raise(len(self.peaks) - 1, "gb_s", self._copy())
         finally:
@@ -107,19 +105,14 @@ class Peaks:
         setattr(peak, name, max(getattr(peak, name), rate / 1e9))
 
     def _fma(self, path: str) -> float:
-        assert self._library is not None
         begun = now()
-        done = self._library.fhash_network_fma(native.PATHS[path], FMA_ROUNDS)
+        done = native.library().fhash_network_fma(native.PATHS[path], FMA_ROUNDS)
         return float(done) / (now() - begun).on("cpu")
 
     def _matrix_product(self, precision: str) -> float:
         """Operations a second of torch's matrix product."""
-        size = CPU_SIZE if self._device.type == "cpu" else GPU_SIZE
+        size = GPU_SIZE
         a, b = (torch.rand(size, size, device=self._device) for _ in range(2))
-        if self._device.type == "cpu":
-            begun = now()
-            torch.mm(a, b)
-            return 2 * size**3 / (now() - begun).on("cpu")
         allowed = torch.backends.cuda.matmul.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
         try:
@@ -139,17 +132,12 @@ class Peaks:
         return moved / _device_seconds(lambda: self._to.copy_(self._from))
 
 
-def _precisions(device: torch.device) -> tuple[str, ...]:
-    return ("float32", "tf32") if device.type == "cuda" else ("float32",)
-
-
 def _multiply_adds(path: str) -> Peak:
     return Peak(what="multiply-adds", path=path, precision="float32", clock="cpu", gflops=0.0)
 
 
-def _product(precision: str, device: torch.device) -> Peak:
-    clock = "cpu" if device.type == "cpu" else "events"
-    return Peak(what="matrix product", path=None, precision=precision, clock=clock, gflops=0.0)
+def _product(precision: str) -> Peak:
+    return Peak(what="matrix product", path=None, precision=precision, clock="events", gflops=0.0)
 
 
 def _device_seconds(work: Any) -> float:

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.train.clock import now
-from fhash_codec.native import network as native
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import ArrayTable, Layer, Network
 from fhash_codec.paper.points import sample_points
@@ -32,7 +31,7 @@ def bench_points(
     """Measure `sample_points` at one time between two key frames, reading the tables included.
 
     The embeddings are random: the time does not depend on them. Each entry has `order` (`rays` or
-    `random`), `gradient`, `threads`, `native` (whether the native library computes),
+    `random`), `gradient`, `threads`,
     `mpoints_s` and `mpoints_cpu_s`, 10^6 points a second that passed and of processors.
 
     Args:
@@ -61,7 +60,6 @@ def bench_points(
                         "order": order,
                         "gradient": gradient,
                         "threads": number,
-                        "native": native.library() is not None,
                         "mpoints_s": POINTS / best.on("wall") / 1e6,
                         "mpoints_cpu_s": POINTS / best.on("cpu") / 1e6,
                     }

@@ -95,20 +95,10 @@ class Magnitudes:
 
 
 def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
-    """Return the histogram of coefficients.
-
-    The native code (fhash_codec/native/quality.cpp) and numpy give the same figures.
-    """
+    """Return the histogram of coefficients (fhash_codec/native/quality.cpp)."""
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
-    library = native.library()
-    if library is None:
-        bins = (flat.view(np.uint32) & np.uint32(0x7FFFFFFF)) >> np.uint32(SHIFT)
-        weights = np.square(flat, dtype=np.float64)
-        squares = np.bincount(bins, weights=weights, minlength=BINS).astype(np.float64)
-        counts = np.bincount(bins, minlength=BINS).astype(np.int64)
-        return Magnitudes(counts=counts, squares=squares)
     histogram = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
-    library.fhash_magnitudes(
+    native.library().fhash_magnitudes(
         ctypes.c_void_p(flat.ctypes.data),
         ctypes.c_int64(flat.size),
         ctypes.c_int64(SHIFT),

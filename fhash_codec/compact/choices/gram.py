@@ -1,8 +1,8 @@
 """Products of the lines of a tile along an axis, from which the data's own bases are made.
 
-They are computed by native code (fhash_codec/native/gram.cpp), or by numpy with the same bits: both
-add line after line. A library for matrices would add in an order of its own, by threads of its own
-beside those that work on tiles.
+They are computed by native code (fhash_codec/native/gram.cpp), which adds line after line. A
+library for matrices would add in an order of its own, by threads of its own beside those that work
+on tiles.
 """
 
 from __future__ import annotations
@@ -30,25 +30,10 @@ def gram_of(planes: npt.NDArray[Any], center: float) -> Gram:
     """
     if planes.dtype not in (np.float32, np.float64):
         planes = planes.astype(np.float64)
-    library = native.library()
-    if library is not None:
-        return _native(library, np.ascontiguousarray(planes), center)
-    sums: Gram = np.zeros((planes.shape[1], planes.shape[1]))
-    for plane in planes:
-        with np.errstate(over="ignore", invalid="ignore"):
-            lines = plane.T.astype(np.float64) - center
-        lines[~np.isfinite(lines)] = 0.0
-        with np.errstate(over="ignore", invalid="ignore"):
-            for line in lines:
-                sums += line[:, None] * line
-    return sums
-
-
-def _native(library: ctypes.CDLL, planes: npt.NDArray[Any], center: float) -> Gram:
-    """Return the sum by native code. planes: float32 or float64, in C order."""
+    planes = np.ascontiguousarray(planes)
     before, length, after = planes.shape
     sums: Gram = np.empty((length, length))
-    function = getattr(library, f"fhash_gram_f{planes.itemsize * 8}")
+    function = getattr(native.library(), f"fhash_gram_f{planes.itemsize * 8}")
     places = ctypes.c_void_p(planes.ctypes.data), ctypes.c_void_p(sums.ctypes.data)
     checked(function(places[0], before, length, after, center, places[1]))
     return sums

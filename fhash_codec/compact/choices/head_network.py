@@ -1,8 +1,8 @@
 """The network of a head in training: weights, biases and Adam's means of them.
 
-The source of Adam is Kingma and Ba 2015, algorithm 1. What the C++ computes, head_network_portable
-computes with the same bits, with any number of threads and on any machine: every sum over voxels is
-a sum of integers, and is exact in whatever order it is formed.
+The source of Adam is Kingma and Ba 2015, algorithm 1. The C++ (fhash_codec/native/train_head.cpp)
+gives the same bits with any number of threads and on any machine: every sum over voxels is a sum of
+integers, and is exact in whatever order it is formed.
 
 - Inputs are integers of 1/512, activations of 1/128 and at most 4095 units, both as in the decoder.
 - Weights are integers of 1/65536 in a product, or, `as_in_file`, those that the file would hold.
@@ -25,14 +25,20 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.compact.choices import head_network_portable as portable
-from fhash_codec.compact.choices.head_network_portable import BETA1, BETA2, MAX_INTEGERS
 from fhash_codec.compact.choices.head_samples import Batches
-from fhash_formats.transform.head.head import Layer, Scaled, layer_inputs
+from fhash_formats.transform.head.head import MAX_BIAS, MAX_WEIGHT, Layer, Scaled, layer_inputs
+from fhash_formats.transform.head.inputs import INPUTS
 
 __all__ = ["Network", "adam_factors"]
 
 Doubles = npt.NDArray[np.float64]
+
+BETA1 = 0.9
+"""Decay of Adam's mean of gradients per update."""
+BETA2 = 0.999
+"""Decay of Adam's mean of squared gradients per update."""
+MIN_SCALE = 1e-6
+"""Least unit of weights and biases in the file."""
 
 
 def adam_factors(rates: Doubles) -> tuple[Doubles, Doubles]:
@@ -89,21 +95,9 @@ class Network:
         as_in_file: whether weights and biases are rounded as in the file. Gradients pass through
             the rounding unchanged.
         """
-        library = native.library()
-        if library is None:
-            portable.learn(
-                voxels,
-                self.widths,
-                (self.parameters, self.means, self.squares),
-                first,
-                rates,
-                roots,
-                as_in_file=as_in_file,
-            )
-            return
         factors = np.ascontiguousarray(rates), np.ascontiguousarray(roots)
         _check(
-            library.fhash_head_learn(
+            native.library().fhash_head_learn(
                 *self._arguments(voxels),
                 *map(_address, (self.parameters, self.means, self.squares, *factors)),
                 first,
@@ -114,14 +108,9 @@ class Network:
 
     def squared_errors(self, voxels: Batches, *, as_in_file: bool) -> list[int]:
         """Return the sum of the squared errors of each batch, in squares of ERROR_UNIT."""
-        library = native.library()
-        if library is None:
-            return portable.squared_errors(
-                voxels, self.widths, self.parameters, as_in_file=as_in_file
-            )
         sums = np.empty(len(voxels), dtype=np.int64)
         _check(
-            library.fhash_head_errors(
+            native.library().fhash_head_errors(
                 *self._arguments(voxels), _address(self.parameters), as_in_file, _address(sums)
             )
         )
@@ -129,12 +118,14 @@ class Network:
 
     def layers(self) -> tuple[Layer, ...]:
         """Return the layers as the file holds them."""
-        layers = []
-        for arrays in portable.layer_arrays(self.parameters, self.widths, self.looked_at):
-            weights, biases = (
-                _as_in_file(values, most) for values, most in zip(arrays, MAX_INTEGERS, strict=True)
-            )
-            layers.append(Layer.of(weights, biases))
+        layers, at = [], 0
+        columns = (INPUTS, self.widths[0] * self.looked_at, self.widths[1])
+        for inputs, outputs in zip(columns, (*self.widths, 1), strict=True):
+            end = at + outputs * inputs
+            weights = self.parameters[at:end].reshape(outputs, inputs)
+            biases = self.parameters[end : end + outputs]
+            layers.append(Layer.of(_as_in_file(weights, MAX_WEIGHT), _as_in_file(biases, MAX_BIAS)))
+            at = end + outputs
         return tuple(layers)
 
     def _arguments(self, voxels: Batches) -> Sequence[ctypes.c_void_p]:
@@ -149,9 +140,12 @@ class Network:
 
 
 def _as_in_file(values: Doubles, most: int) -> Scaled:
-    """Return weights or biases as the integers of the file, at most `most` either way."""
-    scale = portable.file_scale(values, most)
-    return portable.integers(values, scale, most).astype(np.int8), scale
+    """Return weights or biases as the integers of the file, at most `most` either way.
+
+    Their unit is a float16 that maps the largest magnitude to at most `most`.
+    """
+    scale = float(np.float16(max(float(np.abs(values).max()) / most, MIN_SCALE)))
+    return np.clip(np.rint(values / scale), -most, most).astype(np.int8), scale
 
 
 def _address(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:

@@ -1,12 +1,12 @@
 """Training samples of the neighbourhood head: voxels drawn from decoded tiles.
 
-Native code (fhash_codec/native/head_inputs.cpp) and numpy compute the same inputs.
+Native code (fhash_codec/native/head_inputs.cpp) computes the inputs that the head itself computes.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_formats.transform.entropy.coder import checked
-from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
 from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
 
 __all__ = [
@@ -45,8 +44,6 @@ MAX_ERROR = 1 << 24
 """Largest magnitude of an error that a training sees, in these steps; larger ones are clipped."""
 MAX_TARGET = 1 << 30
 """Largest magnitude of a target, in integer steps."""
-PIECE_VOXELS = 1 << 16
-"""Voxels whose inputs are computed at once."""
 
 
 class Pair(NamedTuple):
@@ -125,7 +122,9 @@ def draw(
         among = pair.original.size if pair.counted is None else np.flatnonzero(pair.counted)
         chosen = np.sort(random.choice(among, number)) if number else np.empty(0, np.int64)
         places = np.stack(np.unravel_index(chosen, pair.original.shape))
-        values = clip(pair.decoded.ravel()[chosen], low, high)
+        values = pair.decoded.ravel()[chosen]
+        values = np.where(values > low, values, low)  # NaN becomes low, as the head has it
+        values = np.where(values < high, values, high)
         drawn.append(Voxels(places, values, pair.original.ravel()[chosen]))
     return drawn
 
@@ -183,14 +182,6 @@ def _fill_slots(
     slots: number of each of the n voxels of this tile among all voxels.
     places: coordinates (4, n) of the voxels.
     """
-    library = native.library()
-    if library is None:
-        first = 0
-        for piece in _inputs(decoded, places, offsets, value_range):
-            block, slot = np.divmod(slots[first : first + piece.shape[2]], BLOCK_VOXELS)
-            inputs[block, :, :, slot] = piece.transpose(2, 0, 1)
-            first += piece.shape[2]
-        return
     inverse, unit = _scales(value_range)
     # In the order of the slots: a voxel has its inputs in many places, near those of the next slot.
     order = np.argsort(slots)
@@ -204,7 +195,7 @@ def _fill_slots(
     )
     tile, shape, at, to, neighbours, seen = (ctypes.c_void_p(each.ctypes.data) for each in arrays)
     code = checked(
-        library.fhash_head_inputs(
+        native.library().fhash_head_inputs(
             *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
             *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
             ctypes.c_void_p(inputs.ctypes.data),
@@ -218,39 +209,3 @@ def _scales(value_range: ErrorRange) -> tuple[np.float32, np.float32]:
     span = value_range.high - value_range.low
     unit = np.float32(1024) / span if span > 0 else np.float32(0)
     return np.float32(0.5) / value_range.sigma, unit
-
-
-def _inputs(
-    decoded: Floats,
-    places: npt.NDArray[np.int64],
-    offsets: Sequence[tuple[int, ...]],
-    value_range: ErrorRange,
-) -> Iterator[npt.NDArray[np.int16]]:
-    """Yield the inputs of voxels of a tile, (INPUTS, offsets, n), some voxels at a time.
-
-    They are the inputs that the head itself computes, for the voxels at each offset.
-
-    places: coordinates (4, n) of the voxels.
-    """
-    low, high = value_range.low, value_range.high
-    inverse, unit = _scales(value_range)
-    padded = np.pad(clip(decoded, low, high), ((1, 1), (2, 2), (2, 2), (2, 2)), mode="edge")
-    flat, strides = padded.ravel(), np.array(padded.strides) // padded.itemsize
-    origin = int(strides @ np.array((1, 2, 2, 2)))
-    last = np.array(decoded.shape)[:, None] - 1
-    piece = PIECE_VOXELS // len(offsets)
-    for start in range(0, places.shape[1], piece):
-        voxels = places[:, start : start + piece]
-        at = np.stack(
-            [
-                origin + strides @ np.clip(voxels + np.array(offset)[:, None], 0, last)
-                for offset in offsets
-            ]
-        )
-        centre = flat[at]
-        inputs = np.empty((INPUTS, *at.shape), dtype=np.int16)
-        for number, offset in enumerate(OFFSETS):
-            neighbour = flat[at + int(strides @ np.array(offset))]
-            inputs[number] = compress((neighbour - centre) * inverse)
-        inputs[-2:] = centre_inputs(centre, low, inverse, unit)
-        yield inputs

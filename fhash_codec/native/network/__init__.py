@@ -1,8 +1,7 @@
 """Loader of the network's native library: the C++ of training and evaluating the paper's network.
 
 It is a library of its own because it is compiled with contraction into fused multiply-adds, which
-would change the bits of a stream elsewhere. It is loaded like that of `fhash_formats.native` and
-switched off by the same `FHASH_NATIVE=0`. Whoever calls a function of it also has a way without it.
+would change the bits of a stream elsewhere. It is loaded like that of `fhash_formats.native`.
 """
 
 from __future__ import annotations
@@ -39,20 +38,16 @@ PATHS = {"x86-64-v4": 4, "x86-64-v3": 2, "baseline": 1}
 _FOLDER = Path(__file__).parent
 
 
-def library() -> ctypes.CDLL | None:
-    """The native library of this package, or None; see `fhash_formats.native.load_library`."""
+def library() -> ctypes.CDLL:
+    """The native library of this package; see `fhash_formats.native.load_library`."""
     return load_library(
         _FOLDER, "_network", ABI_VERSION, PROTOTYPES, version_symbol="fhash_network_abi_version"
     )
 
 
 def machine_paths() -> list[str]:
-    """Return the names of the instructions that the kernels can use here, the fastest first.
-
-    The list is empty where the library is missing.
-    """
-    native = library()
-    bits = 0 if native is None else native.fhash_network_paths()
+    """Return the names of the instructions that the kernels can use here, the fastest first."""
+    bits = library().fhash_network_paths()
     return [name for name, bit in PATHS.items() if bits & bit]
 
 

@@ -58,7 +58,7 @@ def refusal(architecture: Architecture, device: torch.device) -> str | None:
     if device.type != "cpu":
         return f"it computes on a CPU, and the device is '{device.type}'"
     if not machine_paths():
-        return "the native library is missing; install the package with a C++ compiler at hand"
+        return "the native library was built for none of this machine's instructions"
     if architecture.hidden_layers > MOST_HIDDEN:
         return f"it has {MOST_HIDDEN} hidden layers at most, not {architecture.hidden_layers}"
     if architecture.hidden_layers and architecture.width > WIDEST:

@@ -143,16 +143,9 @@ class Bricks:
         distance = np.where(matters, 0, FARTHEST).astype(np.int32)
         if not matters.any():
             return distance
-        library = native.library()
-        if library is not None:
-            layers, rows, _ = distance.shape
-            _find_distances(library.fhash_march_distance_layers, distance, layers, self.values.size)
-            _find_distances(library.fhash_march_distance_rows, distance, rows, self.values.size)
-            return distance
-        near = matters
-        for away in range(1, min(max(distance.shape), FARTHEST)):
-            near = _spread(near)
-            distance[near & (distance == FARTHEST)] = away
+        library, (layers, rows, _) = native.library(), distance.shape
+        _find_distances(library.fhash_march_distance_layers, distance, layers, self.values.size)
+        _find_distances(library.fhash_march_distance_rows, distance, rows, self.values.size)
         return distance
 
 
@@ -161,10 +154,6 @@ def _extremes(values: Single) -> tuple[Single, Single]:
     bricks = [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
-    if library is None:
-        low[...] = _reduced(np.where(np.isnan(values), np.float32(np.inf), values), np.minimum)
-        high[...] = _reduced(np.where(np.isnan(values), np.float32(-np.inf), values), np.maximum)
-        return low, high
     shape, counts = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*bricks)
 
     def layer(number: int) -> None:
@@ -205,25 +194,3 @@ def _in_turn(function: Callable[[int], object], numbers: range, vertices: int) -
             function(number)
     else:
         list(in_threads(function, numbers))
-
-
-def _reduced(values: Single, ufunc: np.ufunc) -> Single:
-    """Reduce the vertices of each brick by a ufunc, axis by axis."""
-    for axis, size in enumerate(values.shape):
-        starts = np.arange(0, max(size - 1, 1), SIDE)
-        within = ufunc.reduceat(values, starts, axis=axis)
-        faces = np.take(values, np.minimum(starts + SIDE, size - 1), axis=axis)
-        values = ufunc(within, faces)
-    return values
-
-
-def _spread(mask: Mask) -> Mask:
-    """A mask grown by one element in every direction, diagonals included."""
-    for axis in range(mask.ndim):
-        grown = mask.copy()
-        head, tail = [slice(None)] * mask.ndim, [slice(None)] * mask.ndim
-        head[axis], tail[axis] = slice(None, -1), slice(1, None)
-        grown[tuple(head)] |= mask[tuple(tail)]
-        grown[tuple(tail)] |= mask[tuple(head)]
-        mask = grown
-    return mask

@@ -71,12 +71,6 @@ def factors_at_vertices(values: Single, grading: Grading, spacing: Floats) -> Si
     with np.errstate(over="ignore"):
         scale = np.minimum(GRADES / grading.top / np.abs(spacing), np.finfo(np.float64).max)
     library = native.library()
-    if library is None:
-        with np.errstate(over="ignore"):
-            slopes = [_slopes(values, axis) * scale[2 - axis] for axis in range(3)]
-            size = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + slopes[2] ** 2)
-        found = np.interp(size, np.arange(GRADES + 1), grading.factors)
-        return np.where(np.isnan(values), 0, found).astype(np.float32)
     table = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
     out = np.empty(values.shape, dtype=np.float32)
     shape = (ctypes.c_int64 * 3)(*values.shape)
@@ -95,15 +89,3 @@ def factors_at_vertices(values: Single, grading: Grading, spacing: Floats) -> Si
 
     list(in_threads(layer, range(len(values))))
     return out
-
-
-def _slopes(values: Single, axis: int) -> Floats:
-    """Differences per vertex along an axis, by the neighbours that are there; 0 without any."""
-    wide = values.astype(np.float64)
-    none = np.full_like(wide.take([0], axis=axis), np.nan)
-    steps = np.diff(wide, axis=axis)
-    before = np.concatenate([none, steps], axis=axis)
-    behind = np.concatenate([steps, none], axis=axis)
-    both = (before + behind) / 2
-    either = np.where(np.isnan(before), behind, before)
-    return np.nan_to_num(np.where(np.isnan(both), either, both), nan=0.0)

@@ -212,10 +212,6 @@ def _sums(extinction: Single, step: Floats, count: int) -> Single:
     """Sums of the extinction in the middle of `count` steps from each point."""
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
-    if library is None:
-        for number in range(count):
-            _add_shifted(extinction, step * (number + 0.5), sums)
-        return sums
     shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
     _in_layers(
         extinction.shape[0],
@@ -236,27 +232,6 @@ def _left(sums: Single, length: float) -> Single:
         return np.asarray(np.exp(-factor * sums), dtype=np.float32)
 
 
-def _add_shifted(extinction: Single, offset: Floats, sums: Single) -> None:
-    """Add the extinction at an offset (x, y, z, in cells) from each point, 0 beyond the grid.
-
-    The extinction is trilinear between the points.
-    """
-    cells = np.floor(offset).astype(int)[::-1]
-    fraction = (offset - np.floor(offset))[::-1]
-    shape = np.array(extinction.shape)
-    begin, end = np.maximum(0, -cells), np.minimum(shape, shape - cells - (fraction > 0))
-    if np.any(begin >= end):
-        return
-    to = tuple(slice(low, high) for low, high in zip(begin, end, strict=True))
-    for corner in itertools.product((0, 1), repeat=3):
-        weight = np.prod(np.where(corner, fraction, 1 - fraction))
-        if weight > 0:
-            moved = zip(begin + cells + corner, end + cells + corner, strict=True)
-            sums[to] += (
-                np.float32(weight) * extinction[tuple(slice(low, high) for low, high in moved)]
-            )
-
-
 def _extinction(values: Single, table: Table, across: int, factors: Single | None = None) -> Single:
     """Extinctions on a grid with a point every `across` vertices.
 
@@ -265,8 +240,6 @@ def _extinction(values: Single, table: Table, across: int, factors: Single | Non
     points = tuple(-(-(size - 1) // across) + 1 for size in values.shape)
     library = native.library()
     last = len(table.extinctions) - 1
-    if library is None:
-        return _extinction_portable(values, table, across, points, factors)
     out = np.empty(points, dtype=np.float32)
     entries = np.append(table.extinctions, table.extinctions[-1]).astype(np.float32)
     shape, sizes = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*points)
@@ -291,26 +264,6 @@ def _extinction(values: Single, table: Table, across: int, factors: Single | Non
 
     _in_layers(points[0], layer)
     return out
-
-
-def _extinction_portable(
-    values: Single, table: Table, across: int, points: tuple[int, ...], factors: Single | None
-) -> Single:
-    """The extinctions of `_extinction` in numpy, within rounding; points: (z, y, x)."""
-    entries = np.linspace(table.low, table.high, len(table.extinctions))
-    extinction = np.interp(np.nan_to_num(values), entries, table.extinctions)
-    extinction = np.where(np.isnan(values), 0, extinction)
-    if factors is not None:
-        extinction = extinction * factors
-    offsets = np.arange(1 - across, across)
-    weights = (across - np.abs(offsets)) / across**2
-    for axis, count in enumerate(points):
-        vertices = np.arange(count)[:, None] * across + offsets
-        within = np.clip(vertices, 0, values.shape[axis] - 1)
-        extinction = np.tensordot(
-            np.take(extinction, within, axis=axis), weights, axes=([axis + 1], [0])
-        )
-    return extinction.astype(np.float32)
 
 
 def _in_layers(count: int, function: Callable[[int], object]) -> None:

@@ -57,10 +57,6 @@ def _blurred(values: Single, deviation: float) -> Single:
     """The values after a Gaussian along each axis; a new array."""
     weights = _weights(deviation)
     library = native.library()
-    if library is None:
-        for axis in (2, 1, 0):
-            values = _along(values, weights, axis)
-        return values
     shape = (ctypes.c_int64 * 3)(*values.shape)
     layers, rows, _ = values.shape
     flat, out = np.empty_like(values), np.empty_like(values)
@@ -85,20 +81,3 @@ def _weights(deviation: float) -> Single:
     away = np.arange(math.ceil(REACH * deviation) + 1)
     weights = np.exp(-0.5 * (away / deviation) ** 2)
     return np.asarray(weights / (2 * weights.sum() - weights[0]), dtype=np.float32)
-
-
-def _along(values: Single, weights: Single, axis: int) -> Single:
-    """The values smoothed along one axis, in numpy."""
-    values = np.moveaxis(values, axis, 0)
-    count = len(values)
-    out = weights[0] * values
-    for away, weight in enumerate(weights[1:], start=1):
-        # The sum of two values near the largest one is infinite; their mean counts twice.
-        means = values.copy()
-        if count > 2 * away:
-            half = np.float32(0.5)
-            both = half * values[: count - 2 * away] + half * values[2 * away :]
-            inner = means[away : count - away]
-            inner[...] = np.where(np.isnan(both), inner, both)
-        out += 2 * weight * means
-    return np.ascontiguousarray(np.moveaxis(out, 0, axis))

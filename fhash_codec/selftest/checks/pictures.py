@@ -7,9 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec import native
 from fhash_codec.selftest.case import Finding, Run
-from fhash_codec.selftest.environment import environment
 
 __all__ = ["CHECKS"]
 
@@ -47,12 +45,6 @@ def picture(run: Run) -> Iterator[Finding]:
     for mode in MODES:
         off = np.max(np.abs(_rendered(run, mode) - cached))
         yield Finding(name=f"cache = {mode}", worst=float(off), limit=NEAR, unit="of a channel")
-    if native.library() is not None:
-        with environment(FHASH_NATIVE="0"):
-            off = np.max(np.abs(_rendered(run, "cache") - cached))
-        yield Finding(
-            name="native = portable march", worst=float(off), limit=NEAR, unit="of a channel"
-        )
 
 
 CHECKS = (picture,)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec import native
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_picture
@@ -19,7 +18,6 @@ from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.task.task import Frame
 from fhash_codec.selftest.case import Check, Finding, Run
 from fhash_codec.selftest.checks.ray_oracle import reference_picture
-from fhash_codec.selftest.environment import environment
 
 __all__ = ["MODES", "blocks", "closed_form", "key_times", "scene", "scenes"]
 
@@ -57,8 +55,7 @@ def scene(**parts: Any) -> Scene:
 def scenes(
     scenes_by_name: Mapping[str, Scene], *, modes: tuple[str, ...] = MODES, oracle: bool = True
 ) -> Check:
-    """A check that draws each scene: finite, within 0..1, and the same in each mode and without the
-    native library.
+    """A check that draws each scene: finite, within 0..1, and the same in each mode.
 
     Args:
         scenes_by_name: the scenes.
@@ -173,9 +170,6 @@ def _pictures(
         ).rgba
         for mode in modes
     }
-    if native.library() is not None:
-        with environment(FHASH_NATIVE="0"):
-            by_mode["portable"] = Renderer(run.volume).render(picture_scene).rgba
     bad = sum(int(np.count_nonzero(~np.isfinite(picture))) for picture in by_mode.values())
     yield Finding(name="finite pixels", worst=float(bad), limit=0.0, unit="channels", under=name)
     beyond = max(

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats import native
 from fhash_formats.errors import (
     DamagedFileError,
     InputError,
-    MissingDependencyError,
     UnsupportedFileError,
 )
 
@@ -326,19 +326,9 @@ def zstd_content_size(data: memoryview | bytes) -> int | None:
 
 
 def crc32c(data: bytes | memoryview) -> int:
-    """CRC-32C (Castagnoli) of `data`; raises MissingDependencyError without google-crc32c."""
-    try:
-        # zarr and numcodecs use this implementation, too. Without it nothing could be checked.
-        import google_crc32c
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the CRC-32C of .fhz files needs google-crc32c: pip install google-crc32c"
-        ) from error
-    # google_crc32c takes bytes and arrays, but no memoryview.
-    value: int = google_crc32c.value(
-        data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8)
-    )
-    return value
+    """CRC-32C (Castagnoli) of `data`."""
+    given = data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8).ctypes.data
+    return int(native.library().fhash_crc32c(given, len(data), 0, 0))
 
 
 def _names(codecs: Sequence[Codec]) -> str:

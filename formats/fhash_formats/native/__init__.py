@@ -1,9 +1,8 @@
 """Loader of the native library: C++ kernels that are called through ctypes.
 
-A call releases Python's global interpreter lock. Every native function has a portable twin in numpy
-that computes the same bits, so the library only adds speed. `library()` returns None where no
-compiler was available when the package was installed, and where the environment says
-`FHASH_NATIVE=0`. The portable twins then do the work.
+A call releases Python's global interpreter lock. The library is a part of the package: it is built
+when the package is installed, and without it nothing works. tests/reference decodes the same bits
+in numpy.
 
 `PROTOTYPES` lists the exported functions that this package calls, with the types of their
 arguments. Every exported function returns an int64: at least 0 for success, below 0 for an error
@@ -13,7 +12,6 @@ arguments. Every exported function returns an int64: at least 0 for success, bel
 from __future__ import annotations
 
 import ctypes
-import os
 from collections.abc import Mapping
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
@@ -33,7 +31,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 10
+ABI_VERSION = 11
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -63,6 +61,7 @@ _CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
 _FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
 _RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
 _CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_MASK_LEVELS = (*(ARRAY,) * 3, INTEGER, ARRAY, ARRAY, INTEGER, ARRAY, ARRAY)
 _TYPES = ("f32", "f64")
 _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
@@ -83,6 +82,8 @@ PROTOTYPES: Prototypes = {
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
+    # mask_levels.cpp
+    **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
     # labels.cpp
     "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
     "fhash_encode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
@@ -104,6 +105,8 @@ PROTOTYPES: Prototypes = {
     "fhash_trellis_count": _TRELLIS_COUNT,
     **{f"fhash_trellis_guess_{kind}": _TRELLIS_COUNT for kind in _TYPES},
     **{f"fhash_trellis_choose_{kind}": _TRELLIS for kind in _TYPES},
+    # crc32c.cpp
+    "fhash_crc32c": (ARRAY, INTEGER, INTEGER, INTEGER),
     # values.cpp
     **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
     **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},
@@ -113,13 +116,14 @@ PROTOTYPES: Prototypes = {
 }
 """Functions of this package's library that Python calls."""
 
+_ADVICE = "install the package again (pip install .)"
 _FOLDER = Path(__file__).parent
 _LOCK = ForkLock()
-_LOADED: dict[tuple[Path, str, int], ctypes.CDLL | None] = {}
+_LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
 
 
-def library() -> ctypes.CDLL | None:
-    """The native library of this package, or None; see `load_library`."""
+def library() -> ctypes.CDLL:
+    """The native library of this package; see `load_library`."""
     return load_library(_FOLDER, "_core", ABI_VERSION, PROTOTYPES)
 
 
@@ -130,11 +134,10 @@ def load_library(
     prototypes: Prototypes,
     *,
     version_symbol: str = "fhash_abi_version",
-) -> ctypes.CDLL | None:
+) -> ctypes.CDLL:
     """The native library `name` in a folder, its functions given their argument and result types.
 
-    The result is None where the library was not built or the environment says `FHASH_NATIVE=0`. A
-    library is loaded once; the environment is read at each call. Safe to call from several threads.
+    A library is loaded once. Safe to call from several threads.
 
     Args:
         folder: folder of the Python package to which the extension belongs.
@@ -144,29 +147,27 @@ def load_library(
         version_symbol: exported function without arguments that returns the library's ABI number.
 
     Raises:
-        MissingDependencyError: the library exists but cannot be loaded, lacks a function, or was
-            built from other sources (another ABI number).
+        MissingDependencyError: the library is not there, cannot be loaded, lacks a function, or
+            was built from other sources (another ABI number).
     """
-    if os.environ.get("FHASH_NATIVE") == "0":
-        return None
     key = (folder, name, abi_version)
     if key not in _LOADED:
         with _LOCK:
             if key not in _LOADED:
                 path = _find(folder, name)
-                _LOADED[key] = (
-                    None if path is None else _load(path, abi_version, prototypes, version_symbol)
-                )
+                _LOADED[key] = _load(path, abi_version, prototypes, version_symbol)
     return _LOADED[key]
 
 
-def _find(folder: Path, name: str) -> Path | None:
+def _find(folder: Path, name: str) -> Path:
     candidates = (folder / f"{name}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    return next((path for path in candidates if path.is_file()), None)
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise MissingDependencyError(f"there is no native library {folder / name}.*: {_ADVICE}")
 
 
 def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:
-    advice = "install the package again (pip install .), or set FHASH_NATIVE=0 to do without"
     try:
         loaded = ctypes.CDLL(str(path))
         _declare(loaded, version_symbol, ())
@@ -174,13 +175,13 @@ def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: 
         if built != abi_version:
             raise MissingDependencyError(
                 f"the native library {path} has ABI {built}, "
-                f"this version of the package needs {abi_version}: {advice}"
+                f"this version of the package needs {abi_version}: {_ADVICE}"
             )
         for function, arguments in prototypes.items():
             _declare(loaded, function, arguments)
     except (OSError, AttributeError) as error:
         raise MissingDependencyError(
-            f"the native library {path} cannot be used ({error}): {advice}"
+            f"the native library {path} cannot be used ({error}): {_ADVICE}"
         ) from error
     return loaded
 

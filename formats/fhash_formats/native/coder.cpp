@@ -2,6 +2,7 @@
 // probabilities are mixed from several contexts.
 //
 // A decoder computes with integers only, so encoder and decoder agree on every machine.
+// tests/reference/integers.py explains it.
 //
 // A coefficient is coded as a zero flag, its sign, and its magnitude: in unary up to 13, beyond
 // that by an Exp-Golomb code. Each binary decision k (0 is the zero flag, any other asks "more than

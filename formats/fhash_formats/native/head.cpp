@@ -1,5 +1,5 @@
 // The trained neighbourhood head over a tile. transform/head/head.py states the arithmetic, and
-// transform/head/head_portable.py computes the same bits in numpy.
+// tests/reference/head.py computes the same bits in numpy.
 #include <cstring>
 #include <memory>
 #include <new>

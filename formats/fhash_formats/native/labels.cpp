@@ -4,9 +4,8 @@
 // often first. A decision says whether the vertex has the first candidate, then the second, then
 // the third. Each decision is predicted from which neighbours have the candidate, as in mask.cpp.
 // Where no candidate holds, the label follows bit by bit, without the labels that are excluded.
-// Where all segments around are of one label, a flag stands for SEGMENT vertices of a row. The
-// portable coder (transform/entropy/labels_portable.py) follows this file step by step and gives
-// the same bytes.
+// Where all segments around are of one label, a flag stands for SEGMENT vertices of a row.
+// tests/reference/labels.py explains it.
 //
 // Up to 256 labels are uint8. More of them (WIDE) are uint16; there a label chooses its estimates
 // by a hash, and a flag says whether a label is the one after the highest so far.

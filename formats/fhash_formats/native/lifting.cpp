@@ -1,5 +1,5 @@
 // Forward and inverse transform of one tile (t, z, y, x): lifting wavelets and matrix products.
-// transform/axes/lifting_portable.py computes the same bits.
+// tests/reference/transform.py computes the same bits in numpy.
 //
 // Along t, z and y a block of columns is gathered into a small buffer, lifted there through all
 // levels in place (level l at stride 2^l), and scattered to the bands, low first. Along x a row is

@@ -4,8 +4,8 @@
 // come from the bits before it (to the left, above, one layer and one step before) and from two
 // levels of the vertex and of its neighbours, also of those after it: encoder and decoder have the
 // levels from the decoded values (transform/entropy/mask_levels.py). Where all segments around
-// agree, a flag stands for SEGMENT vertices of a row. The portable coder
-// (transform/entropy/mask_portable.py) follows this file step by step and gives the same bytes.
+// agree, a flag stands for SEGMENT vertices of a row.
+// tests/reference/masks.py explains it.
 #include <cstdlib>
 #include <type_traits>
 

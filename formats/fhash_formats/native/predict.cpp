@@ -12,8 +12,7 @@
 // apart.
 //
 // Python builds the passes and their taps (transform/entropy/predictor.py), so they are right
-// whatever the bytes. The portable coder (transform/entropy/predict_portable.py) gives the same
-// bytes.
+// whatever the bytes. tests/reference/predictor.py decodes the same.
 #include <cstdlib>
 #include <type_traits>
 

@@ -1,5 +1,4 @@
-// Coefficients to integers and back, element by element. transform/values/quantise.py has the
-// portable twins.
+// Coefficients to integers and back, element by element.
 #include <cmath>
 #include <cstdint>
 

@@ -1,5 +1,4 @@
-// Passes over the values of a tile, element by element. transform/values/elementwise.py has the
-// portable twins.
+// Passes over the values of a tile, element by element.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -12,16 +12,12 @@ from click.testing import Result
 from PIL import Image as Pictures
 
 import fhash_codec
-from fhash_codec import native
 from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS
 
 Fhash = Callable[..., Result]
 
-marched = pytest.mark.skipif(native.library() is None, reason="marched natively")
 
-
-@marched
 def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     view = tmp_path / "view.png"
     words = [
@@ -54,7 +50,6 @@ def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Pat
         )
 
 
-@marched
 def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     first, again, scene, changed = (
         tmp_path / name for name in ("a.png", "b.png", "s.json", "c.png")
@@ -100,7 +95,6 @@ def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Pa
     ) == (2, None, None, 2, True)
 
 
-@marched
 def test_explain_says_what_is_done_and_what_it_took(
     fhash: Fhash, run: Path, tmp_path: Path
 ) -> None:
@@ -115,7 +109,6 @@ def test_explain_says_what_is_done_and_what_it_took(
     assert plan["march"].startswith("cache")
 
 
-@marched
 def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     result = fhash(
         "render",
@@ -137,7 +130,6 @@ def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Pat
     assert np.isfinite(np.load(tmp_path / "v.depth.npy")).any()
 
 
-@marched
 def test_without_a_name_the_picture_is_called_as_the_run(
     fhash: Fhash, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,7 +209,6 @@ def test_a_file_that_is_missing_or_damaged_keeps_its_exit_code(
     refused(4, "render", tmp_path / "bad.fhz", "-o", tmp_path / "v.png")
 
 
-@marched
 def test_an_evolution_is_replayed_from_its_picture(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     first, second, single = (tmp_path / name for name in ("a.png", "b.png", "c.png"))
     for words in (
@@ -234,7 +225,6 @@ def test_an_evolution_is_replayed_from_its_picture(fhash: Fhash, run: Path, tmp_
     assert "--explain" in refused.stderr
 
 
-@marched
 def test_a_jpeg_says_where_its_scene_may_stay(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     words = ["render", run, "-o", tmp_path / "v.jpg", "--size", "40x30"]
     result = fhash(*words)
@@ -249,7 +239,6 @@ def test_a_jpeg_says_where_its_scene_may_stay(fhash: Fhash, run: Path, tmp_path:
     assert ".png, .jpg or .jpeg" in other.stderr
 
 
-@marched
 def test_tracked_features_have_a_box_and_a_legend(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     view = tmp_path / "v.png"
     words = ["--size", "80x60", "--track", "interval:5:20", "--track", "isosurface:3=red"]

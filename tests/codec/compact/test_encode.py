@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -371,28 +368,6 @@ def test_other_tiles_are_refused(tmp_path: Path, field: Field, tile: str) -> Non
     ):
         fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(effort=1, tile=tile))
     assert not list(tmp_path.iterdir())
-
-
-DECODE_IN_PYTHON = """
-import sys
-sys.modules["numba"] = None  # compiling takes longer than this small series
-import numpy, fhash_codec
-from fhash_formats import native
-assert native.library() is None
-with fhash_codec.open(sys.argv[1]) as volume:
-    numpy.save(sys.argv[2], volume[...])
-"""
-
-
-def test_without_native_code_the_values_are_the_same(tmp_path: Path, field: Field) -> None:
-    config = EncodeConfig(effort=2, max_error_rel=0.01, features=("interval:0:200",))
-    fhash_codec.encode(field((2, 4, 5, 6)), tmp_path / "a.fhz", config)
-    subprocess.run(
-        [sys.executable, "-c", DECODE_IN_PYTHON, tmp_path / "a.fhz", tmp_path / "b.npy"],
-        env={**os.environ, "FHASH_NATIVE": "0"},
-        check=True,
-    )
-    np.testing.assert_array_equal(np.load(tmp_path / "b.npy"), decoded(tmp_path / "a.fhz"))
 
 
 @pytest.mark.parametrize("effort", [1, 2])

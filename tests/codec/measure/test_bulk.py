@@ -1,4 +1,4 @@
-"""The bulk: percentiles found in one or two passes, with or without the native library."""
+"""The bulk: percentiles found in one or two passes."""
 
 from __future__ import annotations
 
@@ -31,11 +31,9 @@ def heavy(scale):
     return values
 
 
-@pytest.mark.parametrize("library", ["1", "0"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16])
 @pytest.mark.parametrize("scale", [1.0, 20.0, 1000.0])
-def test_the_ends_are_the_percentiles_rounded_outwards(monkeypatch, library, dtype, scale) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", library)
+def test_the_ends_are_the_percentiles_rounded_outwards(dtype, scale) -> None:
     values = heavy(scale).astype(dtype)
     values[5:8] = np.nan, np.inf, -np.inf
     bulk = bulk_of(values)
@@ -54,11 +52,9 @@ def test_the_bulk_scales_with_the_values(factor, offset) -> None:
     assert scaled.high / factor == pytest.approx(plain.high, abs=0.01)
 
 
-@pytest.mark.parametrize("library", ["1", "0"])
-def test_it_does_not_depend_on_the_order_the_pieces_or_the_library(monkeypatch, library) -> None:
+def test_it_does_not_depend_on_the_order_or_the_pieces() -> None:
     values = heavy(300.0).astype(np.float32)
     expected = bulk_of(values)
-    monkeypatch.setenv("FHASH_NATIVE", library)
     assert bulk_of(values[::-1], pieces=7) == expected
 
 

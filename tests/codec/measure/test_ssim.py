@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from skimage import metrics
 
-from fhash_codec import native
 from fhash_codec.measure.ssim import ssim, ssim_steps
 from fhash_formats.errors import InputError
 
@@ -178,27 +177,7 @@ def test_measured_steps_are_even_within_budget_and_include_the_ends(
     assert not len(gaps) or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
 
 
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
-@pytest.mark.parametrize("shape", [*SHAPES, (70, 40, 70)], ids=str)
-@pytest.mark.parametrize("holes", [False, True])
-def test_native_and_numpy_agree(monkeypatch, shape, dtype, holes) -> None:
-    original, decoded = ((field * 200 + 20).astype(dtype) for field in pair(shape))
-    decoded = decoded.astype(np.float32 if dtype != np.float64 else np.float64)
-    mask = np.random.default_rng(3).random(shape) < 0.8 if holes else None
-    if holes and dtype != np.uint8:
-        original[np.random.default_rng(4).random(shape) < 0.1] = np.nan
-    found = []
-    for choice in ("1", "0"):
-        monkeypatch.setenv("FHASH_NATIVE", choice)
-        found.append(ssim(original, decoded, 200.0, mask))
-    assert found[0][1] == found[1][1]
-    assert found[0][0] == pytest.approx(found[1][0], rel=1e-11, abs=1e-11)
-
-
-@pytest.mark.parametrize("choice", ["1", "0"])
-def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", choice)
+def test_a_decoded_value_that_is_not_finite_is_refused() -> None:
     original, decoded = pair((12, 13, 14))
     decoded[6, 6, 6] = np.inf
     with pytest.raises(InputError, match="not finite"):
@@ -222,10 +201,7 @@ except MemoryError as error:
 """
 
 
-@pytest.mark.skipif(
-    sys.platform != "linux" or native.library() is None,
-    reason="needs the native library and Linux's limits on memory",
-)
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's limits on memory")
 def test_no_memory_for_a_tile_is_said_and_ends_no_process() -> None:
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

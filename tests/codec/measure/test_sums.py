@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec import native
-from fhash_codec.compact.choices.estimate import magnitudes
 from fhash_codec.measure.sums import error_sums, histogram, range_and_sum, squared_errors
 
-needs_native = pytest.mark.skipif(
-    native.library() is None, reason="the native library was not built here"
-)
 SIZES = [1, 255, 256, 257, 16383, 16384, 16385, 50_000]
 
 
@@ -37,9 +32,7 @@ def test_range_and_sum_are_those_of_numpy(size, dtype, missing) -> None:
     assert total == pytest.approx(finite.sum() / 2, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("library", ["1", "0"])
-def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", library)
+def test_zeros_have_no_sign_and_sums_may_be_infinite() -> None:
     for values in ([0.0, -0.0], [-0.0, 0.0], [-0.0]):
         _, low, high, _ = range_and_sum(np.array(values))
         assert not np.signbit([low, high]).any()
@@ -74,43 +67,8 @@ def test_errors_are_those_of_numpy(size, dtypes, masked) -> None:
     assert largest == np.abs(difference).max(initial=0)
 
 
-@needs_native
-@pytest.mark.parametrize("missing", [False, True])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("size", SIZES)
-def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing) -> None:
-    original, decoded = pair(size, dtype, missing=missing)
-    mask = np.random.default_rng(2).random(size) < 0.7
-    found = []
-    for choice in ("1", "0"):
-        monkeypatch.setenv("FHASH_NATIVE", choice)
-        seen = magnitudes(decoded.astype(np.float32))
-        counts = np.zeros(100, np.int64)
-        histogram(original, counts, scale=0.5, low=-300.0, factor=0.2)
-        bulk = (-200.0, 300.0)
-        found.append(
-            (
-                range_and_sum(original, 0.3),
-                squared_errors(original, decoded, None, 0.3),
-                squared_errors(original, decoded, mask, 0.3),
-                squared_errors(original.astype(np.float32), decoded.astype(np.float64), mask, 0.3),
-                error_sums(original, decoded, None, 0.3, bulk),
-                error_sums(original, decoded, mask, 0.3, bulk),
-                error_sums(
-                    original.astype(np.float32), decoded.astype(np.float64), mask, 0.3, bulk
-                ),
-                counts.tobytes(),
-                seen.counts.tobytes(),
-                seen.squares.tobytes(),
-            )
-        )
-    assert found[0] == found[1]
-
-
-@pytest.mark.parametrize("choice", ["1", "0"])
 @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.int64])
-def test_the_bulk_is_summed_once_more(monkeypatch, choice, dtype) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", choice)
+def test_the_bulk_is_summed_once_more(dtype) -> None:
     original = pair(20_000, np.float64)[0].astype(dtype)
     decoded = original + np.linspace(-1, 1, original.size).astype(np.float32)
     low, high = float(original[3]), float(original[3]) + 700  # both ends belong to it
@@ -123,9 +81,7 @@ def test_the_bulk_is_summed_once_more(monkeypatch, choice, dtype) -> None:
     assert sums[:3] == squared_errors(original, decoded, None, 0.5)
 
 
-@pytest.mark.parametrize("choice", ["1", "0"])
-def test_values_beyond_a_histogram_go_to_its_ends(monkeypatch, choice) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", choice)
+def test_values_beyond_a_histogram_go_to_its_ends() -> None:
     counts = np.zeros(4, np.int64)
     values = np.array([[-1e300, -1, 0, 0.99], [1, 3.5, 4, 1e300], [np.nan, np.inf, -np.inf, 2]])
     histogram(values, counts, scale=1.0, low=0.0, factor=1.0)
@@ -133,10 +89,8 @@ def test_values_beyond_a_histogram_go_to_its_ends(monkeypatch, choice) -> None:
     assert counts.tolist() == [4, 2, 2, 4]
 
 
-@pytest.mark.parametrize("choice", ["1", "0"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_told(monkeypatch, choice, value) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", choice)
+def test_what_is_not_finite_is_told(value) -> None:
     original, decoded = pair(20_000, np.float32)
     decoded[-3] = value
     assert squared_errors(original, decoded, None, 1.0)[0] == -1

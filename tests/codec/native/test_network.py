@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from exports import exported
 
 import fhash_formats.native as formats_native
@@ -16,15 +15,8 @@ from fhash_codec.native.network import ABI_VERSION, PROTOTYPES
 SOURCES = Path(network.__file__).parent
 
 
-def test_the_environment_switches_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert network.library() is None
-
-
 def test_it_is_a_library_of_its_own() -> None:
     library = network.library()
-    if library is None:
-        pytest.skip("the native library was not built here")
     assert library not in (codec_native.library(), formats_native.library())
     assert library.fhash_network_abi_version() == ABI_VERSION
 
@@ -40,8 +32,6 @@ def test_the_prototypes_take_the_arguments_of_the_sources() -> None:
 
 def test_arithmetic_runs_on_the_paths_of_the_machine_alone() -> None:
     library = network.library()
-    if library is None:
-        pytest.skip("the native library was not built here")
     paths = library.fhash_network_paths()
     assert paths & 1
     lanes = {1: 4, 2: 8, 4: 16}
@@ -55,8 +45,6 @@ def test_arithmetic_runs_on_the_paths_of_the_machine_alone() -> None:
 
 def test_copies_count_what_is_read_and_what_is_written() -> None:
     library = network.library()
-    if library is None:
-        pytest.skip("the native library was not built here")
     source, copy = np.arange(100, dtype=np.float32), np.zeros(100, np.float32)
     assert library.fhash_network_copy(copy.ctypes.data, source.ctypes.data, 400) == 800
     np.testing.assert_array_equal(copy, source)

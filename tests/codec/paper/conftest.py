@@ -13,7 +13,6 @@ import numpy.typing as npt
 import pytest
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.native import network as native
 from fhash_codec.paper.levels import level_resolutions
 from fhash_codec.paper.network import ArrayTable, Network
 
@@ -157,13 +156,3 @@ def network(request: pytest.FixtureRequest) -> Network:
     """A random network of each shape."""
     make: Callable[..., Network] = Networks.random
     return make(*request.param)
-
-
-@pytest.fixture(params=["native", "numpy"])
-def evaluation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Points evaluated by the native library, and by numpy without it."""
-    if request.param == "numpy":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    elif native.library() is None:
-        pytest.skip("the native library was not built here")
-    return str(request.param)

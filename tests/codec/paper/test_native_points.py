@@ -33,10 +33,7 @@ SHAPES = [
 
 @pytest.fixture
 def library() -> ctypes.CDLL:
-    library = native.library()
-    if library is None:
-        pytest.skip("the native library was not built here")
-    return library
+    return native.library()
 
 
 @pytest.fixture(params=SHAPES, ids=str)
@@ -73,18 +70,6 @@ def test_every_path_gives_the_values_of_the_formula(library, networks, network) 
         alone = np.empty_like(values)
         NativePoints(library, tables, path).evaluate(places, alone, None)
         np.testing.assert_array_equal(alone, values)
-
-
-def test_derivatives_are_those_of_numpy(library, networks, network, monkeypatch) -> None:
-    places = faces_and_inside(networks, network)
-    _, slopes = sample_points(network, *places, gradient=True)
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    _, expected = sample_points(network, *places, gradient=True)
-    close = np.isclose(slopes, expected, rtol=1e-4, atol=1e-4)
-    # Near a kink of a ReLU two roundings may take different sides.
-    assert close.mean() > 0.98
-    flat = np.array([network.key_frames, *network.box_size]) == 1
-    assert not slopes[:, flat].any()
 
 
 def test_tables_at_one_time_give_the_same_bits(library, networks, network) -> None:

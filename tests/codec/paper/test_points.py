@@ -19,8 +19,6 @@ from fhash_codec.paper.points import input_slopes, sample_points
 from fhash_codec.paper.regions import decode_region
 from fhash_formats.errors import InputError, RegionError
 
-pytestmark = pytest.mark.usefixtures("evaluation")
-
 
 def test_values_match_the_sixteen_corner_formula(networks, network) -> None:
     for key_index in networks.key_indices(network):

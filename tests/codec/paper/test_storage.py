@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from math import prod
 
 import numpy as np
@@ -162,23 +159,3 @@ def test_mixing_adds_the_components_from_the_first_on() -> None:
     )
     np.testing.assert_array_equal(mix_components(components, mixing), expected)
     assert mix_components(components, mixing).dtype == np.float32
-
-
-def test_coded_tables_are_read_alike_without_torch_and_without_native_code(tmp_path, small) -> None:
-    code = (
-        "import sys, numpy, fhash_codec\n"
-        "from fhash_formats import native\n"
-        "assert native.library() is None\n"
-        "with fhash_codec.open(sys.argv[1]) as volume:\n"
-        "    table = volume._model.network.tables[0]\n"
-        "    region = tuple(slice(0, n) for n in table.shape)\n"
-        "    numpy.savez(sys.argv[2], table.read(region), volume.read(1))\n"
-        "assert 'torch' not in sys.modules\n"
-    )
-    command = [sys.executable, "-c", code, str(small), str(tmp_path / "a.npz")]
-    subprocess.run(command, env={**os.environ, "FHASH_NATIVE": "0"}, check=True)
-    with np.load(tmp_path / "a.npz") as arrays, fhash_codec.open(small) as volume:
-        table = volume._model.network.tables[0]
-        region = tuple(slice(0, n) for n in table.shape)
-        np.testing.assert_array_equal(arrays["arr_0"], table.read(region))
-        np.testing.assert_array_equal(arrays["arr_1"], volume.read(1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume, native
+from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.task.arrays import Arrays
 
@@ -25,13 +24,11 @@ def blobs() -> np.ndarray:
     return (first + second + 0.05 * np.sin(x / 3)).astype(np.float32)
 
 
-@pytest.fixture(params=["native", "portable"])
+@pytest.fixture(params=["native", "streamed"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Both ways to compute: with the native library, and without it."""
-    if request.param == "portable":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    elif native.library() is None:
-        pytest.skip("no native library")
+    """Both ways to march a decoded frame: natively, and streamed as too large a frame is."""
+    if request.param == "streamed":
+        monkeypatch.setattr("fhash_codec.rendering.march.MAX_VALUES", 0)
     return str(request.param)
 
 
@@ -51,10 +48,7 @@ class Files(dict[str, Path]):
 
     def __missing__(self, kind: str) -> Path:
         path = self.folder / f"{kind}.fhz"
-        with warnings.catch_warnings():
-            # Coding without the native core gives a warning, since it is slow; this is little.
-            warnings.simplefilter("ignore", FhashWarning)
-            fhash_codec.encode(blobs(), path, CONFIGS[kind])
+        fhash_codec.encode(blobs(), path, CONFIGS[kind])
         self[kind] = path
         return path
 

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Camera, Shadows
@@ -338,9 +337,7 @@ CASES = {
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.5, -2.0, 1.5), (1e-9, 1e-9, 2e-9)])
 @pytest.mark.parametrize("case", CASES)
-def test_native_and_numpy_make_one_picture(case: str, spacing: tuple[float, float, float]) -> None:
-    if native.library() is None:
-        pytest.skip("no native library")
+def test_both_ways_make_one_picture(case: str, spacing: tuple[float, float, float]) -> None:
     values = waves()
     unit = float(np.exp(np.mean(np.log(np.abs(spacing)))))
     table = table_of(
@@ -351,7 +348,7 @@ def test_native_and_numpy_make_one_picture(case: str, spacing: tuple[float, floa
     task = task_of(
         values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more
     )
-    here, there = march(frame_of(values), task), march_numpy(values, task)
+    here, there = march(frame_of(values), task), streamed(frame_of(values), task)
     assert here.rgba[..., 3].max() > 0.2
     np.testing.assert_allclose(here.rgba, there.rgba, atol=2e-4)
     if task.depth:
@@ -360,10 +357,11 @@ def test_native_and_numpy_make_one_picture(case: str, spacing: tuple[float, floa
         assert np.mean(np.abs(here.depth[both] - there.depth[both]) < 1e-3 * unit) > 0.99
 
 
-def march_numpy(values: np.ndarray, task: Task) -> Marched:
+def streamed(frame: Frame, task: Task) -> Marched:
+    """The picture of a frame that is too large to be marched natively."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FHASH_NATIVE", "0")
-        return march(frame_of(values), task)
+        patch.setattr("fhash_codec.rendering.march.MAX_VALUES", 0)
+        return march(frame, task)
 
 
 def test_values_of_any_magnitude_make_the_same_picture(way: str) -> None:
@@ -415,8 +413,6 @@ def test_a_part_of_the_domain_is_sampled_where_the_whole_is(way: str) -> None:
 
 @pytest.mark.parametrize("stride", [1, 2, 4])
 def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride: int) -> None:
-    if native.library() is None:
-        pytest.skip("no native library")
     n = np.arange(0, 40, stride)
     z, y, x = np.meshgrid(n, n, n, indexing="ij")
     values = (0.5 + 0.5 * np.sin((x + 2 * y - z) / 9)).astype(np.float32)[1:, :-2, 2:]
@@ -432,10 +428,7 @@ def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride: int) -> None:
         surfaces=surfaces,
         depth=True,
     )
-    here = march(frame, task)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FHASH_NATIVE", "0")
-        there = march(frame, task)
+    here, there = march(frame, task), streamed(frame, task)
     np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
     np.testing.assert_allclose(there.depth, here.depth, atol=1e-3)
 
@@ -511,7 +504,7 @@ def test_a_light_grid_darkens(way: str) -> None:
         assert np.all(lit[..., :3] <= plain[..., :3] + 1e-6)
         assert lit[..., 0].sum() < 0.9 * plain[..., 0].sum()
         np.testing.assert_allclose(
-            march_numpy(values, replace(task, light=light)).rgba, lit, atol=2e-4
+            streamed(frame_of(values), replace(task, light=light)).rgba, lit, atol=2e-4
         )
 
 

@@ -11,14 +11,13 @@ import pytest
 from forked import ended_well, forked, needs_fork
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume, native
+from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering import renderer as module
 from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import DamagedFileError, InputError
 
-pytestmark = pytest.mark.skipif(native.library() is None, reason="marched natively")
 SMALL = {"size": [40, 32]}
 
 

@@ -11,9 +11,7 @@ import pytest
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering import render
-from fhash_formats import native
 
-pytestmark = pytest.mark.skipif(native.library() is None, reason="marched natively")
 SMALL = Scene(size=(40, 32))
 
 

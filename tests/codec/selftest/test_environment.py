@@ -12,27 +12,25 @@ from fhash_codec.selftest.environment import describe_machine, environment
 
 def test_the_environment_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FHASH_THREADS", "3")
-    monkeypatch.delenv("FHASH_NATIVE", raising=False)
+    monkeypatch.delenv("OMP_TEST", raising=False)
     seen = []
 
     def within() -> None:
-        with environment(FHASH_THREADS="2", FHASH_NATIVE="0"):
-            seen.append((os.environ["FHASH_THREADS"], os.environ["FHASH_NATIVE"]))
+        with environment(FHASH_THREADS="2", OMP_TEST="0"):
+            seen.append((os.environ["FHASH_THREADS"], os.environ["OMP_TEST"]))
             raise ValueError("out")
 
     with pytest.raises(ValueError, match="out"):
         within()
     assert seen == [("2", "0")]
     assert os.environ["FHASH_THREADS"] == "3"
-    assert "FHASH_NATIVE" not in os.environ
+    assert "OMP_TEST" not in os.environ
 
 
 def test_the_machine_is_described_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", "0")
     monkeypatch.setenv("FHASH_THREADS", "3")
     facts = describe_machine().split(", ")
     assert facts[0] == f"fhash {version('fhash')}"
     assert f"numpy {version('numpy')}" in facts
     assert "3 processors" in facts
-    assert "without the native core" in facts
     assert facts[-1] in ("CUDA", "no CUDA")

@@ -1,4 +1,4 @@
-"""The loader of the native library: what it takes, what it refuses, how it is switched off."""
+"""The loader of the native library: what it takes, and what it refuses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ from fhash_formats.native import ABI_VERSION, PROTOTYPES, load_library
 
 SOURCES = Path(native.__file__).parent
 
-needs_library = pytest.mark.skipif(
-    native.library() is None, reason="the native library was not built here"
-)
-
 
 @pytest.fixture
 def built_copy(tmp_path: Path) -> Path:
@@ -31,31 +27,25 @@ def built_copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_environment_switches_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert native.library() is None
-
-
 def test_every_thread_gets_the_same_library() -> None:
     with ThreadPoolExecutor(4) as pool:
         libraries = list(pool.map(lambda _: native.library(), range(16)))
     assert all(library is libraries[0] for library in libraries)
 
 
-def test_a_folder_without_a_build_has_no_library(tmp_path: Path) -> None:
-    assert load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES) is None
-
-
-def test_a_damaged_library_is_a_plain_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("FHASH_NATIVE", raising=False)
-    (tmp_path / f"_core{EXTENSION_SUFFIXES[0]}").write_bytes(b"not a library")
-    with pytest.raises(MissingDependencyError, match="FHASH_NATIVE=0"):
+def test_a_folder_without_a_build_is_a_plain_error(tmp_path: Path) -> None:
+    with pytest.raises(MissingDependencyError, match="there is no native library"):
         load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES)
 
 
-@needs_library
+def test_a_damaged_library_is_a_plain_error(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / f"_core{EXTENSION_SUFFIXES[0]}").write_bytes(b"not a library")
+    with pytest.raises(MissingDependencyError, match="install the package again"):
+        load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES)
+
+
 def test_a_library_of_other_sources_is_a_plain_error(built_copy: Path) -> None:
     assert load_library(built_copy, "_core", ABI_VERSION, PROTOTYPES) is not None
     message = f"has ABI {ABI_VERSION}, this version of the package needs {ABI_VERSION + 1}"
@@ -63,7 +53,6 @@ def test_a_library_of_other_sources_is_a_plain_error(built_copy: Path) -> None:
         load_library(built_copy, "_core", ABI_VERSION + 1, PROTOTYPES)
 
 
-@needs_library
 @pytest.mark.parametrize(
     ("prototypes", "version_symbol"),
     [({"fhash_nothing": ()}, "fhash_abi_version"), (PROTOTYPES, "fhash_nothing")],
@@ -75,7 +64,6 @@ def test_a_library_that_lacks_a_function_is_a_plain_error(
         load_library(built_copy, "_core", ABI_VERSION, prototypes, version_symbol=version_symbol)
 
 
-@needs_library
 def test_arguments_of_another_type_are_refused() -> None:
     library = native.library()
     assert library is not None

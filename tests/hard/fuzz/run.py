@@ -47,8 +47,8 @@ TARGETS = tuple(
     )
 )
 SOURCES = (
-    *("coder", "trellis", "mask", "predict", "labels"),
-    *("lifting", "head", "quantise", "values"),
+    *("coder", "trellis", "mask", "mask_levels", "predict", "labels"),
+    *("lifting", "head", "quantise", "values", "crc32c"),
 )
 """Files of NATIVE that are always fuzzed."""
 CODEC_SOURCES = ("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head")

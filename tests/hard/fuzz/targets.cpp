@@ -42,14 +42,37 @@ void decode_integers(Reader& in) {
                  static_cast<int64_t>(data.size()));
 }
 
+// Levels of a mask from any values, by sums of one or two kinds of scores.
+template <class T, class F> void levels_of_values(Reader& in, F function) {
+    const std::vector<int64_t> shape = small_shape(in, 8);
+    const std::size_t n = static_cast<std::size_t>(volume(shape));
+    const int64_t count = in.within(0, 15), reach = in.within(0, 64);
+    std::vector<T> edges = in.numbers<T>(count);
+    std::vector<std::int32_t> scores(static_cast<std::size_t>(count) + 1), others(scores);
+    for (std::int32_t& score : scores) score = in.word() % 4096;
+    for (std::int32_t& score : others) score = in.word() % 4096;
+    std::vector<std::uint8_t> first(n), second(n);
+    const bool two = in.byte() & 1;
+    const std::vector<T> values = in.numbers<T>(static_cast<int64_t>(n));
+    function(values.data(), shape.data(), edges.data(), count, scores.data(),
+             two ? others.data() : nullptr, reach, first.data(), second.data());
+    for (const std::uint8_t level : first) require(level < 32, "a level that does not exist");
+    for (const std::uint8_t level : second) require(level < 16, "a level that does not exist");
+}
+
 void decode_mask(Reader& in) {
     const std::vector<int64_t> shape = small_shape(in, 8);
     const State& prior = setups().mask;
     const std::size_t n = static_cast<std::size_t>(volume(shape));
     std::vector<std::uint8_t> mask(n), level(n), other(n);
-    const bool informed = in.byte() & 1;
-    mask_levels(in, informed, level, other);
+    const std::uint8_t how = in.byte();
+    if (how & 2) return levels_of_values<float>(in, fhash_mask_levels_f32);
+    if (how & 4) return levels_of_values<double>(in, fhash_mask_levels_f64);
+    mask_levels(in, how & 1, level, other);
     const std::vector<std::uint8_t> data = in.rest();
+    const int64_t bytes = static_cast<int64_t>(data.size());
+    const int64_t crc = fhash_crc32c(data.data(), bytes, 0, 1);
+    require(crc == fhash_crc32c(data.data(), bytes, 0, 0), "another CRC by the instruction");
     fhash_decode_mask(mask.data(), level.data(), other.data(), shape.data(), prior.slots.data(),
                       static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
                       static_cast<int64_t>(prior.weights.size()), prior.simples.data(),

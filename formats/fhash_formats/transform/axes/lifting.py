@@ -4,7 +4,7 @@ The forward transform goes along t, then z, then y and x (spec.py). Then each co
 multiplied by the norm of its synthesis vector (weights.py). The norm is a product of two factors,
 one of (t, z) and one of (y, x), each computed in float64 and rounded once to the working type. The
 inverse multiplies by their reciprocals, rounded once, and undoes the rest in the opposite order.
-The native library and the portable twin give the same bits.
+The arithmetic is that of native/lifting.cpp.
 """
 
 from __future__ import annotations
@@ -21,19 +21,22 @@ from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.transform.axes.lifting_portable import (
-    KIND_NUMBERS,
-    forward_axis,
-    forward_tile,
-    inverse_tile,
-)
-from fhash_formats.transform.axes.spec import AXES, TransformSpec
+from fhash_formats.transform.axes.spec import AXES, KINDS, TransformSpec
 from fhash_formats.transform.axes.weights import axis_norms, band_lengths, plane_norms
 
 __all__ = ["MAX_LOD", "Transform"]
 
 MAX_LOD = 10
 """Most halvings of a reduced resolution."""
+
+STEPS_97 = (
+    (True, -1.586134342059924),
+    (False, -0.052980118572961),
+    (True, 0.882911075530934),
+    (False, 0.443506852043971),
+)
+"""Lifting steps of the wavelet 9/7 (Daubechies and Sweldens 1998, without the final scaling by K):
+whether the odd half changes, and the factor."""
 
 Values = NDArray[Any]
 Integers = NDArray[np.int32]
@@ -59,31 +62,19 @@ class _Plan:
 
     def run(self, values: Values, inverse: bool) -> Values:
         """The transformed values. Raises MemoryError."""
-        library = native.library()
-        if library is not None:
-            return self._run_native(library, values, inverse)
-        transform = inverse_tile if inverse else forward_tile
-        with np.errstate(all="ignore"):
-            return transform(
-                values, self.kinds, self.depths, self.matrices, self.scale_tz, self.scale_yx
-            )
-
-    def _run_native(self, library: ctypes.CDLL, values: Values, inverse: bool) -> Values:
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         result = np.empty(values.shape, values.dtype)
         _checked_code(
-            getattr(library, f"fhash_transform_{direction}_f{width}")(
+            getattr(native.library(), f"fhash_transform_{direction}_f{width}")(
                 *self._native_arguments(values, result, inverse)
             )
         )
         return result
 
-    def reconstruct(
-        self, library: ctypes.CDLL, integers: Integers, result: Values, numbers: Sequence[float]
-    ) -> int:
+    def reconstruct(self, integers: Integers, result: Values, numbers: Sequence[float]) -> int:
         """Write the values of integers into `result`; the CRC-32 of the integers."""
         return _checked_code(
-            getattr(library, f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
+            getattr(native.library(), f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
                 *self._native_arguments(integers, result, inverse=True),
                 (ctypes.c_double * len(numbers))(*numbers),
                 0,
@@ -111,7 +102,7 @@ class _Plan:
             source.ctypes.data_as(ctypes.c_void_p),
             result.ctypes.data_as(ctypes.c_void_p),
             four(*source.shape),
-            four(*(KIND_NUMBERS[kind] for kind in self.kinds)),
+            four(*(KINDS.index(kind) for kind in self.kinds)),
             four(*self.depths),
             four(*ranks),
             pointers,
@@ -214,15 +205,14 @@ class Transform:
             in_place: whether the values may overwrite the integers, which they then do where they
                 have the same size.
         """
-        library = native.library()
         # Zeros may have another sign until a centre is added that is not -0.
-        if library is None or (numbers[7] == 0 and math.copysign(1.0, numbers[7]) < 0):
+        if numbers[7] == 0 and math.copysign(1.0, numbers[7]) < 0:
             return None
         over = in_place and self.dtype == np.float32 and integers.flags.writeable
         result = integers.view(np.float32) if over else np.empty(self.shape, self.dtype)
         if 0 not in self._plans:
             self._plans[0] = self._inverse_plan(0)
-        return result, self._plans[0].reconstruct(library, integers, result, numbers)
+        return result, self._plans[0].reconstruct(integers, result, numbers)
 
     @cached_property
     def _forward_plan(self) -> _Plan:
@@ -297,9 +287,17 @@ def _gain(kind: str, n: int, levels: int) -> float:
     It differs from 1 for 9/7 only, whose lifting leaves out the scaling by K. A level on a length
     of 1 changes nothing.
     """
+    if kind != "9/7":
+        return 1.0
+    even = odd = 1.0
+    for changes_odd, factor in STEPS_97:
+        if changes_odd:
+            odd += factor * (even + even)
+        else:
+            even += factor * (odd + odd)
     gain = 1.0
     for m in band_lengths(n, levels)[:levels]:
-        gain *= float(forward_axis(np.ones(min(m, 2)), 0, kind)[0])
+        gain *= even if m > 1 else 1.0
     return gain
 
 

@@ -9,13 +9,14 @@ ends. On a longer axis each band has the norm of its interior.
 
 from __future__ import annotations
 
+import ctypes
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fhash_formats.transform.axes.lifting_portable import inverse_axis
-from fhash_formats.transform.axes.spec import AxisTransform
+from fhash_formats import native
+from fhash_formats.transform.axes.spec import KINDS, AxisTransform
 
 __all__ = ["MAX_EXACT", "axis_norms", "band_lengths", "plane_norms"]
 
@@ -35,17 +36,11 @@ def band_lengths(n: int, depth: int) -> list[int]:
 
 def axis_norms(axis: AxisTransform, n: int) -> Norms:
     """Norms along an axis that is transformed on its own, float64 (n,); 1 beyond a basis's rank."""
+    if axis.wavelet:
+        return _wavelet_norms(axis.kind, axis.depth, n)
     norms = np.ones(n)
     if axis.basis is not None:
-        total = np.zeros(axis.basis.rank)
-        for row in axis.basis.synthesis.astype(np.float64):
-            total += row * row
-        norms[: axis.basis.rank] = np.sqrt(total)
-    elif axis.wavelet:
-        lengths, low, high = band_lengths(n, axis.depth), *_level_norms(axis.kind, axis.depth, n)
-        norms[: lengths[-1]] = low[-1]
-        for level in range(1, axis.depth + 1):
-            norms[lengths[level] : lengths[level - 1]] = high[level]
+        norms[: axis.basis.rank] = _column_norms(axis.basis.synthesis.astype(np.float64))
     return norms
 
 
@@ -54,57 +49,56 @@ def plane_norms(y: AxisTransform, x: AxisTransform, rows: int, columns: int) -> 
     if not y.wavelet or (y.kind, y.depth) != (x.kind, x.depth):
         return axis_norms(y, rows)[:, None] * axis_norms(x, columns)
     ys, xs = band_lengths(rows, y.depth), band_lengths(columns, x.depth)
-    (low_y, high_y), (low_x, high_x) = (
-        _level_norms(y.kind, y.depth, rows),
-        _level_norms(x.kind, x.depth, columns),
-    )
-    norms = np.ones((rows, columns))
-    for level in range(1, y.depth + 1):
-        norms[: ys[level], xs[level] : xs[level - 1]] = low_y[level][:, None] * high_x[level]
-        norms[ys[level] : ys[level - 1], : xs[level]] = high_y[level][:, None] * low_x[level]
-        norms[ys[level] : ys[level - 1], xs[level] : xs[level - 1]] = (
-            high_y[level][:, None] * high_x[level]
-        )
-    norms[: ys[-1], : xs[-1]] = low_y[-1][:, None] * low_x[-1]
+    norms = np.empty((rows, columns))
+    for level in range(1, y.depth + 1):  # each overwrites the low-low quarter of the one before
+        along_y, along_x = (_wavelet_norms(y.kind, level, n) for n in (rows, columns))
+        height, width = ys[level - 1], xs[level - 1]
+        norms[:height, :width] = along_y[:height, None] * along_x[:width]
     return norms
 
 
-@lru_cache(maxsize=128)
-def _level_norms(kind: str, depth: int, n: int) -> tuple[list[Norms], list[Norms]]:
-    """Norms of the low band and of the high band after 0 to `depth` levels.
-
-    The high band of level 0 is empty.
-    """
-    low, high = [np.ones(n)], [np.ones(0)]
-    lengths = band_lengths(n, depth)
-    for level in range(1, depth + 1):
-        m = lengths[level]
-        if n <= MAX_EXACT:
-            norms = _synthesis_norms(kind, lengths[: level + 1], np.eye(lengths[level - 1]))
-            low.append(norms[:m])
-            high.append(norms[m:])
-        else:
+@lru_cache(maxsize=256)
+def _wavelet_norms(kind: str, depth: int, n: int) -> Norms:
+    """Norms of the synthesis vectors of a wavelet on an axis; read-only."""
+    if n <= MAX_EXACT:
+        norms = _column_norms(_inverse(np.eye(n), kind, depth))
+    else:
+        norms, ends = np.empty(n), band_lengths(n, depth)
+        for level in range(1, depth + 1):
             # With 32 entries in the band, the vector of a middle entry does not reach the ends.
-            interior = band_lengths(32 << level, level)
-            impulses = np.zeros((interior[level - 1], 2))
-            impulses[16, 0] = impulses[interior[level] + 16, 1] = 1.0
-            norms = _synthesis_norms(kind, interior, impulses)
-            low.append(np.full(m, norms[0]))
-            high.append(np.full(lengths[level - 1] - m, norms[1]))
-    return low, high
+            inner = band_lengths(32 << level, level)
+            vectors = np.zeros((inner[0], 2))
+            vectors[16, 0] = vectors[inner[level] + 16, 1] = 1.0
+            low, high = _column_norms(_inverse(vectors, kind, level))
+            norms[: ends[level]], norms[ends[level] : ends[level - 1]] = low, high
+    norms.setflags(write=False)
+    return norms
 
 
-def _synthesis_norms(kind: str, lengths: list[int], bands: NDArray[np.float64]) -> Norms:
-    """Norms of the columns that the inverse makes of `bands`, both bands of the deepest level.
+def _inverse(bands: NDArray[np.float64], kind: str, depth: int) -> NDArray[np.float64]:
+    """The columns that the inverse of a wavelet makes of columns of bands."""
+    n, columns = bands.shape
+    values, ones = np.empty_like(bands), np.ones(max(n, columns))
+    four, pointer = ctypes.c_int64 * 4, ctypes.c_void_p
+    code = native.library().fhash_transform_inverse_f64(
+        pointer(bands.ctypes.data),
+        pointer(values.ctypes.data),
+        four(n, 1, 1, columns),
+        four(KINDS.index(kind), 0, 0, 0),
+        four(depth, 0, 0, 0),
+        four(0, 0, 0, 0),
+        (pointer * 4)(None, None, None, None),
+        pointer(ones.ctypes.data),
+        pointer(ones.ctypes.data),
+    )
+    if code != 0:
+        raise MemoryError("no memory for the norms of a transform")
+    return values
 
-    lengths: of the low band after each level.
-    """
-    values = inverse_axis(bands, 0, kind)
-    for n in lengths[-3::-1]:
-        padded = np.zeros((n, values.shape[1]))
-        padded[: len(values)] = values
-        values = inverse_axis(padded, 0, kind)
-    total = np.zeros(values.shape[1])
-    for row in values:
+
+def _column_norms(matrix: NDArray[np.float64]) -> Norms:
+    """Norms of the columns, with sums from the first row on."""
+    total = np.zeros(matrix.shape[1])
+    for row in matrix:
         total += row * row
     return np.sqrt(total)

@@ -1,6 +1,6 @@
-"""Labels to bytes and back by an adaptive coder, native (native/labels.cpp) or portable.
+"""Labels to bytes and back by an adaptive coder (native/labels.cpp).
 
-Both write the same bytes. Labels are numbers of a palette without an order: those of a region are
+Labels are numbers of a palette without an order: those of a region are
 equal, and a border between two regions seldom shows a third one. The coder predicts each label from
 those around the vertex that are already coded. It begins without a prior.
 """
@@ -63,10 +63,6 @@ def encode_labels(labels: Labels, count: int) -> bytes:
     wide = count > MAX_NARROW
     state = blank_label_state(wide)
     library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import labels_portable
-
-        return labels_portable.encode(labels, count, state.copy())
     encode = library.fhash_encode_wide_labels if wide else library.fhash_encode_labels
     # The coder writes to its labels, also in encoding, but does not change them.
     work = np.array(labels, dtype=np.uint16 if wide else np.uint8, order="C")
@@ -94,10 +90,6 @@ def decode_labels(data: bytes | memoryview, count: int, shape: tuple[int, ...]) 
     wide = count > MAX_NARROW
     state = blank_label_state(wide)
     library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import labels_portable
-
-        return labels_portable.decode(bytes(data), count, shape, state.copy())
     decode = library.fhash_decode_wide_labels if wide else library.fhash_decode_labels
     labels = np.zeros(shape, dtype=np.uint16 if wide else np.uint8)
     source = np.frombuffer(data, dtype=np.uint8)

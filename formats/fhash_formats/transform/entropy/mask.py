@@ -1,6 +1,6 @@
-"""Masks to bytes and back by an adaptive coder, native (native/mask.cpp) or portable.
+"""Masks to bytes and back by an adaptive coder (native/mask.cpp).
 
-Both write the same bytes. A mask says which vertices of a tile are occupied. Its coder predicts
+A mask says which vertices of a tile are occupied. Its coder predicts
 each bit from the bits around the vertex that are already coded, and from the levels of the vertex
 and its neighbours (mask_levels.py), which tell how likely the vertex is occupied. It begins from a
 prior (`mask_prior.bin`) that was learned from other series. Like the prior of the coefficients, it
@@ -65,16 +65,11 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | Non
     """
     keep = state is not None
     state = mask_prior_state() if state is None else state
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import mask_portable
-
-        return mask_portable.encode(mask, levels, state if keep else state.copy())
     bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
     capacity = max(4096, mask.size // 8)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
-        size = library.fhash_encode_mask(
+        size = native.library().fhash_encode_mask(
             *(array.ctypes.data for array in (bits, first, second)),
             (ctypes.c_int64 * 4)(*mask.shape),
             *state_arguments(state),
@@ -92,15 +87,10 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
     Any other bytes give some mask: the caller must check a digest.
     """
     shape = levels[0].shape
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import mask_portable
-
-        return mask_portable.decode(bytes(data), levels, mask_prior_state().copy())
     mask = np.empty(shape, dtype=np.uint8)
     first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in levels)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = library.fhash_decode_mask(
+    code = native.library().fhash_decode_mask(
         *(array.ctypes.data for array in (mask, first, second)),
         (ctypes.c_int64 * 4)(*shape),
         *state_arguments(mask_prior_state()),

@@ -3,12 +3,13 @@
 A feature is the set of vertices whose values lie in a range, grown by some vertices. So a mask says
 little more than the decoded values do, up to their error. Each vertex adds a score to all vertices
 within `reach`: minus the logarithm of the probability that it is not a reason for them to be
-occupied. The sums of scores are compared with BOUNDS. Values are only compared, and scores are
-whole numbers, so the levels are the same on every machine.
+occupied. The sums of scores are compared with bounds (native/mask_levels.cpp). Values are only
+compared, and scores are whole numbers, so the levels are the same on every machine.
 """
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats import native
 from fhash_formats.errors import InputError
+from fhash_formats.transform.entropy.coder import array_arguments, checked
 
 __all__ = ["MAX_EDGES", "MAX_REACH", "MAX_SCORE", "UNIT", "MaskLevels"]
 
@@ -31,12 +34,6 @@ MAX_FLOAT = float(np.finfo(np.float64).max)
 """Largest magnitude of an edge."""
 UNIT = 128
 """Scores per bit."""
-BOUNDS = (
-    *(1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 110, 128, 155, 190, 230, 275, 325),
-    *(385, 455, 540, 640, 760, 900, 1100, 1350, 1700, 2200),
-)
-"""Sums of scores at which level 1, 2, ... begins; level 16 begins at one bit, at even odds."""
-
 Levels = npt.NDArray[np.uint8]
 
 
@@ -87,18 +84,27 @@ class MaskLevels:
 
         values: the decoded values, finite, in the type in which the tile is transformed.
         """
-        if not any(self.scores) and not any(self.others):
-            return np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.uint8)
-        classes = np.zeros(values.shape, np.uint8)
+        first, second = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.uint8)
+        if not values.size or not (any(self.scores) or any(self.others)):
+            return first, second
         with np.errstate(over="ignore"):
             edges = np.array(self.edges, dtype=values.dtype)
-        for edge in edges:
-            classes += values >= edge
-        alone = np.array(self.scores, dtype=np.int32)
-        first = _LEVELS[_summed(alone[classes], self.reach)]
-        if not self.others:
-            return first, _HALVES[alone][classes]
-        return first, _HALVES[_summed(np.array(self.others, dtype=np.int32)[classes], self.reach)]
+        source = np.ascontiguousarray(values)
+        scores = (ctypes.c_int32 * len(self.scores))(*self.scores)
+        others = (ctypes.c_int32 * len(self.others))(*self.others) if self.others else None
+        function = getattr(native.library(), f"fhash_mask_levels_f{8 * values.dtype.itemsize}")
+        code = function(
+            source.ctypes.data,
+            (ctypes.c_int64 * 4)(*values.shape),
+            *array_arguments(edges),
+            scores,
+            others,
+            self.reach,
+            first.ctypes.data,
+            second.ctypes.data,
+        )
+        checked(code)
+        return first, second
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without those that have their default."""
@@ -129,24 +135,3 @@ class MaskLevels:
             **{name: tuple(numbers) for name, numbers in lists.items()},
             reach=values.get("reach", 0),
         )
-
-
-def _summed(scores: npt.NDArray[np.int32], reach: int) -> npt.NDArray[np.int32]:
-    """Sums over the cubes of that reach along z, y and x, cut at the ends of the tile.
-
-    The sums stop at MAX_SCORE after each axis, so that they stay within int32.
-    """
-    for axis in (1, 2, 3) if reach else ():
-        lines, total = np.moveaxis(scores, axis, 0), scores.copy()
-        out = np.moveaxis(total, axis, 0)
-        for shift in range(1, min(reach, scores.shape[axis] - 1) + 1):
-            out[shift:] += lines[:-shift]
-            out[:-shift] += lines[shift:]
-        scores = np.minimum(total, MAX_SCORE, out=total)
-    return scores
-
-
-_LEVELS: Levels = np.searchsorted(BOUNDS, np.arange(MAX_SCORE + 1), side="right").astype(np.uint8)
-"""First level of each sum of scores."""
-_HALVES: Levels = np.floor_divide(_LEVELS, 2, dtype=np.uint8)
-"""Second level of each sum of scores."""

@@ -1,6 +1,6 @@
-"""Integers of a tile to bytes and back by prediction, native (native/predict.cpp) or portable.
+"""Integers of a tile to bytes and back by prediction (native/predict.cpp).
 
-Both write the same bytes. Under a tight bound on the error this is smaller than a transform: each
+Under a tight bound on the error this is smaller than a transform: each
 value becomes the nearest `origin + step * integer`, with a step of nearly twice the bound, and the
 integers are coded without loss. predictor.py says which vertices predict which. The coder begins
 without a prior: at such a bound a tile holds enough to learn from.
@@ -101,17 +101,12 @@ def encode_predicted(
             their predictions. None counts all.
         predictor: the passes and their weights.
     """
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import predict_portable
-
-        return predict_portable.encode(integers, counted, predictor, blank_state().copy())
     marks = None if counted is None else np.ascontiguousarray(counted, dtype=np.uint8)
     capacity = max(4096, integers.size)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
         result = np.array(integers, dtype=np.int32, order="C")
-        size = library.fhash_encode_predicted(
+        size = native.library().fhash_encode_predicted(
             result.ctypes.data,
             None if marks is None else marks.ctypes.data,
             *_geometry(integers.shape, predictor),
@@ -130,14 +125,9 @@ def decode_predicted(
 
     Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
     """
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import predict_portable
-
-        return predict_portable.decode(bytes(data), shape, predictor, blank_state().copy())
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = library.fhash_decode_predicted(
+    code = native.library().fhash_decode_predicted(
         integers.ctypes.data,
         *_geometry(shape, predictor),
         *state_arguments(blank_state()),

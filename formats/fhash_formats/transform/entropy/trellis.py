@@ -2,9 +2,8 @@
 
 Two quantisers of step 2 delta share the multiples of delta: the first has the even ones, the second
 the odd ones and zero. A trellis of eight states says which of them is next, by the parity of the
-index before (FORMAT.md). The path of least cost is found by the algorithm of
-Viterbi (Forney 1973), natively (native/trellis.cpp) or by trellis_portable.py. A decoder needs none
-of this: it follows the states.
+index before (FORMAT.md, Two quantisers). The path of least cost is found by the algorithm of
+Viterbi (Forney 1973), in native/trellis.cpp. A decoder needs none of this: it follows the states.
 """
 
 from __future__ import annotations
@@ -92,11 +91,6 @@ def _counted(
     buckets = np.empty(vertices, np.uint8)
     counts = np.zeros((2, BUCKETS, RATES), np.int64)
     library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import trellis_portable
-
-        trellis_portable.count(source, table, buckets, counts)
-        return buckets, counts
     guess = f"fhash_trellis_guess_f{source.dtype.itemsize * 8}"
     count = library.fhash_trellis_count if source.dtype == np.int32 else getattr(library, guess)
     checked(
@@ -116,14 +110,8 @@ def _chosen(
 ) -> Integers:
     """The integers of the cheapest path."""
     levels = np.zeros(scaled.shape, np.int32)
-    library = native.library()
-    if library is None:
-        from fhash_formats.transform.entropy import trellis_portable
-
-        trellis_portable.choose(scaled, table, buckets, rates, levels)
-        return levels
     checked(
-        getattr(library, f"fhash_trellis_choose_f{scaled.dtype.itemsize * 8}")(
+        getattr(native.library(), f"fhash_trellis_choose_f{scaled.dtype.itemsize * 8}")(
             _pointer(scaled),
             (ctypes.c_int64 * 4)(*scaled.shape),
             *array_arguments(table),

@@ -31,7 +31,6 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.threads import in_threads, row_parts, usable_threads
-from fhash_formats.transform.head.head_portable import apply_cross, apply_network
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.head.weights import (
     MAX_WEIGHT,
@@ -133,7 +132,8 @@ class Layer:
 class _Constants(NamedTuple):
     """The network in float32 for inputs and activations in integer steps.
 
-    The fields are the arguments of `apply_network` after the decoded values.
+    The output of a layer is scale * (weights @ inputs) + biases. `inverse` is 1 / (2 sigma), `unit`
+    1024 over the length of the clip range.
     """
 
     weights: list[Floats]
@@ -241,12 +241,7 @@ class NeighbourHead:
             )
         if decoded.size == 0:
             return decoded.copy()
-        library = native.library()
-        if library is None:
-            return (apply_cross if self.cross else apply_network)(decoded, *self._constants)
-        return self._apply_native(library, np.ascontiguousarray(decoded), in_place)
-
-    def _apply_native(self, library: ctypes.CDLL, source: Floats, in_place: bool) -> Floats:
+        source = np.ascontiguousarray(decoded)
         rows = source.shape[1] * source.shape[2]
         parts = row_parts(rows, source.size // rows, usable_threads())
         # Threads read the rows of others around theirs, so that they need another array.
@@ -254,7 +249,7 @@ class NeighbourHead:
         arguments = self._native_arguments
 
         def correct(part: tuple[int, int]) -> None:
-            code = library.fhash_head_apply(
+            code = native.library().fhash_head_apply(
                 ctypes.c_void_p(source.ctypes.data),
                 (ctypes.c_int64 * 4)(*source.shape),
                 *part,

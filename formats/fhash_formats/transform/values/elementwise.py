@@ -1,9 +1,7 @@
 """Passes over the values of a tile: error bounds, residuals, casts.
 
-Passes over float32 and float64 are native, all others are portable.
-Tiles are large and these passes are simple, so memory sets their speed. A native pass runs over the
-memory once. A portable pass works in pieces, so that its intermediate results stay in the cache.
-Both give the same bits.
+Passes over float32 and float64 are native (native/values.cpp) and run over the memory once. Other
+types are converted to these where that is exact. The rest is done in pieces that fit the cache.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.support.number_types import is_wide_integer
 
 __all__ = [
     "about_origin",
@@ -40,7 +37,7 @@ Integers = npt.NDArray[np.int32]
 _INT64 = np.iinfo(np.int64)
 
 PIECE = 1 << 14
-"""Values that a portable pass works on at once."""
+"""Values that numpy works on at once."""
 _NATIVE_TYPES = {np.dtype(np.float32): "f32", np.dtype(np.float64): "f64"}
 """Types with native passes, and their names in the library."""
 
@@ -64,46 +61,34 @@ def within(values: Values, decoded: Values, error: float, counted: Mask | None =
         error: the bound, in units of the values.
         counted: the values that are compared; None for all.
     """
-    function = _native("within", values.dtype) if values.dtype == decoded.dtype else None
-    if function is not None:
-        return bool(
-            function(
-                *_pointers(values, decoded, counted),
-                ctypes.c_int64(values.size),
-                ctypes.c_double(error),
-            )
+    if values.dtype.kind != "f":
+        return _integers_within(values, decoded, error, counted)
+    if values.dtype == np.float16:
+        values, decoded = values.astype(np.float32), decoded.astype(np.float32)
+    return bool(
+        _native("within", values.dtype)(
+            *_pointers(values, decoded, counted),
+            ctypes.c_int64(values.size),
+            ctypes.c_double(error),
         )
-    flat_values, flat_decoded, flat_counted = _flat(values, decoded, counted)
-    is_near = _near_integers if is_wide_integer(values.dtype) else _near
-    for piece in pieces(values.size):
-        near = is_near(flat_values[piece], flat_decoded[piece], error)
-        if flat_counted is not None:
-            near |= ~flat_counted[piece]
-        if not bool(np.all(near)):
+    )
+
+
+def _integers_within(values: Values, decoded: Values, error: float, counted: Mask | None) -> bool:
+    """`within` for integers, exact also where float64 is not."""
+    limit = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
+    flat, others = values.reshape(-1), decoded.reshape(-1)
+    mask = None if counted is None else counted.reshape(-1)
+    for piece in pieces(flat.size):
+        value, other = flat[piece], others[piece]
+        if value.dtype.itemsize < 8:
+            value, other = value.astype(np.int64), other.astype(np.int64)
+        # A signed difference may overflow; read as an unsigned number it is right again.
+        difference = np.where(value > other, value - other, other - value).astype(np.uint64)
+        near = difference <= np.uint64(limit)
+        if not bool(np.all(near if mask is None else near | ~mask[piece])):
             return False
     return True
-
-
-def _near(values: Values, decoded: Values, error: float) -> Mask:
-    """`within` value by value, for types that float64 holds exactly."""
-    with np.errstate(all="ignore"):
-        difference = np.abs(values.astype(np.float64) - decoded.astype(np.float64))
-        # A difference of float64 numbers is rounded; the next larger number is not too small.
-        near: Mask = (
-            (values == decoded)
-            | (np.nextafter(difference, np.inf) <= error)
-            | ((values.dtype.itemsize < 8) & (difference <= error))
-        )
-    return near
-
-
-def _near_integers(values: Values, decoded: Values, error: float) -> Mask:
-    """`within` value by value, for integers of 64 bits."""
-    limit = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
-    # A signed difference may overflow; read as an unsigned number it is right again.
-    difference = np.where(values > decoded, values - decoded, decoded - values).astype(np.uint64)
-    near: Mask = difference <= np.uint64(limit)
-    return near
 
 
 def residual_of(
@@ -122,31 +107,18 @@ def residual_of(
         largest: largest magnitude of an integer.
     """
     residual = np.zeros(values.shape, np.int32)
-    function = _native("residual", values.dtype, base.dtype)
-    if function is not None:
-        nonzero = int(
-            function(
-                *_pointers(values, base, counted),
-                ctypes.c_int64(values.size),
-                ctypes.c_double(quantum),
-                ctypes.c_double(largest),
-                *_pointers(residual),
-            )
+    if values.dtype not in _NATIVE_TYPES:
+        values = values.astype(np.float64)
+    nonzero = int(
+        _native("residual", values.dtype, base.dtype)(
+            *_pointers(values, base, counted),
+            ctypes.c_int64(values.size),
+            ctypes.c_double(quantum),
+            ctypes.c_double(largest),
+            *_pointers(residual),
         )
-        return None if nonzero < 0 else (residual, nonzero)
-    flat_values, flat_base, flat_counted = _flat(values, base, counted)
-    flat_residual = residual.reshape(-1)
-    nonzero = 0
-    for piece in pieces(values.size):
-        with np.errstate(all="ignore"):
-            error = flat_values[piece].astype(np.float64) - flat_base[piece].astype(np.float64)
-            error = error if flat_counted is None else np.where(flat_counted[piece], error, 0.0)
-            quanta = np.where(np.abs(error) > quantum / 2, np.rint(error / quantum), 0.0)
-        if not bool(np.all(np.abs(quanta) <= largest)):
-            return None
-        flat_residual[piece] = quanta
-        nonzero += int(np.count_nonzero(flat_residual[piece]))
-    return residual, nonzero
+    )
+    return None if nonzero < 0 else (residual, nonzero)
 
 
 def corrected(
@@ -164,28 +136,15 @@ def corrected(
     """
     if residual is None:
         return base if base.dtype == dtype else cast(base, dtype)
-    function = _native("correct", base.dtype, dtype)
-    result = np.empty(base.shape, dtype)
-    if function is not None:
-        function(
-            *_pointers(base, residual),
-            ctypes.c_int64(base.size),
-            ctypes.c_double(quantum),
-            *_pointers(result),
-        )
-        return result
-    flat_base, flat_residual, flat_result = (
-        base.reshape(-1),
-        residual.reshape(-1),
-        result.reshape(-1),
+    kind = dtype if dtype in _NATIVE_TYPES else np.dtype(np.float64)
+    result = np.empty(base.shape, kind)
+    _native("correct", base.dtype, kind)(
+        *_pointers(base, residual),
+        ctypes.c_int64(base.size),
+        ctypes.c_double(quantum),
+        *_pointers(result),
     )
-    for piece in pieces(base.size):
-        with np.errstate(all="ignore"):
-            flat_result[piece] = _cast_piece(
-                flat_base[piece].astype(np.float64) + flat_residual[piece] * np.float64(quantum),
-                dtype,
-            )
-    return result
+    return result if kind == dtype else cast(result, dtype)
 
 
 def cast(values: Values, dtype: np.dtype[Any]) -> Values:
@@ -198,21 +157,14 @@ def cast(values: Values, dtype: np.dtype[Any]) -> Values:
             return values.astype(dtype)
     result = np.empty(values.shape, dtype)
     flat_values, flat_result = values.reshape(-1), result.reshape(-1)
-    for piece in pieces(values.size):
-        flat_result[piece] = _cast_piece(flat_values[piece], dtype)
-    return result
-
-
-def _cast_piece(values: Values, dtype: np.dtype[Any]) -> Values:
-    """`cast` of one piece."""
-    if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return values.astype(dtype)
     limits = np.iinfo(dtype)
     # float64 cannot hold the largest 64-bit integers; the number below them is in the range.
     low, high = float(limits.min), float(limits.max)
     high = high if int(high) <= limits.max else float(np.nextafter(high, 0.0))
-    return np.clip(np.rint(np.nan_to_num(values.astype(np.float64))), low, high).astype(dtype)
+    for piece in pieces(values.size):
+        rounded = np.rint(np.nan_to_num(flat_values[piece].astype(np.float64)))
+        flat_result[piece] = np.clip(rounded, low, high)
+    return result
 
 
 def clip_shifted(values: Values, center: float, low: float, high: float) -> Values:
@@ -220,18 +172,13 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
 
     `center`, `low` and `high` are first rounded to the type of the values.
     """
-    function = _native("clip", values.dtype)
-    if function is not None and values.flags.c_contiguous:
-        function(
-            *_pointers(values),
-            ctypes.c_int64(values.size),
-            *(ctypes.c_double(number) for number in (center, low, high)),
-        )
-        return values
-    kind = values.dtype.type
-    with np.errstate(all="ignore"):
-        values += kind(center)
-        return np.clip(values, kind(low), kind(high), out=values)
+    assert values.flags.c_contiguous, "they are changed in place"
+    _native("clip", values.dtype)(
+        *_pointers(values),
+        ctypes.c_int64(values.size),
+        *(ctypes.c_double(number) for number in (center, low, high)),
+    )
+    return values
 
 
 def about_origin(values: Values, origin: int) -> Values:
@@ -299,26 +246,14 @@ def free_values(
         high: upper end of the range.
     """
     assert target.flags.c_contiguous, "it is changed in place"
-    function = _native("free", target.dtype)
-    if function is not None:
-        return int(
-            function(
-                *_pointers(target, rebuilt, counted),
-                ctypes.c_int64(target.size),
-                ctypes.c_double(low),
-                ctypes.c_double(high),
-            )
+    return int(
+        _native("free", target.dtype)(
+            *_pointers(target, rebuilt, counted),
+            ctypes.c_int64(target.size),
+            ctypes.c_double(low),
+            ctypes.c_double(high),
         )
-    kind = target.dtype.type
-    flat_target, flat_rebuilt, flat_counted = _flat(target, rebuilt, counted)
-    total = 0
-    for piece in pieces(target.size):
-        value, new = flat_target[piece], flat_rebuilt[piece]
-        free = ((value <= kind(low)) & (new < value)) | ((value >= kind(high)) & (new > value))
-        free = free if flat_counted is None else free | ~flat_counted[piece]
-        value[free] = new[free]
-        total += int(np.count_nonzero(free))
-    return total
+    )
 
 
 def pieces(size: int) -> Iterator[slice]:
@@ -326,18 +261,10 @@ def pieces(size: int) -> Iterator[slice]:
     return (slice(start, start + PIECE) for start in range(0, size, PIECE))
 
 
-def _flat(values: Values, others: Values, mask: Mask | None) -> tuple[Values, Values, Mask | None]:
-    """Three arrays of one shape as flat views."""
-    return values.reshape(-1), others.reshape(-1), None if mask is None else mask.reshape(-1)
-
-
 def _native(name: str, *types: np.dtype[Any]) -> Any:
-    """The native function for arrays of these types; None where there is none."""
-    library = native.library()
-    if library is None or not all(kind in _NATIVE_TYPES for kind in types):
-        return None
-    function = getattr(library, "_".join(["fhash", name, *(_NATIVE_TYPES[kind] for kind in types)]))
-    return function
+    """The native function for arrays of these types, each float32 or float64."""
+    ends = [_NATIVE_TYPES[kind] for kind in types]
+    return getattr(native.library(), "_".join(["fhash", name, *ends]))
 
 
 def _pointers(*arrays: Values | None) -> list[ctypes.c_void_p]:

@@ -42,19 +42,10 @@ def quantise(
         rounding: fraction of a step added before rounding down.
     """
     width, scale = coefficients.dtype.itemsize * 8, 1.0 / step
-    library = native.library()
-    if library is None:
-        kind = coefficients.dtype.type
-        exact = coefficients * kind(scale)
-        magnitude = np.abs(exact)
-        magnitude = np.where(
-            magnitude < kind(LARGEST), magnitude + kind(rounding), kind(LARGEST)
-        ).astype(np.int32)
-        return np.where(exact < 0, -magnitude, magnitude), exact.astype(np.float32)
     integers = np.empty(coefficients.shape, np.int32)
     scaled = np.empty(coefficients.shape, np.float32)
     source = np.ascontiguousarray(coefficients)
-    getattr(library, f"fhash_quantise_f{width}")(
+    getattr(native.library(), f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
         *(ctypes.c_double(number) for number in (scale, rounding, LARGEST)),
@@ -82,16 +73,8 @@ def dequantise(
     kind: np.dtype[Any] = np.dtype(dtype)
     six = offsets if len(offsets) == 6 else (*offsets[:2], *offsets[2:] * 4)
     shifts = np.array(six, dtype=np.float64) / OFFSET_UNIT
-    library = native.library()
-    if library is None:
-        magnitude = np.abs(integers)
-        number = np.where(magnitude < 5, magnitude, 6 - (magnitude & 1))
-        offset = np.concatenate([[0.0], shifts]).astype(kind)[number]
-        with np.errstate(over="ignore"):
-            value: Values = (magnitude.astype(kind) + offset) * np.array(step, dtype=kind)
-        return np.where(integers < 0, -value, value)
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
-    getattr(library, f"fhash_dequantise_f{kind.itemsize * 8}")(
+    getattr(native.library(), f"fhash_dequantise_f{kind.itemsize * 8}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
         ctypes.c_double(step),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec import native
 from fhash_codec.bench.pictures.orbit import orbit, shell
 
 
@@ -17,7 +16,6 @@ def test_a_shell_lies_about_the_middle() -> None:
     assert values[20, 20, 20] == values[0, 0, 0] == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.skipif(native.library() is None, reason="cells are the native marcher's")
 def test_pictures_with_kept_bricks_take_the_same_samples() -> None:
     unlit, lit = orbit(2, 24, side=40)
     assert unlit.name == "shell of 40^3, unlit: bricks kept"

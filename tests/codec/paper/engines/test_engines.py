@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from fhash_codec.native import network
 from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import describe_engine, make_engine
@@ -23,7 +22,7 @@ def test_unknown_engines_are_refused(noise_coreset) -> None:
         )
 
 
-def test_auto_is_native_where_it_takes_the_model_and_else_slab(noise_coreset, monkeypatch) -> None:
+def test_auto_is_native_where_it_takes_the_model_and_else_slab(noise_coreset) -> None:
     coreset = noise_coreset((1, 2, 2, 2))
 
     def chosen(hidden_layers):
@@ -31,26 +30,12 @@ def test_auto_is_native_where_it_takes_the_model_and_else_slab(noise_coreset, mo
         return make_engine("auto", architecture, coreset, np.zeros(1), seed=0, device=CPU)
 
     engine = chosen(2)
-    if network.library() is None:
-        assert describe_engine(engine, 3) == {"engine": "slab", "threads": 3}
-    else:
-        assert describe_engine(engine, 3) == {
-            "engine": "native",
-            "threads": 3,
-            "path": machine_paths()[0],
-        }
+    assert describe_engine(engine, 3) == {
+        "engine": "native",
+        "threads": 3,
+        "path": machine_paths()[0],
+    }
     assert chosen(3).name == "slab"
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert chosen(2).name == "slab"
-
-
-def test_an_engine_that_was_named_is_never_replaced(noise_coreset, monkeypatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    architecture = Architecture.for_box((2, 2, 2), 1)
-    with pytest.raises(InputError, match="native library is missing"):
-        make_engine(
-            "native", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
-        )
 
 
 def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:

@@ -13,7 +13,6 @@ import pytest
 import torch
 from engine_checks import assert_near
 
-from fhash_codec.native import network
 from fhash_codec.native.network import PATHS, machine_paths
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.naive import NaiveEngine
@@ -48,9 +47,6 @@ CASES = {
     "64 neurons twice": ((2, 9, 12, 20), {"hidden_layers": 2, "width": 64, "low": 0.5}),
     "128 neurons twice": ((1, 9, 12, 20), {"hidden_layers": 2, "width": 128}),
 }
-
-if network.library() is None:
-    pytest.skip("the native library was not built here", allow_module_level=True)
 
 
 @pytest.fixture(params=PATHS)
@@ -321,7 +317,7 @@ def test_a_state_of_another_model_is_refused(model_of) -> None:
         engine.restore({"step": np.array(3)})
 
 
-def test_what_it_does_not_take_is_named(model_of, monkeypatch) -> None:
+def test_what_it_does_not_take_is_named(model_of) -> None:
     coreset, architecture = model_of("plain")
 
     def refused(match, **changes):
@@ -334,6 +330,3 @@ def test_what_it_does_not_take_is_named(model_of, monkeypatch) -> None:
     assert "device is 'cuda'" in str(refusal(architecture, torch.device("cuda")))
     with pytest.raises(InputError, match="path is 'quick'"):
         NativeEngine(architecture, coreset, RATES, seed=7, path="quick")
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    assert machine_paths() == []
-    refused("native library is missing")

@@ -105,11 +105,9 @@ def test_points_have_the_bits_of_a_dense_one(random_model) -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
-def test_points_of_one_time_are_found_by_ranks(random_model, monkeypatch, native, key) -> None:
+def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
     """Pictures through the network do so, on the numpy path and on the native one."""
-    monkeypatch.setenv("FHASH_NATIVE", native)
     dense = random_model.network(fill=0.0)
     network = sparse(dense, random_model)
     tables = PointTables.of_box(network, key)
@@ -134,9 +132,7 @@ def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
 
 
 @pytest.mark.parametrize("box", [(1, 6, 9), (5, 1, 9), (5, 6, 1), (1, 1, 1)])
-@pytest.mark.parametrize("native", ["0", "1"])
-def test_an_axis_of_one_vertex(monkeypatch, native, box) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", native)
+def test_an_axis_of_one_vertex(box) -> None:
     chance = np.random.default_rng(4)
     mask = chance.random(box) < 0.5
     held = chance.normal(size=(int(mask.sum()), 3)).astype(np.float32)

@@ -57,12 +57,8 @@ def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_pat
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
-def test_a_checkpoint_of_whole_bricks_is_refused(
-    coreset, architecture, tmp_path, native, monkeypatch
-) -> None:
+def test_a_checkpoint_of_whole_bricks_is_refused(coreset, architecture, tmp_path) -> None:
     """The finest embeddings were once stored for all vertices of the bricks."""
-    monkeypatch.setenv("FHASH_NATIVE", native)
     device = torch.device("cpu")
     engine = make_engine("auto", architecture, coreset, np.zeros(2), seed=0, device=device)
     whole = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)

@@ -64,8 +64,6 @@ def test_limits_lie_around_what_is_seen() -> None:
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing) -> None:
     library = native.library()
-    if library is None:
-        pytest.skip("no native library")
     values = noise(shape, missing)
     values[-1, -1, -1] = 0.9
     bricks = bricks_of(values)
@@ -108,8 +106,6 @@ def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing
 
 def test_where_most_cells_are_seen_they_are_not_looked_for() -> None:
     library = native.library()
-    if library is None:
-        pytest.skip("no native library")
     values = noise((17, 17, 17))
     bricks = bricks_of(values)
     for extinctions in ([1.0, 1.0], [0.0, 0.0], [0.0, 1.0] * 20 + [0.0, 0.0, 1.0] * 20):

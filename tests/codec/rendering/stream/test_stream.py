@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, native
+from fhash_codec import Renderer, Scene
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.stream.beams import Beams
 from fhash_codec.rendering.stream.fields import FrameField
@@ -29,7 +29,6 @@ def picture(
     )
 
 
-@pytest.mark.skipif(native.library() is None, reason="compares with the native packets")
 def test_three_ways_make_one_picture(renderer: Renderer, scene: dict[str, Any]) -> None:
     cache, streamed, adaptive = (
         picture(renderer, mode, scene) for mode in ("cache", "stream", "arm")

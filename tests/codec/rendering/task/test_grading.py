@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec import Renderer, Scene, Volume, native
+from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering.task.grading import factors_at_vertices
 from fhash_codec.rendering.task.task import GRADES, Grading
 
@@ -25,7 +25,7 @@ def test_a_gradient_is_a_share_of_the_range_in_the_distance_of_two_vertices(volu
     assert Renderer(volume).plan(Scene()).task.grading is None
 
 
-def test_factors_at_vertices_are_those_of_their_gradients(way: str) -> None:
+def test_factors_at_vertices_are_those_of_their_gradients() -> None:
     z, y, x = np.mgrid[:5, :6, :7].astype(np.float32)
     slope = np.ascontiguousarray(0.5 * x - 0.3 * y + 0.4 * z)
     spacing = np.array([1.0, -0.5, 2.0])
@@ -35,15 +35,13 @@ def test_factors_at_vertices_are_those_of_their_gradients(way: str) -> None:
     assert np.all(factors_at_vertices(np.ones((1, 1, 1), np.float32), LINEAR, spacing) == 0)
 
 
-def test_neighbours_that_are_missing_do_not_count(way: str) -> None:
+def test_neighbours_that_are_missing_do_not_count() -> None:
     row = np.array([[[0.0, 1.0, np.nan, 5.0, np.nan, np.nan, 8.0, 9.0]]], dtype=np.float32)
     factors = factors_at_vertices(row, LINEAR, np.ones(3))[0, 0]
     np.testing.assert_allclose(factors, [0.5, 0.5, 0, 0, 0, 0, 0.5, 0.5], atol=1e-6)
 
 
-def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(
-    volume: Volume, way: str
-) -> None:
+def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(volume: Volume) -> None:
     """Their inverse would be infinite, and infinity times a gradient of 0 is no number."""
     scene = Scene.from_dict({"transfer_function": {"gradient_opacity": [[0, 0], [5e-324, 1]]}})
     grading = Renderer(volume).plan(scene).task.grading
@@ -52,13 +50,3 @@ def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(
     row = np.array([[[3.0, 3.0, 3.0, 4.0]]], dtype=np.float32)
     for spacing in (np.ones(3), np.full(3, 1e-30)):
         assert factors_at_vertices(row, grading, spacing).tolist() == [[[0, 0, 1, 1]]]
-
-
-@pytest.mark.skipif(native.library() is None, reason="needs the native library")
-def test_both_ways_to_find_factors_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = np.random.default_rng(2).random((7, 8, 9), dtype=np.float32)
-    values[values > 0.9] = np.nan
-    fast = factors_at_vertices(values, LINEAR, np.array([1.0, 0.5, 2.0]))
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    slow = factors_at_vertices(values, LINEAR, np.array([1.0, 0.5, 2.0]))
-    np.testing.assert_allclose(fast, slow, atol=1e-6)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task import light as light_module
@@ -34,7 +33,7 @@ def table_of(extinctions):
 
 @pytest.mark.parametrize("resolution", [1.0, 2.0])
 @pytest.mark.parametrize("spacing", [1.0, -0.5])
-def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing) -> None:
+def test_the_shadow_within_a_slab_is_its_closed_form(resolution, spacing) -> None:
     shape = (41, 9, 9)
     settings = Shadows(strength=0.75, resolution=resolution)
     lamp = UP * np.sign(spacing)
@@ -54,7 +53,7 @@ def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing) -
     assert light.secondary_rays == light.shares[..., 0].size
 
 
-def test_a_block_throws_its_shadow_away_from_the_lamp(way) -> None:
+def test_a_block_throws_its_shadow_away_from_the_lamp() -> None:
     values = np.zeros((40, 40, 40))
     values[18:22, 18:22, 18:22] = 1.0
     lamp = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
@@ -72,7 +71,7 @@ def test_a_block_throws_its_shadow_away_from_the_lamp(way) -> None:
     assert lamp_share[10, 30, 10] > 0.99
 
 
-def test_surroundings_take_light_only_where_there_are_any(way) -> None:
+def test_surroundings_take_light_only_where_there_are_any() -> None:
     values = np.zeros((40, 40, 40))
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
@@ -86,35 +85,7 @@ def test_surroundings_take_light_only_where_there_are_any(way) -> None:
     assert np.all(np.diff(around[2:-2]) >= -1e-6)
 
 
-def test_native_and_numpy_agree(monkeypatch) -> None:
-    if native.library() is None:
-        pytest.skip("no native library")
-    values = np.random.default_rng(4).uniform(size=(23, 30, 17)).astype(np.float32)
-    values[3:6, 4:9, 5:7] = np.nan
-    table = table_of(np.linspace(0, 0.4, 50))
-    lamp = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
-    found = []
-    for choice in ("1", "0"):
-        monkeypatch.setenv("FHASH_NATIVE", choice)
-        for stride, resolution in ((1, 1.0), (1, 3.0), (2, 4.0)):
-            found.append(
-                light_grid(
-                    frame_of(values, stride),
-                    grid_of((46, 60, 34), (1.0, 0.5, 2.0)),
-                    table,
-                    shadows=Shadows(resolution=resolution),
-                    lamp=lamp,
-                    ambient_occlusion=AmbientOcclusion(),
-                )
-            )
-    for one, other in zip(found[:3], found[3:], strict=True):
-        np.testing.assert_allclose(one.shares, other.shares, atol=1e-4)
-        assert one.cell == other.cell
-        assert one.shares.min() >= 0
-        assert one.shares.max() <= 1
-
-
-def test_nothing_that_takes_light_leaves_all_of_it(way) -> None:
+def test_nothing_that_takes_light_leaves_all_of_it() -> None:
     for table in (None, table_of([0.0, 0.0])):
         light = light_grid(
             frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table, shadows=Shadows(), lamp=UP
@@ -133,7 +104,7 @@ def test_shadows_need_a_lamp() -> None:
         )
 
 
-def test_opacity_by_gradient_takes_as_little_light_as_it_draws(way) -> None:
+def test_opacity_by_gradient_takes_as_little_light_as_it_draws() -> None:
     # A ball of even values inside and outside: only its rim has a gradient.
     z, y, x = np.mgrid[-15:16, -15:16, -15:16]
     ball = np.where(np.sqrt(x * x + y * y + z * z) < 9, 1.0, 0.0)

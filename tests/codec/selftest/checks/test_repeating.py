@@ -7,13 +7,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.selftest.case import Check, Run
 from fhash_codec.selftest.checks import repeating
-from fhash_formats import native
 
 Broken = Callable[[Run, Check], set[str]]
 
@@ -38,15 +36,6 @@ def test_bytes_that_depend_on_the_threads_are_seen(
     run = replace(compact_run, thorough=thorough)
     assert broken(run, repeating.same_bytes) == {"same bytes by other threads"}
     assert counts == [1, 2] if thorough else len(counts) == 1
-
-
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-def test_values_of_the_portable_decoder_that_differ_are_seen(
-    run: Run, broken: Broken, spoiled: Callable[..., Run]
-) -> None:
-    values = run.decoded.copy()
-    values[1, 2, 3, 4] += np.float32(1e-3)
-    assert broken(spoiled(run, values), repeating.portable) == {"portable = native"}
 
 
 def test_bytes_that_differ_are_counted(tmp_path: Path) -> None:

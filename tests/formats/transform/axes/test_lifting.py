@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from specs import MIXES, SHAPES, TYPES, axis_of, mixes_and_depths, noise, spec_of
 
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.lifting import MAX_LOD, Transform
 from fhash_formats.transform.axes.spec import KINDS, AxisTransform, TransformSpec
@@ -66,8 +65,6 @@ def test_one_run_gives_the_bits_of_its_three_steps(
     center: float,
     empty: str,
 ) -> None:
-    if native.library() is None:
-        pytest.skip("the native library is not built")
     transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
     random = np.random.default_rng(5)
     integers = (random.integers(-9, 10, shape) * (random.random(shape) < 0.1)).astype(np.int32)
@@ -187,9 +184,7 @@ def test_entries_beyond_the_rank_are_zero() -> None:
     assert transform.inverse(changed).tobytes() == transform.inverse(coefficients).tobytes()
 
 
-@pytest.mark.parametrize("setting", ["1", "0"])
-def test_a_basis_of_rank_0_gives_zeros(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", setting)
+def test_a_basis_of_rank_0_gives_zeros() -> None:
     shape = (2, 3, 4, 5)
     none = AxisTransform(kind="none")
     z, x = axis_of("klt", 0, 3, step=1e9), axis_of("klt", 0, 5, step=1e9)
@@ -232,10 +227,8 @@ def test_threads_share_a_transform() -> None:
     )
 
 
-@pytest.mark.parametrize("setting", ["1", "0"])
 @pytest.mark.filterwarnings("error")
-def test_hostile_coefficients_raise_nothing(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", setting)
+def test_hostile_coefficients_raise_nothing() -> None:
     shape = (2, 4, 8, 8)
     transform = Transform(spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
     coefficients = np.full(shape, np.float32(3e38))
@@ -273,10 +266,8 @@ def test_other_arrays_are_refused() -> None:
         transform.inverse(np.zeros((1, 1, 2, 3), np.float32))
 
 
-@pytest.mark.parametrize("setting", ["1", "0"])
-def test_the_bits_of_the_transform_are_fixed(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bits_of_the_transform_are_fixed() -> None:
     """A file must decode to the same bits for ever: the digests hold for the format version."""
-    monkeypatch.setenv("FHASH_NATIVE", setting)
     shape = (3, 5, 13, 18)
     integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
     digests = {}

@@ -1,14 +1,11 @@
-"""The coder of labels: what was coded comes back, and both engines write the same bytes."""
+"""The coder of labels: what was coded comes back."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from fhash_formats import native
-from fhash_formats.transform.entropy import labels_portable
 from fhash_formats.transform.entropy.labels import (
-    blank_label_state,
     decode_labels,
     encode_labels,
 )
@@ -33,30 +30,6 @@ def test_labels_come_back(shape, count, noise) -> None:
     decoded = decode_labels(data, count, shape)
     assert decoded.dtype == source.dtype
     np.testing.assert_array_equal(decoded, source)
-
-
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("count", [2, 5, 256, 257, 3000])
-def test_both_engines_write_the_same_bytes(shape, count, monkeypatch) -> None:
-    sources = [labels(shape, count, noise) for noise in (0.05, 1.0)]
-    data = [encode_labels(source, count) for source in sources]
-    garbage = np.random.default_rng(0).bytes(40)
-    of_garbage = decode_labels(garbage, count, shape)
-    assert of_garbage.max() < count
-    monkeypatch.setenv("FHASH_NATIVE", "0")
-    for source, stream in zip(sources, data, strict=True):
-        assert encode_labels(source, count) == stream
-        np.testing.assert_array_equal(decode_labels(stream, count, shape), source)
-    np.testing.assert_array_equal(decode_labels(garbage, count, shape), of_garbage)
-
-
-def test_the_engines_agree_on_their_sizes() -> None:
-    for wide, sizes in ((False, labels_portable.SIZES), (True, labels_portable.WIDE_SIZES)):
-        state = blank_label_state(wide)
-        assert len(state.slots) == sum(sizes)
-        assert len(state.weights) % labels_portable.LANES == 0
-        assert len(state.simples) == labels_portable.NEXT + wide
 
 
 def test_regions_take_few_bytes_and_noise_hardly_more_than_its_entropy() -> None:

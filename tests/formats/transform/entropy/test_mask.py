@@ -1,15 +1,11 @@
-"""The coder of masks: round trips, the same bytes from every engine, damaged bytes."""
+"""The coder of masks: round trips, fixed bytes, damaged bytes."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_formats import native
-from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.mask import (
     decode_mask,
     encode_mask,
@@ -26,21 +22,6 @@ SHAPES = [
     (2, 5, 16, 16),
     (1, 1, 11, 17),
 ]
-
-
-@pytest.fixture(params=["native", "compiled", "plain"])
-def form(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Engine: native, compiled (portable, by numba) or plain (portable, in Python)."""
-    with pytest.MonkeyPatch.context() as patch:
-        if request.param != "native":
-            patch.setenv("FHASH_NATIVE", "0")
-        elif native.library() is None:
-            pytest.skip("the native library was not built here")
-        if request.param == "plain":
-            patch.setattr(mixing_portable, "_numba", lambda: None)
-        elif request.param == "compiled" and mixing_portable._numba() is None:
-            pytest.skip("numba cannot be imported here")
-        yield request.param
 
 
 def masks(shape: tuple[int, ...]) -> dict[str, npt.NDArray[np.bool_]]:
@@ -69,7 +50,7 @@ def levels_for(
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_a_mask_comes_back(shape: tuple[int, ...], form: str) -> None:
+def test_a_mask_comes_back(shape: tuple[int, ...]) -> None:
     for mask in masks(shape).values():
         for kind in ("nothing known", "noise", "likely"):
             levels = levels_for(kind, mask)
@@ -78,7 +59,7 @@ def test_a_mask_comes_back(shape: tuple[int, ...], form: str) -> None:
             np.testing.assert_array_equal(decoded, mask)
 
 
-def test_every_form_gives_the_same_bytes(form: str) -> None:
+def test_the_bytes_are_fixed() -> None:
     """The bytes are part of the format, so their lengths and checksums are written here."""
     results = {}
     for name, mask in masks((3, 2, 9, 33)).items():
@@ -120,7 +101,7 @@ def test_what_the_levels_tell_need_not_be_coded() -> None:
     assert 3 * len(told) < len(untold) < mask.size / 50
 
 
-def test_damaged_bytes_give_some_mask(form: str) -> None:
+def test_damaged_bytes_give_some_mask() -> None:
     mask = masks((2, 3, 9, 17))["a ball"]
     levels = levels_for("likely", mask)
     data = encode_mask(mask, levels)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.entropy.mask_levels import BOUNDS, MAX_SCORE, MaskLevels
+from fhash_formats.transform.entropy.mask_levels import MAX_SCORE, MaskLevels
+from reference.masks import BOUNDS, mask_levels
 
 
 def test_levels_rise_with_the_value_and_reach_as_far_as_the_feature_grew() -> None:
@@ -26,6 +27,24 @@ def test_levels_rise_with_the_value_and_reach_as_far_as_the_feature_grew() -> No
     )[0]
     assert list(rising.ravel()) == [0, 16, 16, levels.max()]
     assert all(low < high <= MAX_SCORE for low, high in pairwise(BOUNDS))
+
+
+@pytest.mark.parametrize("reach", [0, 1, 3, 64])
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 17), (1, 9, 1, 40), (3, 1, 70, 2)])
+def test_levels_are_those_of_the_reference(shape: tuple[int, ...], dtype: str, reach: int) -> None:
+    random = np.random.default_rng(reach)
+    values = random.normal(size=shape).astype(dtype)
+    values.flat[::5] = 0.5
+    for others in ((), (9, 0, 4095, 30)):
+        scores = MaskLevels(
+            edges=(-1.0, 0.5, 1e300), scores=(0, 3, 900, 4095), others=others, reach=reach
+        )
+        found = scores.levels(values)
+        expected = mask_levels(values, scores.to_dict())
+        for one, other in zip(found, expected, strict=True):
+            assert one.dtype == np.uint8
+            np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize(

@@ -16,15 +16,11 @@ from fhash_formats.transform.head.inputs import CROSS, INPUTS, OFFSETS
 
 
 @pytest.mark.parametrize("cross", [False, True])
-@pytest.mark.parametrize("environment", ["0", "1"])
-def test_the_arithmetic_is_the_stated_one(
-    environment: str, cross: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_arithmetic_is_the_stated_one(cross: bool) -> None:
     """Voxel by voxel in float64, from the definition.
 
     The results are equal up to the rounding of inputs and activations.
     """
-    monkeypatch.setenv("FHASH_NATIVE", environment)
     head = random_head(seed=7, spread=8.0 if cross else 16.0, cross=cross)
     tile = np.random.default_rng(2).uniform(-1, 2.5, (3, 4, 5, 9)).astype(np.float32)
     hidden, expected = np.empty((*tile.shape, head.hidden[0])), np.empty(tile.shape)

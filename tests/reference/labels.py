@@ -1,0 +1,197 @@
+"""Tiles of few distinct values: a palette, and for each vertex its number in it.
+
+Labels around a vertex that are known are its *candidates*, those that occur more often first. A
+decision asks for each of the first three whether the vertex has it; a label that is none of them
+is spelled bit by bit. Rows have segments with flags, as masks have.
+"""
+
+from __future__ import annotations
+
+import zlib
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from reference.adaptive import Adaptive
+from reference.masks import PAD, SEGMENT, common
+
+Labels = npt.NDArray[Any]
+
+NONE, MIXED, NOTHING = 65536, 65537, 65538
+"""Label of a vertex that does not exist; states of segments, as of masks."""
+AROUND = (
+    *((0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (-1, 0, 0, 0)),
+    *((0, 0, -1, -1), (0, 0, -1, 1)),
+    *((0, -1, 0, 1), (0, -1, 0, -1), (0, -1, 1, 0), (0, -1, -1, 0)),
+    *((-1, 0, 0, 1), (-1, 0, 0, -1), (-1, 0, 1, 0), (-1, 0, -1, 0), (-1, 1, 0, 0), (-1, -1, 0, 0)),
+    *((0, 0, 0, -2), (0, 0, -2, 0), (0, -2, 0, 0), (-2, 0, 0, 0)),
+)
+"""Offsets to the neighbours of a vertex; the first four are the nearest."""
+PLANE, BELOW, BEFORE = (0, 1, 4, 5, 16, 17), (2, 6, 7, 8, 9), (3, 10, 11, 12, 13, 14, 15)
+"""Numbers of the neighbours in the same layer, in the one below and in the step before."""
+DIAGONAL = (6, 8, 10, 12)
+SIZES = (3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288)
+"""Contexts of each of the eight estimates of a decision about a candidate."""
+STARTS = [sum(SIZES[:i]) for i in range(9)]
+LANES = 16
+"""Weights of a set."""
+CANDIDATE_SETS = 3 * 16 + 3 * 4
+
+
+def unpack_labelled(
+    body: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any], masked: bool, many: bool
+) -> tuple[Labels, npt.NDArray[Any] | None]:
+    """The values of a tile of labels, and which are occupied; None without a mask."""
+    unsigned, start = f"<u{dtype.itemsize}", 8 + int.from_bytes(body[4:8], "little")
+    plain = zlib.decompress(body[8:start])
+    if many:  # differences, all lowest bytes first
+        planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+        steps = np.ascontiguousarray(planes.T).view(unsigned).reshape(-1)
+        palette = np.cumsum(steps, dtype=unsigned)
+    else:
+        palette = np.frombuffer(plain, unsigned)
+    count = len(palette) + masked  # the last label stands for vertices that are not occupied
+    labels = LabelDecoder(body[start:], count, shape).run()
+    if zlib.crc32(labels.astype("<u2" if many else "u1").tobytes()) != int.from_bytes(
+        body[:4], "little"
+    ):
+        raise ValueError("the decoded labels of a tile differ from their digest")
+    values = np.append(palette, [palette.dtype.type(0)])[labels]
+    return values.view(dtype.newbyteorder("<")), labels < len(palette) if masked else None
+
+
+class LabelDecoder:
+    """The labels known so far."""
+
+    def __init__(self, data: bytes | memoryview, count: int, shape: tuple[int, ...]) -> None:
+        self.count, self.wide, self.shape = count, count > 256, shape
+        levels = 16 if self.wide else 8
+        runs = [(3 * 16, 3072), (3 * 4, 0), (levels, 4096), (4, 0)]
+        weights = [weight for sets, weight in runs for _ in range(sets * LANES)]
+        bit_slots = 4 * 65536 if self.wide else 256 + 3 * 16384
+        self.adaptive = Adaptive(data, STARTS[8] + bit_slots, weights, 10 + self.wide)
+        self.known = np.full([n + 2 * PAD for n in shape], NONE)
+        segments = [*shape[:3], -(-shape[3] // SEGMENT)]
+        self.states = np.full([n + 2 for n in segments], NOTHING)  # one more at each end
+        self.highest = -1
+
+    def run(self) -> Labels:
+        """The labels (t, z, y, x)."""
+        for t, z, y in product(*map(range, self.shape[:3])):
+            row = self.known[t + PAD, z + PAD, y + PAD, PAD:]
+            for s in range(self.states.shape[3] - 2):
+                end = min((s + 1) * SEGMENT, self.shape[3])
+                same, flag = self.around_segment(t + 1, z + 1, y + 1, s + 1)
+                if same < NONE and self.adaptive.simple(flag):
+                    row[s * SEGMENT : end] = same
+                    state = same
+                else:
+                    for x in range(s * SEGMENT, end):
+                        row[x] = self.vertex(t, z, y, x)
+                        self.highest = max(self.highest, int(row[x]))
+                    found = set(row[s * SEGMENT : end].tolist())
+                    state = found.pop() if len(found) == 1 else MIXED
+                self.states[t + 1, z + 1, y + 1, s + 1] = state
+        return self.known[(slice(PAD, -PAD),) * 4]
+
+    def around_segment(self, t: int, z: int, y: int, s: int) -> tuple[int, int]:
+        """The state that all segments around one have, and the number of the flag's estimate."""
+        rows = [self.states[t, z, y - 1], self.states[t, z - 1, y], self.states[t - 1, z, y]]
+        near = [int(self.states[t, z, y, s - 1]), *(int(row[s]) for row in rows)]
+        same, existing = common(near, NOTHING, MIXED)
+        differing = any(row[s + 1] not in (NOTHING, same) for row in rows)
+        return same, existing * 2 + differing
+
+    def vertex(self, t: int, z: int, y: int, x: int) -> int:
+        """Decode the label of a vertex."""
+        around = [
+            int(self.known[t + a + PAD, z + b + PAD, y + c + PAD, x + d + PAD])
+            for a, b, c, d in AROUND
+        ]
+        candidates: list[int] = []
+        votes: dict[int, int] = {}
+        for i, label in enumerate(around):
+            if label == NONE or (label not in votes and len(candidates) == 4):
+                continue
+            if label not in votes:
+                candidates.append(label)
+            votes[label] = votes.get(label, 0) + (3 if i < 4 else 1)
+            k = candidates.index(label)
+            while k and votes[label] > votes[candidates[k - 1]]:
+                candidates[k - 1 : k + 1] = label, candidates[k - 1]
+                k -= 1
+        tested = candidates[:3]
+        for k, candidate in enumerate(tested):
+            if k == self.count - 1 or self.has(k, candidates, around):
+                return candidate
+        return self.spelled(tested, around)
+
+    def has(self, k: int, candidates: list[int], around: list[int]) -> int:
+        """Whether the vertex has candidate k."""
+        equal = [int(label == candidates[k]) for label in around]
+
+        def pattern(numbers: tuple[int, ...]) -> int:
+            return sum(equal[number] << i for i, number in enumerate(numbers))
+
+        c, found = self.key(candidates[k]), len(candidates)
+        other = self.key(candidates[0 if k else 1]) if found > 1 else 256
+        near, second = pattern((0, 1, 2, 3)), pattern((16, 17, 18, 19))
+        plane, below, before = pattern(PLANE), pattern(BELOW), pattern(BEFORE)
+        in_plane, in_below, in_before = (
+            sum(equal[number] for number in group) for group in (PLANE, BELOW, BEFORE)
+        )
+        mixed = (equal[2] << 6) | (equal[3] << 7) | pattern(DIAGONAL) << 8
+        contexts = (
+            ((k * 4 + found - 1) * 16 + near) * 16 + second,
+            (k * 64 + plane) * 32 + below,
+            (k * 128 + before) * 16 + near,
+            ((256 if k else 0) + c) * 16 + near,
+            (c * 259 + other & 4095) * 16 + near,
+            ((k * 7 + in_plane) * 6 + in_below) * 8 + in_before,
+            k << 12 | mixed | plane,
+            k << 12 | before << 5 | below,
+        )
+        slots = [start + context for start, context in zip(STARTS, contexts, strict=False)]
+        sets = ((k * 16 + near) * LANES, (3 * 16 + k * 4 + found - 1) * LANES)
+        return self.adaptive.mixed(slots, sets, rate=2)
+
+    def key(self, label: int) -> int:
+        """A number below 256 for a label."""
+        return (label * 40503 >> 8) & 255 if self.wide else label
+
+    def spelled(self, tested: list[int], around: list[int]) -> int:
+        """A label that is none of the tested ones, from its highest bit on."""
+        following = self.highest + 1
+        if self.wide and following < self.count and self.adaptive.simple(10):
+            return following
+        levels, size = (16, 65536) if self.wide else (8, 16384)
+        first = STARTS[8] + (65536 if self.wide else 256)
+        low, node = 0, 1
+        for level in range((self.count - 1).bit_length() - 1, -1, -1):
+            middle = low + (1 << level)
+            lower = self.allowed(low, middle, tested)
+            upper = self.allowed(middle, middle + (1 << level), tested)
+            if not (lower and upper):
+                bit = int(not lower)
+            else:
+                others = (tested[0] if tested else 0, around[3], around[2])
+                slots = [STARTS[8] + node]
+                slots += [
+                    first + i * size + self.beside(label, node) for i, label in enumerate(others)
+                ]
+                sets = (CANDIDATE_SETS + level, CANDIDATE_SETS + levels + len(tested))
+                bit = self.adaptive.mixed(slots, [number * LANES for number in sets], rate=2)
+            low = middle if bit else low
+            node = node * 2 + bit
+        return low
+
+    def allowed(self, low: int, high: int, tested: list[int]) -> int:
+        """Labels from `low` to before `high` that are not among the tested ones."""
+        there = sum(low <= label < high for label in tested)
+        return max(min(high, self.count) - low, 0) - there
+
+    def beside(self, label: int, node: int) -> int:
+        """Context of a bit beside another label."""
+        return (label * 40503 + node) & 65535 if self.wide else (label * 256 + node) & 16383
