@@ -346,3 +346,19 @@ def test_threads_do_not_meet() -> None:
         assert (
             list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
         )
+
+
+def test_tables_of_the_coder_do_not_depend_on_the_c_library() -> None:
+    """The formulas of native/mixing.hpp and coder_signs.hpp: no value is near where it rounds."""
+    p, logits = (np.arange(65536) + 0.5) / 65536, np.arange(-2816, 2817)
+    tables = {
+        "stretch": np.log(p / (1 - p)) * 256,
+        "squash": 65536 / (1 + np.exp(-logits / 256)),
+        "cost": -np.log2(np.arange(1, 65537) / 65536) * 2048,
+        "log": np.log2(np.arange(1, 4096)) * 16,
+        "octaves": 256 * np.log2(1.0 + np.arange(4096)),
+        "rate": 0.006 * 8388608 * np.exp(-np.arange(241) / 32 * 0.69314718055994531),
+    }
+    for name, values in tables.items():
+        fraction = (values + 0.5) % 1
+        assert np.minimum(fraction, 1 - fraction).min() > 1e-9, name
