@@ -26,7 +26,8 @@ constexpr int CHAINS = 12;
         FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = P::F{} + (1.0f + c);            \
         asm volatile("" : REGISTER(factor), REGISTER(summand));                                    \
         for (std::int64_t round = 0; round < rounds; round++) {                                    \
-            FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) chain[c] = chain[c] * factor + summand; \
+            FHASH_UNROLLED for (int c = 0; c < CHAINS; c++)                                        \
+                chain[c] = chain[c] * factor + summand;                                            \
             FHASH_UNROLLED for (int c = 0; c < CHAINS; c++) asm volatile("" : REGISTER(chain[c])); \
         }                                                                                          \
         return 2 * CHAINS * P::N * rounds;                                                         \
