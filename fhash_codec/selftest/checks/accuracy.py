@@ -178,7 +178,7 @@ def _psnr(run: Run, where: Mask) -> float:
     span = Fraction(finite.max().item()) - Fraction(finite.min().item())
     if span == 0:
         return 0.0
-    given_values, decoded_values = run.values[where], run.decoded[where]
+    given_values, decoded_values = run.values[where], _own_values(run)[where]
     if is_wide_integer(given_values.dtype):
         shares = np.array(
             [

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.selftest.case import Finding, Run
+from fhash_formats.errors import InputError
 
 __all__ = ["CHECKS"]
 
@@ -21,8 +22,15 @@ MODES = ("stream", "arm")
 
 def picture(run: Run) -> Iterator[Finding]:
     """A picture halfway between the first two steps, where values missing in either of them must
-    not be drawn."""
-    cached = _rendered(run, "cache")
+    not be drawn. 64-bit integers that are one number as float64 have none, and are refused."""
+    try:
+        cached = _rendered(run, "cache")
+    except InputError:
+        ends = {float(end) for end in run.volume.value_range.ends}
+        yield Finding(
+            name="refused pictures", worst=float(len(ends) - 1), limit=0.0, unit="of series"
+        )
+        return
     yield Finding(
         name="finite pixels",
         worst=float(np.count_nonzero(~np.isfinite(cached))),
