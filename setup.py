@@ -52,9 +52,9 @@ def use_zig() -> None:
     """Set the variables by which setuptools finds the compiler to that of ziglang."""
     if find_spec("ziglang") is None:
         sys.exit("fhash needs a C++17 compiler: install g++ or clang++, or `pip install ziglang`")
-    # -fno-sanitize: zig adds checks that trap, unless it is told otherwise
+    # Unless it is told otherwise, zig adds checks that trap, and compiles for this very processor.
     compiler = f"{sys.executable} -m ziglang c++ -fno-sanitize=all -s"
-    compiler += f" -target {TARGET}" if TARGET else ""
+    compiler += f" -target {TARGET}" if TARGET else " -mcpu=baseline"
     shared = f"{compiler} -shared"
     os.environ |= {"CC": compiler, "CXX": compiler, "LDSHARED": shared, "LDCXXSHARED": shared}
 
