@@ -68,6 +68,12 @@ class BuildNative(build_ext):
     def get_export_symbols(self, ext: Extension) -> list[str]:
         return []  # not that of a Python module
 
+    def run(self) -> None:
+        has_compiler = os.name == "nt" or os.environ.get("CXX") or which("c++") or which("g++")
+        if TARGET or not has_compiler:
+            use_zig()
+        super().run()
+
     def build_extensions(self) -> None:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             if self.compiler.compiler_type != "msvc":  # that one initialises itself on the way
@@ -124,8 +130,6 @@ def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension
     )
 
 
-if TARGET or (os.name != "nt" and not os.environ.get("CXX") and not (which("c++") or which("g++"))):
-    use_zig()
 setup(
     ext_modules=[
         native("fhash_formats.native._core", FORMATS),
