@@ -57,6 +57,24 @@ def test_without_a_compiler_the_installation_fails_in_one_line(tmp_path: Path) -
     assert last.startswith("error: fhash needs a C++17 compiler, and 'no-g++' did not build it")
 
 
+@pytest.mark.parametrize("found", [None, "/usr/bin/g++"])
+def test_a_build_without_a_compiler_asks_for_one(found: str | None) -> None:
+    script = (
+        f"import shutil; shutil.which = lambda name: {found!r};"
+        "import build_backend; print(build_backend._compiler())"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "CXX"}
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=Path(__file__).parents[2],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ("ziglang" in done.stdout) == (found is None)
+
+
 def test_the_wheel_holds_the_stripped_libraries(wheel: Path) -> None:
     assert "-py3-none-" in wheel.name
     with zipfile.ZipFile(wheel) as archive:
