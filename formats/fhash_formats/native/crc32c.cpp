@@ -9,7 +9,11 @@
 
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(FHASH_PLAIN)
 #include <nmmintrin.h>
+#if defined(__clang__)  // in which the instruction has a name of its own
+#define FHASH_CRC_TARGET __attribute__((target("sse4.2,crc32")))
+#else
 #define FHASH_CRC_TARGET __attribute__((target("sse4.2")))
+#endif
 #define FHASH_HAS_CRC() (fhash_instructions() & FHASH_HAS_CRC32)
 #define FHASH_CRC_8(crc, value) _mm_crc32_u64(crc, value)
 #define FHASH_CRC_1(crc, value) _mm_crc32_u8((std::uint32_t)(crc), value)
