@@ -6,6 +6,7 @@ They stand in the header, or of many steps in an array of their own.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, Context
 from typing import Any
@@ -83,7 +84,7 @@ def read_steps(
 
 def _levels(figures: Sequence[float | None], data_range: float) -> list[int]:
     """The smallest level, then each level counted from it, or EXACT or UNKNOWN."""
-    width = math.log10(data_range or 1.0)
+    width = _decades(data_range)
     levels: list[int | None] = []
     for figure in figures:
         if figure is not None and 0 < figure < math.inf:
@@ -98,11 +99,16 @@ def _levels(figures: Sequence[float | None], data_range: float) -> list[int]:
     return result
 
 
+def _decades(data_range: float) -> float:
+    """The decimal logarithm of a range; of the largest float64 for one beyond it."""
+    return math.log10(min(data_range or 1.0, sys.float_info.max))
+
+
 def _figure(lowest: int, level: int, data_range: float, limit: float | None) -> float | None:
     """The figure that is so many hundredths of a dB below a range, rounded up."""
     if level < 0:
         return 0.0 if level == EXACT else None
-    exponent = math.log10(data_range or 1.0) - (lowest + level) / HUNDREDTHS
+    exponent = _decades(data_range) - (lowest + level) / HUNDREDTHS
     if not -323 < exponent < 308:
         return None
     value = math.pow(10.0, exponent)

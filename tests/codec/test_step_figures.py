@@ -52,7 +52,7 @@ def test_figures_are_never_better_than_they_are(most: int, monkeypatch: Any) -> 
     assert steps[4]["max_abs_error"] == 1.9
 
 
-@pytest.mark.parametrize("ends", [(2.0, 2.0), (0.0, 1e-300), (-1e308, 1e307)])
+@pytest.mark.parametrize("ends", [(2.0, 2.0), (0.0, 1e-300), (-1e308, 1e307), (-1.7e308, 1.7e308)])
 def test_figures_of_any_range(ends: tuple[float, float]) -> None:
     steps, _ = back([1e-300, 3.0], [1e-299, 1e300], ends)
     assert steps[0]["rmse"] == pytest.approx(1e-300, rel=2e-3)
