@@ -139,7 +139,10 @@ def check_format(top: Record) -> None:
         )
     major, minor = top.integers("format_version", 2, 0, 10_000)
     check_major(major, f"{major}.{minor}")
-    unknown = [name for name in top.texts("required_features") if name not in KNOWN_FEATURES]
+    features = top.texts("required_features")
+    # Every variable has this list: a long one would be read as often.
+    top.need(len(features) == len(set(features)), "required_features", "names that stand once")
+    unknown = [name for name in features if name not in KNOWN_FEATURES]
     if unknown:
         raise UnsupportedFileError(
             f"the file needs the feature {unknown[0][:80]!a}, "

@@ -19,6 +19,7 @@ BAD = [
     ("format_version", "1.0"),
     ("required_features", {}),
     ("required_features", [1]),
+    ("required_features", ["transform", "transform"]),
     ("encoder", ...),
     ("encoder", []),
     ("encoder.version", 1),
