@@ -86,6 +86,7 @@ def test_windows_of_hard_cases(quality: dict[str, float]) -> None:
     assert compared > 60
 
 
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
 @pytest.mark.skipif(not LONG, reason="takes minutes")
 def test_hard_cases(tmp_path: Path) -> None:
     """Every series of the catalogue that the profile compact takes."""
