@@ -10,17 +10,21 @@ from setuptools import build_meta
 from setuptools.build_meta import *  # noqa: F403  # the hooks that stay as they are
 
 
+def has_compiler() -> bool:
+    """Whether the machine has a C++ compiler; on Windows setuptools finds its own."""
+    return bool(os.name == "nt" or os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++"))))
+
+
 def _compiler() -> list[str]:
-    """The requirement of a compiler, unless there is one; on Windows setuptools finds its own."""
-    found = os.name == "nt" or os.environ.get("CXX") or any(map(shutil.which, ("c++", "g++")))
-    return [] if found else ["ziglang>=0.15"]
+    """The requirement of a compiler, unless there is one."""
+    return [] if has_compiler() else ["ziglang>=0.15"]
 
 
 def get_requires_for_build_wheel(config_settings: object = None) -> list[str]:
-    """What a wheel needs to be built."""
+    """Names the requirements of building a wheel."""
     return build_meta.get_requires_for_build_wheel(config_settings) + _compiler()
 
 
 def get_requires_for_build_editable(config_settings: object = None) -> list[str]:
-    """What an editable installation needs to be built."""
+    """Names the requirements of building an editable installation."""
     return build_meta.get_requires_for_build_editable(config_settings) + _compiler()

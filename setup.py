@@ -11,13 +11,14 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 from setuptools.errors import BaseError, CCompilerError, CompileError
+
+from build_backend import has_compiler
 
 FORMATS = Path("formats/fhash_formats/native")
 """Sources of the file format's library; the codec's library includes core.hpp and guard.hpp."""
@@ -69,8 +70,7 @@ class BuildNative(build_ext):
         return []  # not that of a Python module
 
     def run(self) -> None:
-        has_compiler = os.name == "nt" or os.environ.get("CXX") or which("c++") or which("g++")
-        if TARGET or not has_compiler:
+        if TARGET or not has_compiler():
             use_zig()
         super().run()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -73,6 +74,15 @@ def test_a_build_without_a_compiler_asks_for_one(found: str | None) -> None:
         check=True,
     )
     assert ("ziglang" in done.stdout) == (found is None)
+
+
+def test_the_source_archive_holds_what_builds_it(wheel: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "setup.py", "-q", "sdist", "-d", tmp_path]
+    subprocess.run(command, cwd=wheel.parents[1], check=True, capture_output=True)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as opened:
+        names = {name.partition("/")[2] for name in opened.getnames()}
+    assert {"build_backend.py", "setup.py", "pyproject.toml"} <= names
 
 
 def test_the_wheel_holds_the_stripped_libraries(wheel: Path) -> None:

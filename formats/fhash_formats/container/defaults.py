@@ -6,9 +6,12 @@ default of the encoder that changes is from then on written.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any
+
+Change = Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]]
+"""An object and its defaults to the object with or without them."""
 
 __all__ = ["CONFIG_DEFAULTS", "DEFAULTS", "brief", "complete"]
 
@@ -61,19 +64,20 @@ DOMAIN_FIGURES = ("psnr", "rmse", "max_abs_error")
 
 def brief(header: Mapping[str, Any]) -> dict[str, Any]:
     """A header without what `complete` puts back."""
-    result = _without(header, DEFAULTS)
-    quality = result.get("quality")
-    if isinstance(quality, dict) and "psnr" in quality:
-        result["quality"] = _without(quality, _of_quality(quality))
-    return result
+    return _changed(_without, header)
 
 
 def complete(header: Mapping[str, Any]) -> dict[str, Any]:
     """A header with all that was left out; what is there stays, of whatever form it is."""
-    result = _with(header, DEFAULTS)
+    return _changed(_with, header)
+
+
+def _changed(change: Change, header: Mapping[str, Any]) -> dict[str, Any]:
+    """A header and its measured quality after `_without` or `_with`."""
+    result = change(header, DEFAULTS)
     quality = result.get("quality")
     if isinstance(quality, dict) and "psnr" in quality:
-        result["quality"] = _with(quality, _of_quality(quality))
+        result["quality"] = change(quality, _of_quality(quality))
     return result
 
 
