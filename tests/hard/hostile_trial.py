@@ -27,14 +27,20 @@ from typing import Any
 import mutations
 import numpy as np
 from containers import unpack
+from documents import header_of, path_of
 from further_trials import Further
+from mutated_payload import configuration_of, documents_of, inner_chunks
 from PIL import Image
 
 import fhash_cli.main
 import fhash_codec
 from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
+from fhash_formats.container.header import TABLE
 from fhash_formats.errors import FhashError, FhashWarning
+from fhash_formats.transform.array_axes import take_axes
+from fhash_formats.transform.tile.sections import EXACT, parse_stream, unpack_settings
+from fhash_formats.transform.tile.settings import TileSettings
 
 MEMORY = 512 << 20
 """Bytes that the process may allocate beyond what it has before; larger allocations fail."""
@@ -225,7 +231,7 @@ class Trial:
             return f"{what}: shape {values.shape} instead of {tuple(shape)}"
         if np.isinf(values).any():
             return f"{what}: infinities"
-        if self.mutation.kind == "clip" and self._beyond(values):
+        if self.mutation.kind == "clip" and self.beyond(values, region):
             return f"{what}: values beyond the range to which they are clipped"
         if not self.mutation.sealed:
             expected = expected_values(self.mutation.golden, self.variable)
@@ -235,21 +241,14 @@ class Trial:
                 return f"{what}: values that differ from the golden's"
         return None
 
-    def _beyond(self, values: Any) -> bool:
-        """Whether values lie beyond the range to which the settings in the file clip them."""
-        with Container.open(self.path) as container:
-            fill = container.header["variable"].get("fill")
-            settings = container.arrays["tables/level_1"].settings
-        assert settings is not None
-        if not settings.clip:
-            return False
-        # Ends are rounded to the type, as values are.
-        margin = 1.0 if values.dtype.kind != "f" else 1e-6 * max(-settings.low, settings.high, 0.0)
-        known = values[~np.isnan(values) & (values != fill)].astype(np.float64)
-        return bool(
-            known.size
-            and (known.min() < settings.low - margin or known.max() > settings.high + margin)
-        )
+    def beyond(self, values: Any, region: list[tuple[int, int]] | None) -> bool:
+        """Whether values lie beyond the range to which their tile clips them."""
+        fill = header_of(unpack(self.mutation.data))[2]["variable"].get("fill")
+        ends = clip_ends(self.mutation)
+        if region is not None:
+            ends = ends[:, *(slice(low, high) for low, high in region)]
+        known = ~np.isnan(values) & (values != fill)
+        return bool((known & ((values < ends[0]) | (values > ends[1]))).any())
 
     def _sample(self) -> str | None:
         """Sample points between vertices with the API."""
@@ -277,6 +276,59 @@ def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
     """Print a warning as the command line does; warnings of libraries with their own category."""
     kind = "warning" if issubclass(category, FhashWarning) else category.__name__
     say(f"{kind}: {' '.join(str(message).split())}")
+
+
+def clip_ends(mutation: mutations.Mutation) -> Any:
+    """Return the ends of the range to which each vertex of a table is clipped, (2, t, z, y, x).
+
+    They are of the type of the table, and its extreme values in tiles that are not clipped: those
+    without `clip` in their settings, and those of labels and of exact values (FORMAT.md, Decoding).
+    The table has every vertex and step of the domain. With an origin the range is that of the
+    differences.
+    """
+    parts = unpack(mutation.data)
+    table = path_of(header_of(parts)[2], TABLE)
+    document = documents_of(parts)[table]
+    shared = TileSettings.from_dict(take_axes(configuration_of(document))[0])
+    shape, dtype = document["shape"], np.dtype(document["data_type"])
+    ends = np.empty((2, *shape), dtype)
+    ends[0], ends[1] = (-np.inf, np.inf) if dtype.kind == "f" else most_of(dtype)
+    for member, data in parts:
+        if not member.startswith(f"{table}/c/"):
+            continue
+        sharding, present, chunks = inner_chunks(document, member, data)
+        counts = [n // m for n, m in zip(sharding.shard_shape, sharding.chunk_shape, strict=True)]
+        shard = [int(number) for number in member.removeprefix(f"{table}/c/").split("/")]
+        for number, chunk in zip(np.flatnonzero(present), chunks, strict=True):
+            stream = parse_stream(chunk[:-4])
+            own = stream.settings
+            settings = shared if own is None else unpack_settings(own)
+            if settings.clip and not stream.labelled and not stream.flags & EXACT:
+                inner = np.unravel_index(number, counts)
+                tile = tuple(
+                    slice((i * count + j) * length, (i * count + j + 1) * length)
+                    for i, j, count, length in zip(
+                        shard, inner, counts, sharding.chunk_shape, strict=True
+                    )
+                )
+                for end, limit in zip(ends, (settings.low, settings.high), strict=True):
+                    end[tile] = rounded(limit, settings.origin, dtype)
+    return ends
+
+
+def most_of(dtype: np.dtype[Any]) -> tuple[int, int]:
+    """Return the smallest and the largest integer of a type."""
+    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+
+
+def rounded(limit: float, origin: int, dtype: np.dtype[Any]) -> Any:
+    """Return an end of a range, about the origin, in the type of an array."""
+    if dtype.kind == "f":
+        return dtype.type(limit)
+    low, high = most_of(dtype)
+    if origin:  # the differences are of int64
+        limit = min(max(round(limit), -(1 << 63)), (1 << 63) - 1)
+    return min(max(round(limit) + origin, low), high)
 
 
 def said(work: Callable[[], str | None]) -> str | None:

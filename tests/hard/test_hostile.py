@@ -15,6 +15,7 @@ from pathlib import Path
 import hostile
 import hostile_trial
 import mutations
+import numpy as np
 import pytest
 from reporting import LONG, record
 
@@ -111,3 +112,25 @@ def test_a_worker_that_crashes_is_reported(tmp_path: Path, monkeypatch: pytest.M
     assert result.mutations == 3
     assert [line for line in result.wrong if line.startswith("1 ") and "SIGSEGV" in line]
     assert len(result.wrong) == 1
+
+
+@pytest.mark.parametrize("golden", ["compact-clip", "compact-named", "compact-origin"])
+def test_the_oracle_of_clipping_sees_one_value_beyond_the_range_of_its_tile(
+    golden: str, tmp_path: Path
+) -> None:
+    """Labels and exact values are not clipped; without clipping nothing lies beyond."""
+    data, _ = mutations.goldens()[golden]
+    sound = mutations.Mutation(number=0, golden=golden, kind="clip", sealed=True, data=data)
+    trial = hostile_trial.Trial(sound, tmp_path)
+    _, high = hostile_trial.clip_ends(sound)
+    clipped = np.isfinite(high) if high.dtype.kind == "f" else high < np.iinfo(high.dtype).max
+    assert clipped.any() != (golden == "compact-named")  # its tiles are labels
+    values = np.array(hostile_trial.expected_values(golden, None))
+    assert not trial.beyond(values, None)
+    for where in (np.argwhere(clipped)[-1:], np.argwhere(~clipped)[-1:]):
+        for vertex in map(tuple, where):
+            changed = values.copy()
+            changed[vertex] = high[vertex] + 1 if clipped[vertex] else 10**9
+            region = [(i, i + 1) for i in vertex]
+            part = changed[tuple(slice(*ends) for ends in region)]
+            assert trial.beyond(changed, None) == trial.beyond(part, region) == clipped[vertex]
