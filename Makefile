@@ -44,15 +44,11 @@ every: .venv/.stamp
 PLATFORMS := x86_64-linux-gnu.2.17/manylinux_2_17_x86_64 aarch64-linux-gnu.2.17/manylinux_2_17_aarch64 \
 	x86_64-linux-musl/musllinux_1_2_x86_64 aarch64-linux-musl/musllinux_1_2_aarch64 x86_64-macos.11.0/macosx_11_0_x86_64 \
 	aarch64-macos.11.0/macosx_11_0_arm64 x86_64-windows-gnu/win_amd64 aarch64-windows-gnu/win_arm64
-wheels: .venv/.stamp .venv/.zig $(PLATFORMS:%=wheel/%)
+wheels: .venv/.stamp $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	ls -l dist
 
-.venv/.zig: .venv/.stamp
-	$(INSTALL) ziglang
-	touch $@
-
-wheel/%: .venv/.zig
+wheel/%: .venv/.stamp
 	FHASH_TARGET=$(*D) $(BIN)/python setup.py -q build --build-base build/$(*F) bdist_wheel --plat-name $(*F) -d dist
 
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
