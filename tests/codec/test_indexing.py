@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.indexing import (
     BLOCK,
+    coarse_vertices,
     expand_index,
     index_ranges,
     shared_part,
     slice_of,
     step_blocks,
 )
+from fhash_formats.errors import RegionError
 
 SHAPE = (3, 4, 1, 5)
 ENDS = st.none() | st.integers(-7, 7)
@@ -71,6 +73,21 @@ def test_the_part_that_a_region_shares_with_a_box() -> None:
         Box.of([(0, 1), (1, 4), (1, 2)]),
     )
     assert shared_part(box, Box.of([(4, 5), (2, 6), (0, 3)])) is None
+
+
+@given(low=st.integers(0, 11), length=st.integers(1, 12), lod=st.integers(0, 3))
+def test_coarse_vertices_are_those_of_the_box_in_the_region(
+    low: int, length: int, lod: int
+) -> None:
+    box, region = Box.of([(2, 9), (0, 12), (3, 4)]), Box.of([(low, low + length)] * 3)
+    expected = [
+        [n for n in range(first, end, 1 << lod) if low <= n < low + length] for first, end in box
+    ]
+    if all(expected):
+        assert [list(along) for along in coarse_vertices(box, region, lod, "run")] == expected
+    else:
+        with pytest.raises(RegionError, match="holds no vertex of level of detail"):
+            coarse_vertices(box, region, lod, "run")
 
 
 @pytest.mark.parametrize(

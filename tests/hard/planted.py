@@ -33,7 +33,7 @@ TESTS = {
     NATIVE: FORMAT_TESTS,
     "fhash_codec/native/": "tests/codec/native tests/codec/measure tests/codec/rendering",
     "fhash_codec/compact/": "tests/codec/compact tests/codec/test_volume.py",
-    "fhash_codec/indexing.py": "tests/codec/test_indexing.py tests/codec/test_volume.py",
+    "fhash_codec/indexing.py": "tests/codec/test_indexing.py tests/cli/commands/test_decode.py",
     "cli/fhash_cli/": "tests/cli",
 }
 """Tests of the files below a folder; of others, those of the room of the same name."""
