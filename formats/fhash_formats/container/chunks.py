@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import with_crc32c
 from fhash_formats.container.sharding import Sharding, pack_index
 from fhash_formats.errors import InputError
 
@@ -85,12 +84,12 @@ def shard_parts(
 
 
 def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
-    """The bytes of a chunk with their CRC-32C, from its values or from its bytes without.
+    """The bytes of a chunk, from its values or as they are.
 
     Raises InputError as `full_chunk` does.
     """
     if isinstance(chunk, bytes):
-        return with_crc32c(chunk)
+        return chunk
     return metadata.coder.encode(full_chunk(name, metadata, index, chunk))
 
 

@@ -14,12 +14,11 @@ import numpy.typing as npt
 from fhash_formats.container.ahead import Ahead, chunks_after
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.container.coding import CRC_BYTES, without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.shard_places import ShardPlaces
 from fhash_formats.container.source import Source, damage_named
 from fhash_formats.container.zip_checked import check_member, read_member
-from fhash_formats.errors import DamagedFileError, FhashError, RegionError
+from fhash_formats.errors import DamagedFileError, FhashError, InputError, RegionError
 from fhash_formats.support.slabs import common_part, region_bounds
 from fhash_formats.support.threads import in_threads
 
@@ -154,6 +153,8 @@ class StoredArray:
             DamagedFileError: for a damaged chunk; the message names the member of the file.
         """
         self._check_index(index)
+        if lod < 0:
+            raise InputError(f"level of detail {lod}; 0 is all of it, and others are coarser")
         with damage_named(self._path, self._source):
             return self._chunk(tuple(index), lod, keep=True)
 
@@ -348,12 +349,12 @@ class StoredArray:
     def coded(self, index: ChunkIndex) -> memoryview:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""
         with self._stored_chunk(index) as data:
-            return without_crc32c(data)
+            self._metadata.coder.check(data)
+            return data
 
     def coded_bytes(self, index: ChunkIndex) -> int:
         """The number of bytes that `coded` returns, without reading them."""
-        size = self.chunks[index].size if self._shards is None else self._place(index)[1]
-        return size - CRC_BYTES
+        return self.chunks[index].size if self._shards is None else self._place(index)[1]
 
     @contextmanager
     def _stored_chunk(self, index: ChunkIndex) -> Iterator[memoryview]:
