@@ -29,7 +29,7 @@ import numpy as np
 from containers import unpack
 from documents import header_of, path_of
 from further_trials import Further
-from mutated_payload import configuration_of, documents_of, inner_chunks
+from mutated_payload import documents_of, inner_chunks, settings_of
 from PIL import Image
 
 import fhash_cli.main
@@ -38,8 +38,7 @@ from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import FhashError, FhashWarning
-from fhash_formats.transform.array_axes import take_axes
-from fhash_formats.transform.tile.sections import EXACT, parse_stream, unpack_settings
+from fhash_formats.transform.tile.sections import PREDICTED, TRANSFORMED, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 MEMORY = 512 << 20
@@ -282,14 +281,14 @@ def clip_ends(mutation: mutations.Mutation) -> Any:
     """Return the ends of the range to which each vertex of a table is clipped, (2, t, z, y, x).
 
     They are of the type of the table, and its extreme values in tiles that are not clipped: those
-    without `clip` in their settings, and those of labels and of exact values (FORMAT.md, Decoding).
+    without `clip`, and those that are neither transformed nor predicted (FORMAT.md, Decoding).
     The table has every vertex and step of the domain. With an origin the range is that of the
     differences.
     """
     parts = unpack(mutation.data)
     table = path_of(header_of(parts)[2], TABLE)
     document = documents_of(parts)[table]
-    shared = TileSettings.from_dict(take_axes(configuration_of(document))[0])
+    shared = settings_of(document)
     shape, dtype = document["shape"], np.dtype(document["data_type"])
     ends = np.empty((2, *shape), dtype)
     ends[0], ends[1] = (-np.inf, np.inf) if dtype.kind == "f" else most_of(dtype)
@@ -300,10 +299,10 @@ def clip_ends(mutation: mutations.Mutation) -> Any:
         counts = [n // m for n, m in zip(sharding.shard_shape, sharding.chunk_shape, strict=True)]
         shard = [int(number) for number in member.removeprefix(f"{table}/c/").split("/")]
         for number, chunk in zip(np.flatnonzero(present), chunks, strict=True):
-            stream = parse_stream(chunk[:-4])
+            stream = parse_stream(chunk)
             own = stream.settings
-            settings = shared if own is None else unpack_settings(own)
-            if settings.clip and not stream.labelled and not stream.flags & EXACT:
+            settings = shared if own is None else TileSettings.from_bytes(own)
+            if settings is not None and settings.clip and stream.kind in (TRANSFORMED, PREDICTED):
                 inner = np.unravel_index(number, counts)
                 tile = tuple(
                     slice((i * count + j) * length, (i * count + j + 1) * length)
