@@ -42,8 +42,9 @@ GNU_FLAGS = [
     "-fvisibility=hidden",
     "-g0",
 ]
-GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if sys.platform == "linux" and not TARGET else []
-"""Debug records and symbol tables would make the libraries five times as large."""
+GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if TARGET or sys.platform == "linux" else []
+"""Debug records and symbol tables would make the libraries five times as large; on Windows they
+would lie beside them."""
 NETWORK_FLAGS = ("-ffp-contract=fast", "-pthread")
 """Fused multiply-adds, and threads, for the network alone: no stream depends on its bits."""
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
