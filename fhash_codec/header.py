@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.occupancy import write_bits
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.provenance import date_of, source_parts
@@ -28,13 +29,10 @@ from fhash_formats.container import (
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED, STEP_FIGURES
+from fhash_formats.container.header import HISTORY, MISSING, MISSING_ARRAY, NOT_STORED, STEP_FIGURES
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
-
-MISSING_CHUNK_BYTES = 1 << 20
-"""Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
 
 MAX_POINTS = 24
 """Points of a training history that a file of the profile paper keeps at most."""
@@ -167,24 +165,13 @@ def _storable(coordinate: Coordinate) -> Coordinate:
 
 
 def write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
-    """Write one row of bits per step, 1 = not finite, several rows to a chunk."""
-    steps = shape[0]
+    """Write one row of bits per step, 1 = not finite."""
     empty = np.zeros(-(-prod(shape[1:]) // 8), dtype=np.uint8)
-    rows = max(1, min(steps, MISSING_CHUNK_BYTES // empty.size))
-    writer.add_array(
-        "missing/bits",
-        shape=(steps, empty.size),
-        dtype=empty.dtype,
-        chunk_shape=(rows, empty.size),
-        chunks=(
-            np.stack(
-                [
-                    scanned.missing.get(step, empty)
-                    for step in range(start, min(start + rows, steps))
-                ]
-            )
-            for start in range(0, steps, rows)
-        ),
+    write_bits(
+        writer,
+        MISSING_ARRAY,
+        (shape[0], empty.size),
+        lambda step: scanned.missing.get(step, empty),
     )
 
 
@@ -193,7 +180,7 @@ def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray
 
     None if every value of the source is finite.
     """
-    stored = container.arrays.get("missing/bits")
+    stored = container.arrays.get(MISSING_ARRAY)
     if stored is None:
         return None
     _, y, x = container.header["domain"]["shape"][1:]

@@ -17,13 +17,16 @@ import numpy.typing as npt
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.container.header import (
+    BITS_ARRAY,
     CODED,
     COMPACT,
     HEAD_CROSS,
     HEAD_INPUTS,
     LOWEST,
     MASK_ARRAY,
+    MASK_FEATURES,
     MAX_LEVEL,
+    MISSING_ARRAY,
     PAPER,
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
@@ -47,13 +50,18 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
 
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
-    paper = header["model"]["profile"] == PAPER
+    masked = MASK_ARRAY in arrays and header["model"]["profile"] == PAPER
     if SPARSE in header["model"] and MASK_ARRAY in arrays:
         raise DamagedFileError(
-            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs occupancy/bits"
+            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs {BITS_ARRAY}"
+        )
+    if masked and len(header["features"]) > MASK_FEATURES:
+        raise DamagedFileError(
+            f"array {MASK_ARRAY} is there in a file of {len(header['features'])} features; "
+            f"more than {MASK_FEATURES} need {BITS_ARRAY}"
         )
     for name, shape, dtypes in _required_arrays(header, arrays):
-        if name == "occupancy/bits" and MASK_ARRAY in arrays and paper:
+        if name == BITS_ARRAY and masked:
             continue
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
@@ -145,11 +153,10 @@ def _required_arrays(
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)
-    yield (
-        "occupancy/bits",
-        (key_frames, occupancy_bytes(header["feature_bounding_box"])),
-        ("uint8",),
-    )
+    # The profile compact merges its features.
+    features = 1 if compact else len(header["features"])
+    size = occupancy_bytes(header["feature_bounding_box"])
+    yield BITS_ARRAY, (features, key_frames, size), ("uint8",)
 
 
 def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
@@ -162,13 +169,9 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         yield "key_frames", (key_frames,), ("int64",)
         yield "corrections", (key_frames, *box), PLAIN_TABLE_TYPES
     else:
-        # One of each feature, where there are several.
-        bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
-        for number in range(1, len(header["features"]) + 1):
-            yield f"occupancy/feature_{number}", bits, ("uint8",)
         yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
     yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)
-    yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
+    yield MISSING_ARRAY, (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
 def _check_array(

@@ -29,8 +29,14 @@ COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 TABLE = "tables/level_1"
 """Name of the array of the finest table."""
+BITS_ARRAY = "occupancy/bits"
+"""Name of the array of the occupancy as bits."""
 MASK_ARRAY = "occupancy/mask"
 """Name of the array of an occupancy that is coded, in place of bits."""
+MASK_FEATURES = 8
+"""Largest number of features whose occupancy the numbers of a mask tell."""
+MISSING_ARRAY = "missing/bits"
+"""Name of the array of the bits of vertices without a value."""
 STEPS = "steps/figures"
 """Name of the array of the figures of single steps, where they are not in the header."""
 STEP_FIGURES = ("rmse", "max_abs_error")
@@ -94,7 +100,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
     shape = top.record("domain").integers("shape", 4, 1, MAX_LENGTH)
     _check_values(top, dtype)
     box = _box(top, shape)
-    top.texts("features")
+    top.need(bool(top.texts("features")), "features", "at least one")
     top.integer("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
     plain = PLAIN_FEATURE in header["required_features"]
