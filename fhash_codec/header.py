@@ -29,7 +29,7 @@ from fhash_formats.container import (
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import HISTORY, MISSING, MISSING_ARRAY, NOT_STORED, STEP_FIGURES
+from fhash_formats.container.header import HISTORY, MISSING_ARRAY, NOT_STORED, STEP_FIGURES
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
@@ -42,9 +42,6 @@ HEAD_POINTS = 8
 
 DIGITS = 6
 """Significant digits of a figure over all steps."""
-
-OUTSIDE = MISSING[0]
-"""Value of the header's `missing`: the vertices outside the coreset are those without a value."""
 
 GAIN = ("what", "bytes", "seconds")
 """Entries of a list in `model.gains`, in this order; the last one is left out with the times."""
@@ -120,8 +117,9 @@ def write_series(
     variable: header entry after which the table is named, unless the writer has begun it.
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
     allows, but for the coordinates of one of several variables, which share their arrays.
-    everything: all finite values are in the coreset of every step, so that its mask says
-    which are missing. Returns the header entries that then stand for the arrays.
+    everything: all finite values are in the coreset of every key frame, and at a key frame no
+    others are read: where each step is one, the coreset says which values are missing.
+    Returns the header entries that then stand for the arrays.
     """
     coords = _storable_coords(series)
     if not writer.begun:
@@ -142,11 +140,8 @@ def write_series(
             )
     if not brief or len(key_frames) < series.shape[0]:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
-    if not scanned.missing:
-        return {"coordinates": described} if brief else {}
-    if brief and everything and len(key_frames) == series.shape[0]:
-        return {"coordinates": described, "missing": OUTSIDE}
-    write_missing(writer, series.shape, scanned)
+    if scanned.missing and not (everything and len(key_frames) == series.shape[0]):
+        write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
 
 

@@ -27,11 +27,10 @@ from fhash_codec.comparison import measure, ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.extent import Extent, packed_masks
-from fhash_codec.coreset.features import Everything, resolve_features
+from fhash_codec.coreset.features import resolve_features
 from fhash_codec.coreset.scan import Scan, scan_steps
 from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import (
-    OUTSIDE,
     begin_variable,
     brief_quality,
     describe_source,
@@ -47,7 +46,7 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import SOURCE, ContainerWriter
-from fhash_formats.container.header import NOT_STORED
+from fhash_formats.container.header import EVERYTHING, NOT_STORED
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series, StepsSeries
@@ -256,7 +255,6 @@ class _Job:
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""
         plan, steps = self.plan, StepsSeries(self.series, self.steps)
-        everything = str(Everything()) in plan.features
         variable = describe_variable(self.series)
         begin_variable(writer, variable)
         source = self._write_source(writer)
@@ -274,10 +272,8 @@ class _Job:
             range(len(self.steps)),
             variable=variable,
             brief=True,
-            everything=everything,
+            everything=EVERYTHING in plan.features,
         )
-        if everything and plan.has_missing:
-            described["missing"] = OUTSIDE
         parts = TableParts(
             shape=(len(self.steps), *blocks.shape[1:]),
             dtype=blocks.source_dtype,

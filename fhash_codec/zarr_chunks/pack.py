@@ -19,7 +19,6 @@ from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.dataset_encoding import encodable
 from fhash_codec.header import (
-    OUTSIDE,
     describe_source,
     describe_variable,
     write_missing,
@@ -231,13 +230,11 @@ def _header(
     if settings is not None and settings.head is not None:
         weights = settings.head.size
         head = {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
-    masked = facts.occupied < prod(array.shape)
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
     return {
         **source,
         **described,
-        **({"missing": OUTSIDE} if masked else {}),
         "required_features": ["transform"],
         "encoder": {**encoder, **({"codec": array.quality} if array.quality else {})},
         "background": exact_number(_in_type(scan.mean, array.dtype)),

@@ -57,8 +57,8 @@ QUALITY = (
     "max_abs_error_domain",
 )
 """Figures in `quality`, each a number or null."""
-MISSING = ("outside",)
-"""Values of `missing`: the vertices outside the coreset are those without a value."""
+EVERYTHING = "all"
+"""Name of the feature that every vertex with a value belongs to."""
 NOT_STORED = "not_stored"
 """Key of `variable`: what nobody wrote of the values."""
 HISTORY = ("seconds", "epoch", "psnr")
@@ -179,8 +179,6 @@ def _check_source(top: Record) -> np.dtype[Any]:
         variable.number("fill")
     if variable.has(NOT_STORED):
         _check_not_stored(variable.record(NOT_STORED))
-    if top.has("missing"):
-        top.choice("missing", MISSING)
     return dtype
 
 

@@ -80,7 +80,10 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
         arrays[f"mlp/weight_{number}"] = rng.standard_normal((outputs, inputs)).astype(np.float32)
         arrays[f"mlp/bias_{number}"] = rng.standard_normal(outputs).astype(np.float32)
     arrays["occupancy/bits"] = rng.integers(
-        0, 256, (len(header["features"]), key_frames, occupancy_bytes(header["feature_bounding_box"])), dtype=np.uint8
+        0,
+        256,
+        (len(header["features"]), key_frames, occupancy_bytes(header["feature_bounding_box"])),
+        dtype=np.uint8,
     )
     return arrays
 
