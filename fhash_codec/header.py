@@ -6,7 +6,7 @@ Each profile adds what it alone knows, such as its model.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
@@ -108,28 +108,47 @@ def write_series(
     scanned: Scan,
     key_frames: Sequence[int],
     *,
-    variable: Mapping[str, Any],
-    brief: bool = False,
     everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
-    variable: header entry after which the table is named, unless the writer has begun it.
-    brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows, but for the coordinates of one of several variables, which share their arrays.
-    everything: all finite values are in the coreset of every key frame, and at a key frame no
-    others are read: where each step is one, the coreset says which values are missing.
-    Returns the header entries that then stand for the arrays.
+    The writer begins the variable of the series, unless one has begun. Each array that the header
+    can say in fewer bytes is left out, but for the coordinates of one of several variables, which
+    share their arrays. Returns the header's `coordinates`, which stand for these arrays.
+
+    Args:
+        writer: of the container.
+        series: what is encoded.
+        scanned: its values that are not finite.
+        key_frames: steps of the key frames.
+        everything: whether the coreset of each step says which values are not finite, where every
+            step is a key frame: all others are in it, and are read from there.
     """
     coords = _storable_coords(series)
     if not writer.begun:
-        begin_variable(writer, variable)
+        begin_variable(writer, describe_variable(series))
     described = {}
     if not writer.one_of_several:
         names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
-        described = describe_coordinates(coords, names) if brief else {}
+        described = describe_coordinates(coords, names)
     for name, array in source_parts(series, coords, {})[1].items():
         writer.add_whole(name, array)
+    write_coordinates(writer, coords, described)
+    every_step = len(key_frames) == series.shape[0]
+    if not every_step:
+        writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
+    if scanned.missing and not (everything and every_step):
+        write_missing(writer, series.shape, scanned)
+    return {"coordinates": described}
+
+
+def write_coordinates(
+    writer: ContainerWriter, coords: Mapping[str, Coordinate], described: Collection[str] = ()
+) -> None:
+    """Write an array for each axis whose positions do not stand in the header.
+
+    coords: a coordinate for each of "t", "z", "y" and "x". described: the axes in the header.
+    """
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -138,11 +157,6 @@ def write_series(
                 coordinate.values,
                 attributes={**coordinate.attributes, "name": coordinate.name},
             )
-    if not brief or len(key_frames) < series.shape[0]:
-        writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
-    if scanned.missing and not (everything and len(key_frames) == series.shape[0]):
-        write_missing(writer, series.shape, scanned)
-    return {"coordinates": described} if brief else {}
 
 
 def _storable_coords(series: Series) -> dict[str, Coordinate]:

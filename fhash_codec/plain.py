@@ -19,7 +19,7 @@ from fhash_codec.compact.plain import correction_of, correction_type, predicted
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes, write_bits
-from fhash_codec.header import begin_variable
+from fhash_codec.header import begin_variable, write_coordinates
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
@@ -29,8 +29,8 @@ from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, STEPS
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.sparse import SPARSE
+from fhash_formats.container.variables import COORDINATES
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.slabs import chunk_region, slab_shape
 from fhash_formats.transform.head.head import NeighbourHead
@@ -111,11 +111,12 @@ class _Export:
         copied = {
             name: array
             for name, array in self._arrays.items()
-            if not f"{name}/".startswith(rewritten)
+            if not f"{name}/".startswith((*rewritten, COORDINATES))
         }
         keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
         self._total = sum(prod(array.grid) for array in copied.values()) + keys
         self._total += sum(map(_chunk_count, coded))
+        write_coordinates(self._writer, self._volume.coords)
         for name, array in copied.items():
             self._copy(name, array)
         for table in coded:
@@ -129,6 +130,7 @@ class _Export:
         }
         return {
             **self._header,
+            "coordinates": {},
             "model": {key: model[key] for key in model if key != SPARSE} | changed,
             "required_features": [],
         }
@@ -246,13 +248,7 @@ class _Export:
 
     def _write_axes(self) -> None:
         """Write positions and key frames as arrays, and arrays of the source beside the values."""
-        for axis, stored in AXIS_NAMES.items():
-            coordinate = self._volume.coords[axis]
-            self._writer.add_whole(
-                f"coords/{stored}",
-                coordinate.values,
-                attributes={**coordinate.attributes, "name": coordinate.name},
-            )
+        write_coordinates(self._writer, self._volume.coords)
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
         for name, array in self._arrays.items():

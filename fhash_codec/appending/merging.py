@@ -295,8 +295,6 @@ class _Whole:
             series,
             scan,
             range(self.shape[0]),
-            variable=header["variable"],
-            brief=True,
         )
         table = TableParts(
             shape=(self.shape[0], *first.table.shape[1:]),

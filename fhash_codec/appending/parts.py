@@ -255,8 +255,7 @@ class _Job:
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""
         plan, steps = self.plan, StepsSeries(self.series, self.steps)
-        variable = describe_variable(self.series)
-        begin_variable(writer, variable)
+        begin_variable(writer, describe_variable(self.series))
         source = self._write_source(writer)
         value_range = plan.value_range
         scanned = Scan(
@@ -270,8 +269,6 @@ class _Job:
             steps,
             scanned,
             range(len(self.steps)),
-            variable=variable,
-            brief=True,
             everything=EVERYTHING in plan.features,
         )
         parts = TableParts(

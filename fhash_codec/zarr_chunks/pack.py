@@ -20,7 +20,6 @@ from fhash_codec.coreset.scan import Scan
 from fhash_codec.dataset_encoding import encodable
 from fhash_codec.header import (
     describe_source,
-    describe_variable,
     write_missing,
     write_series,
 )
@@ -159,8 +158,6 @@ class _Job:
             series,
             nothing,
             range(series.shape[0]),
-            variable=describe_variable(series),
-            brief=True,
         )
         tiles = Tiles(array, series.source, fill_absent=self.absent == "fill")
         total = len(tiles)

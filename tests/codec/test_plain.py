@@ -225,7 +225,7 @@ def test_a_header_that_does_not_fit_is_damage(tmp_path: Path) -> None:
         wrong["model"]["head"]["hidden"] = hidden
         with pytest.raises(DamagedFileError, match=name):
             check_arrays(wrong, arrays)
-    for name in ("mlp/bias_3", "tables/level_2", "occupancy/bits", "coords/x", "key_frames"):
+    for name in ("mlp/bias_3", "tables/level_2", "occupancy/bits", "coords/x"):
         with pytest.raises(DamagedFileError, match=f"{name} is missing"):
             check_arrays(header, {key: arrays[key] for key in arrays if key != name})
     for scale in (0.0, -1.0, None):

@@ -51,6 +51,7 @@ DEFAULTS: dict[str, Any] = {
     "features": ["all"],
     "dilation": 1,
     "coreset_fraction": 1.0,
+    "coordinates": {},
     "config": CONFIG_DEFAULTS,
     "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
     "history": {},

@@ -130,15 +130,14 @@ def _required_arrays(
     """
     model = header["model"]
     compact = model["profile"] == COMPACT
-    described = header.get("coordinates", {}) if compact else {}
+    described = header.get("coordinates", {})
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         if axis not in described:
             yield f"coords/{axis}", (length,), ("float64",)
     key_frames = model["levels"][0][0]
-    coded = compact and PLAIN_FEATURE not in header["required_features"]
-    if not coded or key_frames < header["domain"]["shape"][0]:
+    if key_frames < header["domain"]["shape"][0]:
         yield "key_frames", (key_frames,), ("int64",)
-    if coded:
+    if compact and PLAIN_FEATURE not in header["required_features"]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
     for number, level in enumerate(model["levels"], start=1):
@@ -164,10 +163,9 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     model, steps = header["model"], header["domain"]["shape"][0]
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         yield f"coords/{axis}", (length,), ("float64",)
+    yield "key_frames", (model["levels"][0][0],), ("int64",)
     if model["profile"] == COMPACT:
-        key_frames, *box = model["levels"][0]
-        yield "key_frames", (key_frames,), ("int64",)
-        yield "corrections", (key_frames, *box), PLAIN_TABLE_TYPES
+        yield "corrections", tuple(model["levels"][0]), PLAIN_TABLE_TYPES
     else:
         yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
     yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)

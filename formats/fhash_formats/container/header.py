@@ -113,8 +113,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
         header["required_features"],
         allowed=profile == PAPER and header["model"]["tables"] != CODED,
     )
-    if profile == COMPACT:
-        _check_coordinates(top, shape)
+    _check_coordinates(top, shape)
     top.record("config")
     _check_training(top.record("training"))
     quality = top.record("quality")

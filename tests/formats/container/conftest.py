@@ -45,6 +45,7 @@ def make_header() -> dict[str, Any]:
         "features": ["all"],
         "dilation": 1,
         "coreset_fraction": 0.5,
+        "coordinates": {},
         "model": {
             "profile": "paper",
             "fold": 2,
@@ -104,7 +105,7 @@ def make_compact_header() -> dict[str, Any]:
         "time": {"values": [0, 0.5, 2, 2.25], "attributes": {"units": "h"}},
         "z": {},
         "y": {"start": -1.5, "step": 0.25},
-        "x": {"start": 0.1, "step": 0.3, "last": 1.6, "dtype": "float32", "name": "lon"},
+        "x": {"start": 0.1, "step": 0.3, "ulps": [1], "dtype": "float32", "name": "lon"},
     }
     return header
 
