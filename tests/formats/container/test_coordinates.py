@@ -223,7 +223,7 @@ def test_the_profile_paper_has_positions_in_the_header_too(sample, samples) -> N
     with Container.open(sample) as container:
         np.testing.assert_array_equal(container.coordinate("x").values, np.arange(6) * 0.5)
     header["coordinates"] = {"x": {"step": None}}
-    with pytest.raises(InputError, match="coordinates.x.step"):
+    with pytest.raises(InputError, match=r"coordinates\.x\.step"):
         samples.write(sample, header, arrays, force=True)
 
 
