@@ -26,9 +26,8 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
-from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, STEPS
+from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, SPARSE, STEPS
 from fhash_formats.container.source_entry import AUXILIARY
-from fhash_formats.container.sparse import SPARSE
 from fhash_formats.container.variables import COORDINATES
 from fhash_formats.errors import InputError
 from fhash_formats.support.atomic import check_output

@@ -19,7 +19,7 @@ from fhash_codec.paper.training.rounds import Goal
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.sparse import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
+from fhash_formats.container.header import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
 from fhash_formats.series import Series
 
 SPARSE_BELOW = 0.5

@@ -26,8 +26,7 @@ from fhash_codec.paper.number_type import NumberType
 from fhash_codec.paper.tables.needed import Needed, needed_by
 from fhash_codec.paper.tables.sparse_table import SparseTable, write_sparse
 from fhash_formats.container import Container, ContainerWriter, StoredArray
-from fhash_formats.container.header import BITS_ARRAY
-from fhash_formats.container.sparse import COUNTS, FRINGE
+from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE
 from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20

@@ -20,6 +20,7 @@ from fhash_formats.container.header import (
     BITS_ARRAY,
     CODED,
     COMPACT,
+    COUNTS,
     HEAD_CROSS,
     HEAD_INPUTS,
     LOWEST,
@@ -31,6 +32,7 @@ from fhash_formats.container.header import (
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
+    SPARSE,
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
@@ -38,7 +40,6 @@ from fhash_formats.container.header import (
 )
 from fhash_formats.container.record import Record
 from fhash_formats.container.source_entry import check_source
-from fhash_formats.container.sparse import SPARSE, sparse_shape
 from fhash_formats.errors import DamagedFileError
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
@@ -147,7 +148,7 @@ def _required_arrays(
             continue
         name, size = f"tables/level_{number}", model["embedding_size"]
         sparse = SPARSE in model
-        shape = sparse_shape(name, level, size, arrays) if sparse else (*level, size)
+        shape = _sparse_shape(name, level, size, arrays) if sparse else (*level, size)
         yield name, shape, (model["tables"],)
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
@@ -156,6 +157,26 @@ def _required_arrays(
     features = 1 if compact else len(header["features"])
     size = occupancy_bytes(header["feature_bounding_box"])
     yield BITS_ARRAY, (features, key_frames, size), ("uint8",)
+
+
+def _sparse_shape(
+    name: str, level: Sequence[int], embedding_size: int, arrays: Mapping[str, ArrayMetadata]
+) -> tuple[int, ...]:
+    """The shape that the array of a sparse table must have, by its counts.
+
+    Args:
+        name: of the array.
+        level: vertices (t, z, y, x) of the level.
+        embedding_size: numbers at each vertex.
+        arrays: all arrays of the file.
+
+    Raises DamagedFileError where the counts do not fit the level.
+    """
+    if name not in arrays:
+        raise DamagedFileError(f"array {name} is missing")
+    attributes = Record(arrays[name].attributes, f"array {name} attribute ")
+    counts = attributes.integers(COUNTS, level[0], 0, prod(level[1:]))
+    return sum(counts), embedding_size
 
 
 def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:

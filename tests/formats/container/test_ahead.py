@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fhash_formats.container.ahead import Ahead, chunks_after
+from fhash_formats.container.stored import Ahead, chunks_after
 
 
 def read(ahead: Ahead, *spans: tuple[int, int]) -> int:

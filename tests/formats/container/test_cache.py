@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fhash_formats.container import Container
-from fhash_formats.container.cache import ChunkCache
+from fhash_formats.container.stored import ChunkCache
 
 
 def chunk(size: int = 100) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from sharded_files import chunk_of, random_values, write_sharded
 
 from fhash_formats.container import shard_order
-from fhash_formats.container.chunks import cut
+from fhash_formats.container.writer import cut
 from fhash_formats.errors import InputError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 
-from fhash_formats.container.defaults import CONFIG_DEFAULTS, DEFAULTS, brief, complete
+from fhash_formats.container.header import CONFIG_DEFAULTS, DEFAULTS, brief, complete
 
 
 def test_a_brief_header_comes_back(samples) -> None:

@@ -19,9 +19,7 @@ from fhash_formats.container import (
 )
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import plain_codecs
-from fhash_formats.container.defaults import DEFAULTS
-from fhash_formats.container.header import LOWEST, MASK_ARRAY, MISSING_ARRAY, STEPS
-from fhash_formats.container.layout import FORMAT_VERSION
+from fhash_formats.container.header import DEFAULTS, LOWEST, MASK_ARRAY, MISSING_ARRAY, STEPS
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.variables import (
     ARRAY,
@@ -33,6 +31,7 @@ from fhash_formats.container.variables import (
     part_place,
     read_variables,
 )
+from fhash_formats.container.zip_file import FORMAT_VERSION
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.number_types import DTYPES

@@ -8,8 +8,14 @@ import zipfile
 
 import pytest
 
-from fhash_formats.container.layout import Member, comment, directory_entry, ending, local_header
-from fhash_formats.container.zip_checked import read_members
+from fhash_formats.container.zip_file import (
+    Member,
+    comment,
+    directory_entry,
+    ending,
+    local_header,
+    read_members,
+)
 from fhash_formats.errors import DamagedFileError
 
 MEMBER = Member(name="a/b", offset=0x01020304, size=0x05060708, crc=0x090A0B0C)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import Container, remote
-from fhash_formats.container.location import Location
+from fhash_formats.container.reader import Location
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from fhash_formats.container.ranges import merged
+from fhash_formats.container.source import merged
 
 
 def places(requests) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ from hostile_files import refused, replaced
 
 from fhash_formats.container import FORMAT_VERSION, Container, is_container
 from fhash_formats.container.coding import crc32c
-from fhash_formats.container.defaults import complete
+from fhash_formats.container.header import complete
 from fhash_formats.errors import DamagedFileError
 
 

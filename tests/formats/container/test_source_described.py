@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import describe_metadata, read_metadata, strict_json
-from fhash_formats.container.source_described import MAX_INLINE
+from fhash_formats.container.source_entry import MAX_INLINE
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate, index_coordinate
 from fhash_formats.source_metadata import SourceMetadata, SourceVariable

@@ -9,7 +9,7 @@ import zlib
 import pytest
 from hostile_files import FLAGS, FULL_SIZE, METHOD, OFFSET, ROOT, SIZE, read_everything, refused
 
-from fhash_formats.container.layout import Member, comment, deflated, ending, local_header
+from fhash_formats.container.zip_file import Member, comment, deflated, ending, local_header
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 ENTRIES = {
