@@ -96,12 +96,6 @@ def describe_source(
     }
 
 
-def begin_variable(writer: ContainerWriter, variable: Mapping[str, Any]) -> None:
-    """Begin the variable of a header entry, in a file of its own."""
-    units = {"units": variable["units"]} if variable["units"] else {}
-    writer.begin(variable["name"], {**variable["attributes"], **units})
-
-
 def write_series(
     writer: ContainerWriter,
     series: Series,
@@ -112,9 +106,9 @@ def write_series(
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
-    The writer begins the variable of the series, unless one has begun. Each array that the header
-    can say in fewer bytes is left out, but for the coordinates of one of several variables, which
-    share their arrays. Returns the header's `coordinates`, which stand for these arrays.
+    The writer begins the variable of the series. Each array that the header can say in fewer bytes
+    is left out, but for the coordinates of one of several variables, which share their arrays.
+    Returns the header's `coordinates`, which stand for these arrays.
 
     Args:
         writer: of the container.
@@ -125,8 +119,7 @@ def write_series(
             step is a key frame: all others are in it, and are read from there.
     """
     coords = _storable_coords(series)
-    if not writer.begun:
-        begin_variable(writer, describe_variable(series))
+    writer.begin(describe_variable(series))
     described = {}
     if not writer.one_of_several:
         names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)

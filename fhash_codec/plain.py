@@ -19,7 +19,7 @@ from fhash_codec.compact.plain import correction_of, correction_type, predicted
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes, write_bits
-from fhash_codec.header import begin_variable, write_coordinates
+from fhash_codec.header import write_coordinates
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
@@ -92,7 +92,7 @@ class _Export:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
         self._header = volume.container.header
-        begin_variable(writer, self._header["variable"])
+        writer.begin(self._header["variable"])
         names = [coordinate.name for coordinate in volume.coords.values()]
         writer.name_axes(names, volume.shape)
         self._done, self._total = 0, 1

@@ -12,7 +12,7 @@ import numpy as np
 
 from fhash_codec.appending.figures import Figures
 from fhash_codec.appending.layers import CodedLayer, LayerCoder
-from fhash_codec.header import begin_variable, write_coordinates
+from fhash_codec.header import write_coordinates
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import StoredArray, describe_coordinates
 from fhash_formats.container.coding import transform_codecs
@@ -145,7 +145,7 @@ class GrowingFile:
 
     def _name(self, frame: Sequence[int]) -> list[str]:
         """Name the arrays; the names of the axes, which stay the same for any number of steps."""
-        begin_variable(self._container, self._header["variable"])
+        self._container.begin(self._header["variable"])
         coordinates = [self._coords[axis].name for axis in AXES]
         return self._container.name_axes(coordinates, (self.steps, *frame))
 

@@ -31,10 +31,8 @@ from fhash_codec.coreset.features import resolve_features
 from fhash_codec.coreset.scan import Scan, scan_steps
 from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import (
-    begin_variable,
     brief_quality,
     describe_source,
-    describe_variable,
     write_series,
 )
 from fhash_codec.measure.metrics import Comparison
@@ -255,8 +253,6 @@ class _Job:
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""
         plan, steps = self.plan, StepsSeries(self.series, self.steps)
-        begin_variable(writer, describe_variable(self.series))
-        source = self._write_source(writer)
         value_range = plan.value_range
         scanned = Scan(
             value_range=value_range,
@@ -271,6 +267,7 @@ class _Job:
             range(len(self.steps)),
             everything=EVERYTHING in plan.features,
         )
+        source = self._write_source(writer)
         parts = TableParts(
             shape=(len(self.steps), *blocks.shape[1:]),
             dtype=blocks.source_dtype,

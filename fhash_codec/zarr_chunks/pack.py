@@ -114,16 +114,12 @@ def _write_several(
     writer: ContainerWriter, job: _Job, names: Sequence[str], figures: dict[str, Any]
 ) -> int:
     """Write several variables, and add the figures of each; the bytes of the file."""
-    labels = {}
     for name in names:
         # Every variable is opened once, so that one that cannot be taken is refused at once.
         with job.opened(name) as (series, _):
-            units = {"units": str(series.units)} if series.units else {}
-            labels[name] = {**series.attributes, **units}
             metadata = series.metadata
     writer.attributes = {} if metadata is None else json_attributes(metadata.attributes)
     for number, name in enumerate(names, start=1):
-        writer.begin(name, labels[name])
         with job.opened(name) as (series, array):
             note = f"{name}, {number} of {len(names)}"
             header, figures[name] = job.write(writer, series, array, note)

@@ -253,15 +253,17 @@ class ContainerWriter:
         self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], int] = {}
 
-    def begin(self, name: str, attributes: Mapping[str, Any]) -> None:
-        """Begin a variable, whose table has a name as near as possible to this one.
+    def begin(self, variable: Mapping[str, Any]) -> None:
+        """Begin a variable, whose table has a name as near as possible to that of the variable.
 
-        Args:
-            name: of the variable; among several, one of their names.
-            attributes: of the variable; its table gets those of SHOWN_ATTRIBUTES.
+        variable: `name`, `units` and `attributes`, as the header has them; the table gets its units
+            and those of SHOWN_ATTRIBUTES. Several variables have the names that were given for
+            them, in that order.
         """
+        attributes = {**variable["attributes"], "units": variable["units"]}
         shown = {key: attributes[key] for key in SHOWN_ATTRIBUTES if attributes.get(key)}
         if self.one_of_several:
+            name = list(self._nodes)[len(self._headers)]
             begun = self._position + len(self._tail()) if self._headers else 0
             self._variable = _Variable(
                 name=name,
@@ -271,13 +273,9 @@ class ContainerWriter:
                 begun=begun,
             )
             return
-        self._variable = _Variable(name=None, number=0, node=free_node(name, ()), attributes=shown)
-        self._names_taken = {self._variable.node}
-
-    @property
-    def begun(self) -> bool:
-        """Whether a variable has begun that is not finished."""
-        return self._variable is not None
+        node = free_node(variable["name"], ())
+        self._variable = _Variable(name=None, number=0, node=node, attributes=shown)
+        self._names_taken = {node}
 
     def name_axes(self, coordinates: Sequence[str], shape: Sequence[int]) -> list[str]:
         """Give the axes of the variable names before their coordinates are written, if at all.
@@ -536,7 +534,7 @@ class ContainerWriter:
         if self._variable is None:
             if self.one_of_several:
                 raise InputError(f"{self.path}: no variable has begun")
-            self.begin("values", {})
+            self.begin({"name": "values", "units": "", "attributes": {}})
         assert self._variable is not None
         return self._variable
 
