@@ -158,7 +158,7 @@ class _Piece:
             "frame": header["domain"]["shape"][1:],
             "bulk": (header["quality"].get("bulk") or {}).get("range"),
             "tile": self.table.chunk_shape,
-            "settings": self.settings.to_dict(),
+            "settings": self.settings.to_bytes(),
             "positions": [(c.name, c.attributes, c.values.tobytes()) for c in positions],
             "time": (time.name, time.attributes),
             "parts": (self.of, self.steps, self.ssim_steps),

@@ -18,7 +18,6 @@ from fhash_codec.compact.choices.labels import (
     has_labels,
     holds_beside,
     look_at_labels,
-    may_be_many,
     tiled_labels,
     with_step_of,
 )
@@ -214,8 +213,7 @@ def _by_trial(
         if holds_beside(task, labelled, attempt):
             return _label_plan(task, labelled)
     if trial is not None and task.goal.lossless:
-        many = may_be_many(task.value_range, attempt.sample)
-        settings = replace(settings, labels=True, many_labels=many)
+        settings = replace(settings, labels=True)
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,

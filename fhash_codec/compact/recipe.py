@@ -7,7 +7,6 @@ everything gives them, under a bound of the error. It is JSON, so that it can be
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
@@ -79,9 +78,9 @@ class Recipe:
     def to_dict(self) -> dict[str, Any]:
         """JSON values; `from_dict` takes them."""
         coding = {name: value for name, value in vars(self.coding).items() if name != "bulk"}
-        values = {"tile": list(self.tile), "settings": self.settings.to_dict(), "coding": coding}
+        values = {"tile": list(self.tile), "settings": self.settings.to_text(), "coding": coding}
         if self.filling is not None:
-            settings, density = self.filling.settings.to_dict(), self.filling.density
+            settings, density = self.filling.settings.to_text(), self.filling.density
             values["filling"] = {"settings": settings, "density": density}
         return values
 
@@ -105,9 +104,7 @@ class Recipe:
 
 def _settings(record: Record, tile: Shape) -> TileSettings:
     """The settings of a record for tiles of a shape; raises InputError or DamagedFileError."""
-    values = record.get("settings")
-    record.need(isinstance(values, Mapping), "settings", "an object")
-    settings = TileSettings.from_dict(values)
+    settings = TileSettings.from_text(record.text("settings"))
     transform_for(settings, tile)  # refuses bases of other lengths
     return settings
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.scan import scan_piece
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import CRC32C, TRANSFORM, Codec, with_crc32c
+from fhash_formats.container.coding import TRANSFORM, Codec
 from fhash_formats.container.sharding import SINGLE_SHARD_CHUNKS, shard_order
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.readers.zarr_coded import CodedArray
@@ -132,7 +132,7 @@ class Tiles:
         marks = bool(array.fill != array.fill) or array.fill in array.fills
         self._fill_absent = fill_absent or marks
         codec: Codec = {"name": TRANSFORM, "configuration": array.configuration}
-        self.codecs: list[Codec] = [codec, CRC32C]
+        self.codecs: list[Codec] = [codec]
         self.metadata = ArrayMetadata(
             shape=array.shape, dtype=array.dtype, chunk_shape=array.tile, codecs=self.codecs
         )
@@ -197,7 +197,7 @@ class Tiles:
 
     def _decode(self, stream: bytes) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
         """The values of a tile, and its mask where it may have one, as a reader decodes them."""
-        coder, data = self.metadata.coder, memoryview(with_crc32c(stream))
+        coder, data = self.metadata.coder, memoryview(stream)
         return coder.decode_masked(data) if coder.masked else (coder.decode(data), None)
 
     def _look(self, index: Index) -> _Look:

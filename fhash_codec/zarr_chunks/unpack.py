@@ -19,7 +19,6 @@ from fhash_codec.dataset import open as open_file
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.zarr_chunks.chunk_table import FILL, ChunkTable
-from fhash_formats.container.coding import with_crc32c
 from fhash_formats.container.sharding import pack_index
 from fhash_formats.errors import InputError
 from fhash_formats.source_metadata import SourceVariable
@@ -139,7 +138,6 @@ def _same(first: SourceVariable, second: SourceVariable) -> bool:
 
 def _add_table(root: Any, table: ChunkTable) -> None:
     """Write the document of an array of tiles."""
-    from zarr.codecs import Crc32cCodec
 
     outline, attributes = table.outline, json_attributes(table.outline.attributes)
     if table.fill is not None:
@@ -151,7 +149,7 @@ def _add_table(root: Any, table: ChunkTable) -> None:
         chunks=table.chunk,
         shards=table.shard,
         serializer=table.codec,
-        compressors=(Crc32cCodec(),),
+        compressors=(),
         filters=(),
         fill_value=np.nan if table.dtype.kind == "f" else 0,
         dimension_names=list(outline.dimensions),
@@ -170,8 +168,7 @@ def _write_chunks(folder: Path, table: ChunkTable, progress: Progress) -> None:
         sizes = []
         with path.open("wb") as file:
             for index in indices:
-                data = with_crc32c(table.stream(index))
-                sizes.append(file.write(data))
+                sizes.append(file.write(table.stream(index)))
                 done += 1
                 progress("unpacking", done, total, name)
             if table.sharding is not None:

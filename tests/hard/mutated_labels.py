@@ -1,47 +1,49 @@
-"""Mutations of what version 1.2 of the format added: tiles of labels, clipped values, fill values.
+"""Mutations of tiles of labels, of clipped values and of fill values.
 
-All checksums are correct, and so are the digests of labels, unless the digest itself is changed. A
-file without what a kind changes is passed over.
+All checksums are correct. A file without what a kind changes is passed over.
 """
 
 from __future__ import annotations
 
+import copy
 import random
 import zlib
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from containers import Parts, with_crc
+from containers import Parts
 from documents import DOCUMENT, FLOATS, OTHERS, dumped, header_of, path_of
 from mutated_payload import (
     NothingFitsError,
-    configuration_of,
     damaged,
     documents_of,
     inner_chunks,
     is_coded,
-    labelled_body,
+    put_settings,
     replaced,
+    sealed,
+    sections_of,
+    settings_of,
     shard_of,
 )
 
 from fhash_formats.container.header import TABLE
+from fhash_formats.errors import InputError
 from fhash_formats.support.number_types import DTYPES
-from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
+from fhash_formats.transform.entropy.labels import MAX_LABELS
 from fhash_formats.transform.tile.sections import (
-    EXACT,
+    KIND,
     LABELS,
-    LABELS_MASKED,
-    MANY,
+    MASKED,
     MISSING,
     OWN,
     RESIDUAL,
+    pack_planes,
     parse_stream,
-    section,
+    seal,
 )
-
-Bytes = bytes | memoryview
+from fhash_formats.transform.tile.settings import read_varint, varint
 
 
 def _labelled(parts: Parts) -> list[tuple[str, int]]:
@@ -53,15 +55,13 @@ def _labelled(parts: Parts) -> list[tuple[str, int]]:
             continue
         _, _, chunks = inner_chunks(document, member, data)
         found += [
-            (member, number)
-            for number, chunk in enumerate(chunks)
-            if chunk[0] & 0xE0 in (LABELS, LABELS_MASKED)
+            (member, number) for number, chunk in enumerate(chunks) if chunk[4] & KIND == LABELS
         ]
     return found
 
 
 def _labels(chance: random.Random, parts: Parts) -> Parts:
-    """Change the palette, the labels, the digest or the flags of a tile of labels."""
+    """Change the palette, the labels or the flags of a tile of labels."""
     found = _labelled(parts)
     if not found:
         raise NothingFitsError
@@ -69,43 +69,30 @@ def _labels(chance: random.Random, parts: Parts) -> Parts:
     document = documents_of(parts)[member.partition("/c/")[0]]
     sharding, present, chunks = inner_chunks(document, member, dict(parts)[member])
     dtype = np.dtype(document["data_type"])
-    stream = _labels_changed(chance, chunks[number][:-4], dtype, sharding.chunk_shape)
-    chunks[number] = with_crc(stream)
+    chunks[number] = _labels_changed(chance, chunks[number], dtype)
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
-def _labels_changed(
-    chance: random.Random, stream: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> bytes:
+def _labels_changed(chance: random.Random, stream: bytes, dtype: np.dtype[Any]) -> bytes:
     """Return another stream of labels: a valid one, unless a decoder refuses it."""
-    sections, flags = parse_stream(stream).sections(), stream[0]
-    masked, body = flags & 0xE0 == LABELS_MASKED, sections[-1]
-    size = int.from_bytes(body[4:8], "little")
-    packed: bytes = body[8 : 8 + size]
-    coded = body[8 + size :]
-    plain = zlib.decompress(packed)
-    bits = _unpacked(plain, dtype) if flags & MANY else np.frombuffer(plain, f"<u{dtype.itemsize}")
+    sections, flags = sections_of(parse_stream(stream)), stream[4]
+    size, rest = read_varint(memoryview(sections[-1]))
+    length, rest = read_varint(rest)
+    packed, coded = bytes(rest[:length]), bytes(rest[length:])
+    planes = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(dtype.itemsize, -1)
+    steps = np.ascontiguousarray(planes.T).view(f"<u{dtype.itemsize}").reshape(-1)
+    bits = np.cumsum(steps, dtype=steps.dtype)
     turn = chance.randrange(10)
     if turn == 0:  # other values
-        packed = _packed(_palette(chance, bits, dtype), flags)
+        packed = _packed(_palette(chance, bits, dtype))
     elif turn == 1:  # another number of values
-        counts = (
-            0,
-            1,
-            2,
-            len(bits) - 1,
-            len(bits) + 1,
-            MAX_NARROW,
-            MAX_LABELS - 1,
-            MAX_LABELS,
-            257,
-            70_000,
-        )
+        counts = (0, 1, 2, size - 1, size + 1, 256, 257, MAX_LABELS - 1, MAX_LABELS, 70_000)
         most = 1 << min(8 * dtype.itemsize, 20)
-        packed = _packed(np.arange(min(chance.choice(counts), most), dtype=bits.dtype), flags)
+        size = min(chance.choice(counts), most)
+        packed = _packed(np.arange(size, dtype=bits.dtype))
     elif turn == 2:  # values that do not ascend
         order = chance.choice((bits[::-1], np.repeat(bits, 2), np.roll(bits, 1), bits[:1] * 0))
-        packed = _packed(order, flags)
+        size, packed = len(order), _packed(order)
     elif turn == 3:  # bytes that are no palette
         packed = chance.choice(
             (
@@ -117,36 +104,25 @@ def _labels_changed(
     elif turn in (4, 5):  # other labels
         coded = damaged(chance, coded)
     elif turn == 6:  # with a mask or without one
-        masked = not masked
-        flags ^= LABELS ^ LABELS_MASKED
+        flags ^= MASKED
     elif turn == 7:
-        flags ^= chance.choice((OWN, MISSING, RESIDUAL, EXACT, MANY, MANY, 0xE0, 0x60))
-    body = labelled_body(packed, coded, dtype, shape, masked=masked)
-    if turn == 8:  # another digest, or another length of the palette
-        at = chance.choice((0, 4))
-        number = chance.choice((0, 1, len(body) - 8, len(body) - 7, len(body), 2**32 - 1))
-        body = body[:at] + number.to_bytes(4, "little") + body[at + 4 :]
-    sections = [*sections[:-1], body]
+        flags ^= chance.choice((OWN, MISSING, RESIDUAL, MASKED, 1, 3, 4, 128))
+    length = len(packed)
+    if turn == 8:  # another number of values, or another length of the palette
+        number = chance.choice((0, 1, len(coded), length - 1, length + 1, 2**32 - 1, 2**35 - 1))
+        size, length = chance.choice(((number, length), (size, number)))
+    sections[-1] = varint(size) + varint(length) + packed + coded
     if turn == 9:
-        sections = chance.choice(
-            ([], [b""], sections * 2, [*sections, b""], [body[:7]], [body[:8]], [b"", *sections])
+        body = sections[-1]
+        return sealed(
+            bytes([flags]) + chance.choice((b"", body[:1], body[:2], body * 2, b"\xff" * 9))
         )
-    return bytes([flags]) + b"".join(map(section, sections))
+    return seal(flags, sections)
 
 
-def _unpacked(plain: bytes, dtype: np.dtype[Any]) -> Any:
-    """Return the palette of many labels, whose differences stand in planes of bytes."""
-    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-    steps = np.ascontiguousarray(planes.T).view(f"<u{dtype.itemsize}").reshape(-1)
-    return np.cumsum(steps, dtype=steps.dtype)
-
-
-def _packed(palette: Any, flags: int) -> bytes:
-    """Return a deflated palette, in the form that the flags of its stream say."""
-    if not flags & MANY:
-        return zlib.compress(palette.tobytes())
-    steps = np.diff(palette, prepend=palette.dtype.type(0))
-    return zlib.compress(steps.view(np.uint8).reshape(-1, steps.itemsize).T.tobytes())
+def _packed(palette: Any) -> bytes:
+    """Return a packed palette."""
+    return pack_planes(np.diff(palette, prepend=palette.dtype.type(0)))
 
 
 def _palette(chance: random.Random, bits: Any, dtype: np.dtype[Any]) -> Any:
@@ -173,35 +149,43 @@ def _clip(chance: random.Random, parts: Parts) -> Parts:
     root, top, header = header_of(parts)
     table = path_of(header, TABLE)
     document = documents_of(parts).get(table, {})
-    settings = configuration_of(document) if document and is_coded(document) else {}
-    if "clip" not in settings:
+    settings = settings_of(document) if document and is_coded(document) else None
+    if settings is None or not settings.clip:
         raise NothingFitsError
-    low, high = settings["range"]
+    settings = copy.copy(settings)
+
+    def put(**values: Any) -> None:  # without the checks of settings
+        for name, value in values.items():
+            object.__setattr__(settings, name, value)
+
+    low, high = float(settings.low), float(settings.high)
     middle = (low + high) / 2
-    turn = chance.randrange(7)
+    turn = chance.randrange(6)
     if turn == 0:
-        settings["clip"] = chance.choice((False, "true", 1, 0, None, [True], {}))
+        put(clip=False)
     elif turn in (1, 2):
-        settings["range"] = chance.choice(
+        ends = chance.choice(
             (
                 *([low, low], [high, high], [middle, middle], [middle, high], [low, middle]),
                 *([high, low], [-0.0, 0.0], [low - 1, high + 1], [5e-324, 1e-323]),
                 *([-1e300, 1e300], [-3.4e38, 3.4e38], [3.5e38, 3.6e38], [-1e39, -1e38]),
-                *([1e308, 1.7e308], [low, 10**400], [low], [low, high, high], [None, high]),
+                *([1e308, 1.7e308], [low, float("inf")], [float("nan"), high]),
             )
         )
+        put(low=ends[0], high=ends[1])
     elif turn == 3:  # residuals far beyond the range
-        settings["quantum"] = chance.choice((*FLOATS, 1e6, 1e30, 1e300, 2.0**1000))
+        put(quantum=chance.choice((*FLOATS, 1e6, 1e30, 1e300, 2.0**1000)))
     elif turn == 4:
         header["value_range"] = chance.choice(
             ([low - 9, low - 8], [middle, middle], [high, high], [0, 0], [-3e38, 3e38])
         )
-    elif turn == 5:
-        features = top["required_features"]
-        top["required_features"] = chance.choice(([*features, "clip"], features * 2, []))
     else:
         top["format_version"] = chance.choice(([1, 8], [2, 1], [2, 2], [3, 0]))
-        settings["double"] = chance.random() < 0.5
+        put(double=chance.random() < 0.5)
+    try:
+        put_settings(document, settings.to_bytes())
+    except (InputError, OverflowError, ValueError) as error:  # whole ends have no fractions
+        raise NothingFitsError from error
     return replaced(parts, {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 

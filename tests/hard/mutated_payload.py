@@ -5,11 +5,10 @@ All checksums are correct, so the contents reach the decoders.
 
 from __future__ import annotations
 
-import contextlib
+import base64
 import json
 import random
 import struct
-import zlib
 from collections.abc import Callable
 from math import prod
 from typing import Any
@@ -21,23 +20,15 @@ from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.sharding import Sharding, pack_index, parse_index
-from fhash_formats.errors import FhashError
-from fhash_formats.transform.array_axes import take_axes
-from fhash_formats.transform.axes.bands import band_table
-from fhash_formats.transform.entropy.coder import decode_integers
-from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels
-from fhash_formats.transform.entropy.mask import decode_mask
-from fhash_formats.transform.entropy.predict import decode_predicted
-from fhash_formats.transform.entropy.table import single_band
-from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
+from fhash_formats.native import crc32c
 from fhash_formats.transform.tile.sections import (
-    MISSING,
-    OWN,
+    KIND,
+    MASKED,
     RESIDUAL,
-    little_endian,
+    TRANSFORMED,
+    TileStream,
     parse_stream,
-    section,
-    unpack_settings,
+    seal,
 )
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -132,8 +123,7 @@ def damaged(chance: random.Random, data: bytes) -> bytes:
 def inner_chunks(
     document: dict[str, Any], member: str, data: bytes
 ) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
-    """Return the sharding of an array, which inner chunks a shard has, and these with their
-    CRC-32C."""
+    """Return the sharding of an array, which inner chunks a shard has, and these."""
     metadata = ArrayMetadata.from_dict(document)
     sharding = metadata.sharding
     if sharding is None:
@@ -145,6 +135,11 @@ def inner_chunks(
     return sharding, present, [data[offset : offset + size] for offset, size in index[present]]
 
 
+def sealed(rest: bytes) -> bytes:
+    """Return the stream of bytes that follow its checksum."""
+    return crc32c(rest).to_bytes(4, "little") + rest
+
+
 def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[bytes]) -> bytes:
     if isinstance(sharding, OneTile):
         return b"".join(chunks)
@@ -152,13 +147,13 @@ def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[byt
 
 
 def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
-    """Change bytes of a chunk as stored, with a correct CRC-32C."""
+    """Change bytes of a chunk as stored, with a correct checksum."""
     _, document, member, data = chosen(chance, parts)
     if not is_coded(document):
         return replaced(parts, {member: with_crc(damaged(chance, data[:-4]))})
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    chunks[at] = with_crc(damaged(chance, chunks[at][:-4]))
+    chunks[at] = sealed(damaged(chance, chunks[at][4:]))
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
@@ -240,104 +235,39 @@ def tile_of(document: dict[str, Any]) -> tuple[int, ...]:
     return tuple(place["configuration"]["chunk_shape"])
 
 
-def _stream(chance: random.Random, parts: Parts) -> Parts:
-    """Change sections of a coded tile, with correct digests of what they decode to.
+def settings_of(document: dict[str, Any]) -> TileSettings | None:
+    """Return the settings that all tiles of an array share; None where each has its own."""
+    text = configuration_of(document).get("settings")
+    return None if text is None else TileSettings.from_text(text)
 
-    The result is another valid tile, unless a decoder refuses it.
-    """
+
+def put_settings(document: dict[str, Any], data: bytes) -> None:
+    configuration_of(document)["settings"] = base64.b64encode(data).decode()
+
+
+def sections_of(stream: TileStream) -> list[bytes]:
+    parts = (stream.settings, stream.missing, stream.body, stream.residual, stream.mask)
+    return [bytes(part) for part in parts if part is not None]
+
+
+def _stream(chance: random.Random, parts: Parts) -> Parts:
+    """Change sections of a coded tile: another valid tile, unless a decoder refuses it."""
     if not any(is_coded(document) for document in documents_of(parts).values()):
         return values_changed(chance, parts)
     _, document, member, data = chosen(chance, parts, True)
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    whole, axes = take_axes(configuration_of(document))
-    shape = sharding.chunk_shape if axes is None else axes.tile_shape(sharding.chunk_shape)
-    dtype = np.dtype(document["data_type"])
-    stream = chunks[at][:-4]
-    if "transform" in whole:
-        settings = TileSettings.from_dict(whole)
-    else:  # tiles have settings of their own, or need none
-        own = parse_stream(stream).settings
-        if own is None:
-            raise NothingFitsError
-        settings = unpack_settings(own)
-    chunks[at] = with_crc(_restreamed(chance, stream, settings, shape, dtype))
-    return replaced(parts, {member: shard_of(sharding, present, chunks)})
-
-
-def _restreamed(
-    chance: random.Random,
-    stream: bytes,
-    settings: TileSettings,
-    shape: tuple[int, ...],
-    dtype: np.dtype[Any],
-) -> bytes:
-    parts = parse_stream(stream)
-    flags, sections = parts.flags, parts.sections()
-    if parts.labelled:
-        body = sections[-1]
-        start = 8 + int.from_bytes(body[4:8], "little")
-        sections[-1] = labelled_body(
-            body[8:start], damaged(chance, body[start:]), dtype, shape, masked=parts.masked
+    flags, sections = chunks[at][4], sections_of(parse_stream(chunks[at]))
+    if sections:
+        number = chance.randrange(len(sections))
+        sections[number] = damaged(chance, sections[number])
+    if chance.random() < 0.15 and flags & KIND == TRANSFORMED and not flags & RESIDUAL:
+        flags |= RESIDUAL  # a residual where none was
+        sections.insert(
+            len(sections) - bool(flags & MASKED), chance.randbytes(chance.randrange(200))
         )
-        return stream[:1] + b"".join(map(section, sections))
-    if not parts.coded:
-        return stream[:1] + b"".join(section(damaged(chance, data)) for data in sections)
-    first = bool(flags & OWN) + bool(flags & MISSING)
-    at = chance.randrange(first, len(sections))
-    sections[at] = damaged(chance, sections[at])
-    if (
-        chance.random() < 0.15 and not flags & RESIDUAL and not parts.predicted
-    ):  # a residual where none was
-        flags |= RESIDUAL
-        sections.insert(first + 1, chance.randbytes(chance.randrange(200)))
-    try:
-        if parts.predicted and settings.predictor is not None:
-            integers = decode_predicted(sections[first], shape, settings.predictor)
-        else:
-            table = band_table(settings.transform, shape)
-            integers = decode_integers(sections[first], shape, table, trellis=settings.trellis)
-        digest = zlib.crc32(little_endian(integers))
-        if flags & RESIDUAL:
-            residual = decode_integers(sections[first + 1], shape, single_band(shape))
-            digest = zlib.crc32(little_endian(residual), digest)
-        if parts.masked and settings.mask is not None and sections[-1]:
-            sections[-1] = _mask_section(
-                sections[-1][2:], integers, settings, shape, parts.predicted
-            )
-    except FhashError:
-        digest = chance.getrandbits(32)
-    return bytes([flags]) + digest.to_bytes(4, "little") + b"".join(map(section, sections))
-
-
-def labelled_body(
-    packed: bytes, coded: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], *, masked: bool
-) -> bytes:
-    """Return the section of a tile of labels, with the digest of the labels to which it decodes.
-
-    packed: the deflated palette. If its length is not that of a palette, the digest is 0.
-    """
-    with contextlib.suppress(zlib.error):
-        plain = zlib.decompressobj().decompress(packed, 1 << 20)
-        count = len(plain) // dtype.itemsize + masked
-        if 1 <= count <= MAX_LABELS:
-            digest = zlib.crc32(decode_labels(coded, count, shape).data)
-            return struct.pack("<II", digest, len(packed)) + packed + coded
-    return struct.pack("<II", 0, len(packed)) + packed + coded
-
-
-def _mask_section(
-    coded: bytes, integers: Any, settings: TileSettings, shape: tuple[int, ...], predicted: bool
-) -> bytes:
-    """Return a coded mask after the digest of the mask to which it decodes."""
-    assert settings.mask is not None
-    with np.errstate(all="ignore"):
-        if predicted and settings.predictor is not None:
-            linear = predicted_values(integers, settings.predictor, settings)
-        else:
-            linear = linear_values(integers, transform_for(settings, shape), settings)  # type: ignore[arg-type]
-        mask = decode_mask(coded, settings.mask.levels(linear.astype(settings.dtype)))
-    return (zlib.crc32(np.packbits(mask).data) & 0xFFFF).to_bytes(2, "little") + coded
+    chunks[at] = seal(flags, sections)
+    return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {

@@ -6,18 +6,18 @@ volumes.
 
 from __future__ import annotations
 
-import base64
-import json
+import copy
 import random
 import struct
-import zlib
+import types
 from collections.abc import Callable
+from dataclasses import replace
 from math import prod
 from typing import Any
 
 import numpy as np
-from containers import Parts, with_crc
-from documents import DOCUMENT, dumped, header_of, hostile, path_of, places
+from containers import Parts
+from documents import DOCUMENT, dumped, header_of, hostile, path_of
 from mutated_payload import (
     bytes_changed,
     chosen,
@@ -26,8 +26,11 @@ from mutated_payload import (
     documents_of,
     inner_chunks,
     is_coded,
+    put_settings,
     replaced,
-    section,
+    sealed,
+    sections_of,
+    settings_of,
     shard_of,
     tile_of,
     values_changed,
@@ -35,23 +38,27 @@ from mutated_payload import (
 
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE, TABLE
 from fhash_formats.container.sharding import Sharding
+from fhash_formats.errors import InputError
 from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.axes.basis import Basis
-from fhash_formats.transform.entropy.coder import encode_block
+from fhash_formats.transform.axes.candidates import NO_TRANSFORM
 from fhash_formats.transform.entropy.predictor import passes_of
 from fhash_formats.transform.head.head import Layer, NeighbourHead, layer_inputs
-from fhash_formats.transform.stream import MAX_TILE_VERTICES
 from fhash_formats.transform.tile.sections import (
     EMPTY,
-    EXACT,
-    FORMAT,
     LABELS,
-    LABELS_MASKED,
     MASKED,
     OWN,
     PREDICTED,
+    TRANSFORMED,
+    pack_planes,
+    parse_stream,
+    seal,
 )
+from fhash_formats.transform.tile.settings import TileSettings, varint
 
+PLAIN = TileSettings(transform=NO_TRANSFORM, step=1.0, center=0.5, low=0.0, high=1.0)
+"""Settings of tiles that have none."""
 CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE})
 """Features of files with coded tiles: all but those of files whose headers differ."""
 
@@ -63,18 +70,16 @@ def _flags(chance: random.Random, parts: Parts) -> Parts:
     _, document, member, data = chosen(chance, parts, True)
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    stream = chunks[at][:-4]
+    stream = chunks[at]
     if chance.random() < 0.5:
-        stream = bytes([chance.randrange(256)]) + stream[1:]
+        chunks[at] = sealed(bytes([chance.randrange(256)]) + stream[5:])
     else:
-        configuration = json.loads(json.dumps(configuration_of(document)))
-        _settings_changed(chance, configuration, sharding.chunk_shape)
-        text = zlib.compress(
-            chance.choice((dumped(configuration), b"[" * 100_000, b" " * (1 << 24), b"{}", b"3"))
-        )
-        head = 1 if stream[0] & (EXACT | EMPTY) else 5
-        stream = bytes([stream[0] | OWN]) + stream[1:head] + section(text) + stream[head:]
-    chunks[at] = with_crc(stream)
+        parsed = parse_stream(stream)
+        own = parsed.settings
+        settings = settings_of(document) if own is None else TileSettings.from_bytes(own)
+        block = _changed_settings(chance, settings or PLAIN, sharding.chunk_shape)
+        others = sections_of(parsed)[own is not None :]
+        chunks[at] = seal(stream[4] | OWN, [block, *others])
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
@@ -89,69 +94,90 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         return values_changed(chance, parts)
     name = chance.choice(coded)
     document = documents[name]
-    _settings_changed(
-        chance,
-        configuration_of(document),
-        tile_of(document),
-    )
+    settings = settings_of(document) or PLAIN
+    put_settings(document, _changed_settings(chance, settings, tile_of(document)))
+    if chance.random() < 0.1:
+        configuration = configuration_of(document)
+        configuration["settings"] = hostile(chance, configuration["settings"])
     root, top, _ = header_of(parts)
     top["required_features"] = CODED_FEATURES
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
-def _settings_changed(
-    chance: random.Random, settings: dict[str, Any], shape: tuple[int, ...]
-) -> None:
-    turn = chance.randrange(10)
+class Packed:
+    """Stands for a basis or head of some bytes."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def to_bytes(self) -> bytes:
+        return self.data
+
+
+def _changed_settings(
+    chance: random.Random, settings: TileSettings, shape: tuple[int, ...]
+) -> bytes:
+    """Return a block of other settings, most of them not allowed."""
+    if chance.random() < 0.2:
+        return damaged(chance, settings.to_bytes())
+    changed = copy.copy(settings)
+    for name, value in _other(chance, settings, shape).items():  # without the checks of settings
+        object.__setattr__(changed, name, value)
+    try:
+        return changed.to_bytes()
+    except (InputError, OverflowError, ValueError, struct.error):  # no such block
+        return damaged(chance, settings.to_bytes())
+
+
+def _other(chance: random.Random, settings: TileSettings, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Return some other values of settings."""
+    turn = chance.randrange(8)
     numbers = (1e-300, 1e-38, 1.2e-38, 1e-12, 1.0, 1e12, 3.3e38, 1e300, 1.7e308)
+    signed = (*numbers, *(-n for n in numbers), 0.0, np.nan, np.inf)
     if turn == 0:
-        settings["step"] = chance.choice(numbers)
-        settings["double"] = chance.random() < 0.5
-    elif turn == 1:
-        settings["range"] = sorted(chance.choices((*numbers, *(-n for n in numbers), 0.0), k=2))
-        settings["center"] = chance.choice((*numbers, *(-n for n in numbers), 0.0))
-    elif turn == 2:
-        settings["quantum"] = chance.choice((*numbers, 0.0))
-        settings["offsets"] = [chance.choice((-128, 128, 0, 129)) for _ in range(3)]
-    elif turn == 3:
-        axis = chance.choice("tzyx")
-        kinds = (
-            "none",
-            ["haar", 1],
-            ["haar", 10],
-            ["5/3", 10],
-            ["9/7", 10],
-            ["9/7", 0],
-            ["9/7", 11],
-            ["klt", 1],
+        return {"step": chance.choice((*numbers, 0.0, -1.0)), "double": chance.random() < 0.5}
+    if turn == 1:
+        low, high = sorted(chance.choices(signed, k=2))
+        return {"low": low, "high": high, "center": chance.choice(signed)}
+    if turn == 2:
+        count = len(settings.offsets)
+        offsets = tuple(chance.choice((-128, 127, 0)) for _ in range(count))
+        return {"quantum": chance.choice((*numbers, 0.0)), "offsets": offsets}
+    if turn == 3:
+        axes = list(settings.transform.axes)
+        kind, depth = chance.choice(
+            (("none", 0), ("haar", 1), ("haar", 10), ("5/3", 10), ("9/7", 10), ("9/7", 0))
         )
-        settings["transform"][axis] = chance.choice(kinds)
-    elif turn == 4:
-        settings["transform"][chance.choice("tzyx")] = {"klt": _basis(chance, shape)}
-    elif turn == 5:
-        settings["head"] = _head(chance)
-    elif turn == 6:
+        axis = types.SimpleNamespace(kind=kind, depth=depth, basis=None)
+        if chance.random() < 0.5:
+            axis.kind, axis.depth, axis.basis = "klt", 0, _basis(chance, shape)
+        axes[chance.randrange(4)] = axis
+        return {"transform": types.SimpleNamespace(axes=tuple(axes))}
+    if turn == 4:
+        return {"head": _head(chance)}
+    if turn == 5:
         edges = sorted(
             chance.choices((*numbers, -1.0, 0.0, 0.25, 0.5, 0.75), k=chance.randrange(16))
         )
-        scores = [chance.choice((0, 1, 2048, 4095, 4096)) for _ in range(len(edges) + 1)]
-        settings["mask"] = {
-            "edges": edges,
-            "scores": scores,
-            "reach": chance.choice((0, 1, 64, 65)),
-        }
-    elif turn == 7:
-        settings["predictor"] = _predictor(chance)
-    elif turn == 8:
-        for name in ("clip", "labels", "many_labels"):
-            settings[name] = chance.choice((True, True, False, 1, None))
-        settings["origin"] = chance.choice((0, 1, -(1 << 63), (1 << 64) - 1, 1 << 64, 10**400, 2.0))
-    else:
-        holder, key = chance.choice(list(places(settings)))
-        holder[key] = hostile(chance, holder[key])
+        scores, others = (
+            tuple(chance.choice((0, 1, 2048, 4095, 4096)) for _ in range(len(edges) + 1))
+            for _ in range(2)
+        )
+        mask = {"edges": tuple(edges), "scores": scores, "reach": chance.choice((0, 1, 64, 65))}
+        mask["others"] = chance.choice(((), others))
+        return {"mask": types.SimpleNamespace(**mask)}
+    if turn == 6:
+        return {"predictor": _predictor(chance)}
+    whole = (0, 1, -(1 << 63), (1 << 63) - 1, (1 << 53) + 1)
+    low, high = sorted(chance.choices(whole, k=2))
+    origin = chance.choice((*whole, (1 << 64) - 1, 1 << 64, -(1 << 71)))
+    return {
+        **{"low": low, "high": high, "origin": origin},
+        **{name: chance.random() < 0.5 for name in ("clip", "labels")},
+    }
 
 
-def _basis(chance: random.Random, shape: tuple[int, ...]) -> str:
+def _basis(chance: random.Random, shape: tuple[int, ...]) -> Packed:
     """Return a packed basis, mostly of a wrong length."""
     n = min(chance.choice((*shape, 1, 2, 512)), 512)  # longer ones cannot be packed
     rank = chance.randrange(n + 1) if n < 40 else 3
@@ -163,10 +189,10 @@ def _basis(chance: random.Random, shape: tuple[int, ...]) -> str:
             struct.pack("<HH", chance.choice((n, 0, 513, 65535)), chance.choice((rank, 0, 65535)))
             + packed[4:]
         )
-    return base64.b64encode(damaged(chance, packed) if chance.random() < 0.3 else packed).decode()
+    return Packed(damaged(chance, packed) if chance.random() < 0.3 else packed)
 
 
-def _head(chance: random.Random) -> str:
+def _head(chance: random.Random) -> Packed:
     """Return a packed head with extreme numbers."""
     cross = chance.random() < 0.4
     hidden = [chance.choice((1, 3, 14)) for _ in range(2 if cross else chance.randrange(1, 4))]
@@ -190,10 +216,10 @@ def _head(chance: random.Random) -> str:
     packed = NeighbourHead(
         layers=layers, sigma=sigma, low=ends[0], high=ends[1], cross=cross
     ).to_bytes()
-    return base64.b64encode(damaged(chance, packed) if chance.random() < 0.3 else packed).decode()
+    return Packed(damaged(chance, packed) if chance.random() < 0.3 else packed)
 
 
-def _predictor(chance: random.Random) -> dict[str, Any]:
+def _predictor(chance: random.Random) -> types.SimpleNamespace:
     """Return a predictor with extreme weights."""
     levels = [chance.choice((0, 1, 3, 8)) for _ in range(4)]
     order = chance.sample(range(4), 4)
@@ -201,17 +227,14 @@ def _predictor(chance: random.Random) -> dict[str, Any]:
     l0, l1, l2, l3 = levels
     o0, o1, o2, o3 = order
     count = sum(len(a_pass.taps) for a_pass in passes_of((l0, l1, l2, l3), (o0, o1, o2, o3), reach))
-    weights = np.array([chance.choice((-32767, 32767, 0, 4096)) for _ in range(count)], np.int32)
-    packed = encode_block(weights.reshape(1, 1, 1, -1))
-    packed = damaged(chance, packed) if chance.random() < 0.3 else packed
-    return {
-        "step": chance.choice((1e-300, 1.0, 1e300, 0.0)),
-        "origin": chance.choice((0.0, 1e308, -1e308)),
-        "levels": levels,
-        "order": order,
-        "reach": chance.choice((reach, reach, 3)),
-        "weights": base64.b64encode(packed).decode(),
-    }
+    return types.SimpleNamespace(
+        step=chance.choice((1e-300, 1.0, 1e300, 0.0)),
+        origin=chance.choice((0.0, 1e308, -1e308)),
+        levels=levels,
+        order=order,
+        reach=chance.choice((reach, reach, 3)),
+        weights=[chance.choice((-32767, 32767, 0, 4096, 32768)) for _ in range(count)],
+    )
 
 
 def _giant(chance: random.Random, parts: Parts) -> Parts:
@@ -228,25 +251,23 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     top["required_features"] = CODED_FEATURES
     kind = chance.choice(list(DTYPES))
     shape, chunk, shard = _giant_shapes(chance, header, kind)
-    settings = configuration_of(document)
-    plain = dict.fromkeys("tzyx", "none")
-    if chance.random() < 0.7:
-        settings = {"transform": plain, "step": 1.0, "center": 0.5, "range": [0.0, 1.0]}
+    settings = settings_of(document)
+    if settings is None or chance.random() < 0.7:
+        settings = PLAIN
     elif chance.random() < 0.5:
-        settings["transform"] = plain
+        settings = replace(settings, transform=PLAIN.transform)
     document.update(shape=shape, data_type=kind, fill_value=0)
     document["chunk_grid"]["configuration"]["chunk_shape"] = shard
-    checked = {"name": "crc32c"}
-    inner = [{"name": "fhash.transform", "configuration": settings}, checked]
-    index = [{"name": "bytes", "configuration": {"endian": "little"}}, checked]
+    inner = [{"name": "fhash.transform", "configuration": {"settings": settings.to_text()}}]
+    index = [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]
     sharded = {"chunk_shape": chunk, "codecs": inner, "index_codecs": index}
     document["codecs"] = [
         {"name": "sharding_indexed", "configuration": {**sharded, "index_location": "end"}}
     ]
     sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
-    stream = _empty_stream(chance, prod(chunk), np.dtype(kind).itemsize)
+    stream = _empty_stream(chance, np.dtype(kind).itemsize)
     present = sharding.present((0, 0, 0, 0), shape)
-    chunks = [with_crc(stream)] * int(present.sum())
+    chunks = [stream] * int(present.sum())
     new = {f"{table}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)}
     kept = [
         (name, data)
@@ -283,29 +304,17 @@ def _giant_shapes(
     return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
 
 
-def _empty_stream(chance: random.Random, vertices: int, itemsize: int) -> bytes:
-    """Return the stream of a tile of few bytes: empty, with empty sections, or of labels.
-
-    vertices: of the tile.
-    itemsize: bytes of a value.
-    """
-    stream = bytes([chance.choice((FORMAT, MASKED)) | EMPTY])
+def _empty_stream(chance: random.Random, itemsize: int) -> bytes:
+    """Return the stream of a tile of few bytes: empty, with empty sections, or of labels."""
     turn = chance.random()
     if turn < 0.3:  # labels of one value: no byte is needed for any number of them
-        packed = zlib.compress(bytes(itemsize))
-        digest = 0
-        for start in range(0, min(vertices, MAX_TILE_VERTICES), 1 << 20):
-            digest = zlib.crc32(bytes(min(1 << 20, vertices - start)), digest)
-        body = struct.pack("<II", digest, len(packed)) + packed
-        stream = bytes([chance.choice((LABELS, LABELS, LABELS_MASKED))]) + section(body)
-    elif turn < 0.6:
+        packed = pack_planes(np.zeros(1, f"u{itemsize}"))
+        body = varint(1) + varint(len(packed)) + packed
+        return seal(chance.choice((LABELS, LABELS, LABELS | MASKED)), [body])
+    if turn < 0.6:
         sections = [b""] * chance.choice((1, 2, 3))
-        stream = (
-            bytes([chance.choice((FORMAT, MASKED, PREDICTED))])
-            + zlib.crc32(b"").to_bytes(4, "little")
-            + b"".join(map(section, sections))
-        )
-    return stream
+        return seal(chance.choice((TRANSFORMED, TRANSFORMED | MASKED, PREDICTED)), sections)
+    return seal(chance.choice((EMPTY, EMPTY | MASKED)), [])
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {

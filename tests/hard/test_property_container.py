@@ -75,7 +75,7 @@ def write(path: Path, extra: Any, **changes: Any) -> None:
 
     spec = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
     settings = TileSettings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)
-    codecs = [{**TABLE, "configuration": settings.to_dict()}, {"name": "crc32c"}]
+    codecs = [{**TABLE, "configuration": {"settings": settings.to_text()}}]
     with ContainerWriter(path) as writer:
         writer.add_whole(
             "tables/level_1", table(), chunk_shape=SHAPE, codecs=codecs, dimension_names=AXES

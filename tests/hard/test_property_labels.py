@@ -17,7 +17,7 @@ from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels, en
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.labelled import build_labelled_stream
+from fhash_formats.transform.tile.labelled import labelled_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 _T, _Z, _Y, _X = (AxisTransform(kind="5/3", depth=1) for _ in range(4))
@@ -26,7 +26,7 @@ SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 3), st.integers(1, 4), st.i
 
 
 @st.composite
-def labels(draw: Draw) -> tuple[npt.NDArray[np.uint8], int]:
+def labels(draw: Draw) -> tuple[npt.NDArray[np.uint16], int]:
     """Draw labels in regions, of which some are random, and their number."""
     shape, count = draw(SHAPES), draw(st.integers(1, MAX_LABELS))
     lengths = draw(st.tuples(*(st.integers(1, 20) for _ in shape)))
@@ -34,13 +34,13 @@ def labels(draw: Draw) -> tuple[npt.NDArray[np.uint8], int]:
     places = np.indices(shape) // np.array(lengths).reshape(4, 1, 1, 1, 1)
     regions = (places * np.array([7, 5, 3, 1]).reshape(4, 1, 1, 1, 1)).sum(0) % count
     alone = random.random(shape) < draw(st.sampled_from([0.0, 0.1, 1.0]))
-    return np.where(alone, random.integers(0, count, shape), regions).astype(np.uint8), count
+    return np.where(alone, random.integers(0, count, shape), regions).astype(np.uint16), count
 
 
 @looking(20)
 @given(drawn=labels())
 def test_any_labels_come_back(
-    drawn: tuple[npt.NDArray[np.uint8], int],
+    drawn: tuple[npt.NDArray[np.uint16], int],
 ) -> None:
     source, count = drawn
     data = encode_labels(source, count)
@@ -73,7 +73,7 @@ def test_tiles_of_any_few_bits_come_back(
         mask=MaskLevels() if masked else None,
     )
     occupied = random.random(shape) < 0.7 if masked else None
-    stream = build_labelled_stream(values, settings if own else None, occupied)
+    stream = labelled_stream(values, settings if own else None, occupied)
     assert stream is not None
     decoded, mask = decode_tile_mask(stream, shape, kind, None if own else settings)  # type: ignore[arg-type]
     counted = np.ones(shape, bool) if occupied is None else occupied

@@ -41,37 +41,46 @@ CANDIDATE_SETS = 3 * 16 + 3 * 4
 
 
 def unpack_labelled(
-    body: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any], masked: bool, many: bool
+    body: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any], masked: bool
 ) -> tuple[Labels, npt.NDArray[Any] | None]:
     """The values of a tile of labels, and which are occupied; None without a mask."""
-    unsigned, start = f"<u{dtype.itemsize}", 8 + int.from_bytes(body[4:8], "little")
-    plain = zlib.decompress(body[8:start])
-    if many:  # differences, all lowest bytes first
-        planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-        steps = np.ascontiguousarray(planes.T).view(unsigned).reshape(-1)
-        palette = np.cumsum(steps, dtype=unsigned)
-    else:
-        palette = np.frombuffer(plain, unsigned)
-    count = len(palette) + masked  # the last label stands for vertices that are not occupied
-    labels = LabelDecoder(body[start:], count, shape).run()
-    if zlib.crc32(labels.astype("<u2" if many else "u1").tobytes()) != int.from_bytes(
-        body[:4], "little"
-    ):
-        raise ValueError("the decoded labels of a tile differ from their digest")
+    size, body = number_in(body)
+    length, body = number_in(body)
+    steps = unpack_planes(body[:length], np.dtype(f"u{dtype.itemsize}"))
+    palette = np.cumsum(steps, dtype=steps.dtype)
+    # The label after the last of the palette stands for vertices that are not occupied.
+    labels = LabelDecoder(body[length:], size + masked, shape).run()
     values = np.append(palette, [palette.dtype.type(0)])[labels]
-    return values.view(dtype.newbyteorder("<")), labels < len(palette) if masked else None
+    return values.view(dtype), labels < size if masked else None
+
+
+def number_in(data: memoryview) -> tuple[int, memoryview]:
+    """The number at the start of some bytes (LEB128), and the bytes after it."""
+    number = shift = 0
+    while True:
+        byte, data = data[0], data[1:]
+        number |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            return number, data
+
+
+def unpack_planes(data: memoryview, dtype: np.dtype[Any]) -> Labels:
+    """Values of deflated bytes: the lowest bytes of all values, then the next ones, and so on."""
+    plain = np.frombuffer(zlib.decompress(data), np.uint8)
+    planes = np.ascontiguousarray(plain.reshape(dtype.itemsize, -1).T)
+    return planes.view(dtype.newbyteorder("<")).reshape(-1).astype(dtype)
 
 
 class LabelDecoder:
     """The labels known so far."""
 
     def __init__(self, data: bytes | memoryview, count: int, shape: tuple[int, ...]) -> None:
-        self.count, self.wide, self.shape = count, count > 256, shape
-        levels = 16 if self.wide else 8
-        runs = [(3 * 16, 3072), (3 * 4, 0), (levels, 4096), (4, 0)]
+        self.count, self.shape = count, shape
+        self.bit_size = 256 << min((count - 1).bit_length(), 8)
+        runs = [(3 * 16, 3072), (3 * 4, 0), (16, 4096), (4, 0)]
         weights = [weight for sets, weight in runs for _ in range(sets * LANES)]
-        bit_slots = 4 * 65536 if self.wide else 256 + 3 * 16384
-        self.adaptive = Adaptive(data, STARTS[8] + bit_slots, weights, 10 + self.wide)
+        self.adaptive = Adaptive(data, STARTS[8] + 4 * self.bit_size, weights, 11)
         self.known = np.full([n + 2 * PAD for n in shape], NONE)
         segments = [*shape[:3], -(-shape[3] // SEGMENT)]
         self.states = np.full([n + 2 for n in segments], NOTHING)  # one more at each end
@@ -159,15 +168,13 @@ class LabelDecoder:
 
     def key(self, label: int) -> int:
         """A number below 256 for a label."""
-        return (label * 40503 >> 8) & 255 if self.wide else label
+        return (label * 40503 >> 8) & 255
 
     def spelled(self, tested: list[int], around: list[int]) -> int:
         """A label that is none of the tested ones, from its highest bit on."""
         following = self.highest + 1
-        if self.wide and following < self.count and self.adaptive.simple(10):
+        if following < self.count and self.adaptive.simple(10):
             return following
-        levels, size = (16, 65536) if self.wide else (8, 16384)
-        first = STARTS[8] + (65536 if self.wide else 256)
         low, node = 0, 1
         for level in range((self.count - 1).bit_length() - 1, -1, -1):
             middle = low + (1 << level)
@@ -176,12 +183,11 @@ class LabelDecoder:
             if not (lower and upper):
                 bit = int(not lower)
             else:
-                others = (tested[0] if tested else 0, around[3], around[2])
-                slots = [STARTS[8] + node]
-                slots += [
-                    first + i * size + self.beside(label, node) for i, label in enumerate(others)
-                ]
-                sets = (CANDIDATE_SETS + level, CANDIDATE_SETS + levels + len(tested))
+                contexts = [node]
+                for label in (tested[0] if tested else 0, around[3], around[2]):
+                    contexts.append((label * 40503 + node) & self.bit_size - 1)
+                slots = [STARTS[8] + i * self.bit_size + c for i, c in enumerate(contexts)]
+                sets = (CANDIDATE_SETS + level, CANDIDATE_SETS + 16 + len(tested))
                 bit = self.adaptive.mixed(slots, [number * LANES for number in sets], rate=2)
             low = middle if bit else low
             node = node * 2 + bit
@@ -191,7 +197,3 @@ class LabelDecoder:
         """Labels from `low` to before `high` that are not among the tested ones."""
         there = sum(low <= label < high for label in tested)
         return max(min(high, self.count) - low, 0) - there
-
-    def beside(self, label: int, node: int) -> int:
-        """Context of a bit beside another label."""
-        return (label * 40503 + node) & 65535 if self.wide else (label * 256 + node) & 16383

@@ -47,17 +47,14 @@ class Pass:
     weights: tuple[int, ...] = ()
 
 
-def passes_of(settings: dict[str, Any], decode_base64: Any) -> list[Pass]:
-    """The passes that the object `predictor` of the settings says."""
-    levels, order = settings["levels"], settings["order"]
+def passes_of(levels: Sequence[int], order: Sequence[int], reach: int, coded: bytes) -> list[Pass]:
+    """The passes of a predictor whose weights are a coded block."""
     axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
     passes = [Pass(-1, KINDS - 1, first_taps())]
     for i, axis in enumerate(axes):
-        passes.append(
-            Pass(axis, min(len(axes) - 1 - i, KINDS - 2), taps_of(axis, settings["reach"]))
-        )
+        passes.append(Pass(axis, min(len(axes) - 1 - i, KINDS - 2), taps_of(axis, reach)))
     count = sum(len(one.taps) for one in passes)
-    weights = decode_block(decode_base64(settings["weights"]), (1, 1, 1, count)).ravel().tolist()
+    weights = decode_block(coded, (1, 1, 1, count)).ravel().tolist()
     result = []
     for one in passes:
         own, weights = weights[: len(one.taps)], weights[len(one.taps) :]

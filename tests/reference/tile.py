@@ -1,14 +1,9 @@
-"""One tile of `fhash.transform`: its bytes to values, in the order of FORMAT.md's section Decoding.
-
-A stream is a byte of flags, a digest of the coded integers, and sections.
-"""
+"""One tile of `fhash.transform`: its bytes to values, as FORMAT.md's section Decoding says."""
 
 from __future__ import annotations
 
-import base64
-import json
-import zlib
-from collections.abc import Iterator, Sequence
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,73 +12,113 @@ import numpy.typing as npt
 from reference.bands import bands_of
 from reference.head import apply_head, unpack_head
 from reference.integers import decode_block, decode_integers
-from reference.labels import unpack_labelled
+from reference.labels import LabelDecoder, number_in, unpack_labelled, unpack_planes
 from reference.masks import mask_levels, unpack_mask
 from reference.predictor import decode_predicted, passes_of
-from reference.transform import axis_of, inverse
+from reference.transform import Axis, inverse, unpack_basis
 
 Values = npt.NDArray[Any]
 Settings = dict[str, Any]
 
-OWN, MISSING, RESIDUAL, EXACT, EMPTY = 1, 2, 4, 8, 16
-"""Bits of the flags."""
-MANY = 16
-"""Bit of the flags of a stream of labels that are many."""
-PLAIN, MASKED, PREDICTED, PREDICTED_MASKED, LABELS, LABELS_MASKED = range(1, 7)
-"""Numbers in the upper three bits of the flags."""
+TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY = range(5)
+"""Kinds of streams, the lower three bits of the flags."""
+OWN, MISSING, RESIDUAL, MASKED = 8, 16, 32, 64
+"""Other bits of the flags."""
 
 
 class Stream:
     """The parts of a stream.
 
     Attributes:
-        flags: the first byte; its upper three bits are `number`.
+        kind: what it is, and `masked` whether it says which values are occupied.
         sections: the sections by name.
-        digest: CRC-32 of the coded integers, where there are some.
         settings: its own settings, or those that it shares.
-        shape, kind: of the tile (t, z, y, x), less the origin.
+        shape, dtype: of the tile (t, z, y, x), less the origin.
     """
 
-    def __init__(self, data: memoryview, shape: Sequence[int], dtype: Any, shared: Any) -> None:
-        self.flags, self.number = data[0], data[0] >> 5
-        self.labelled = self.number in (LABELS, LABELS_MASKED)
-        self.predicted = self.number in (PREDICTED, PREDICTED_MASKED)
-        self.masked = self.number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
-        coded = not self.labelled and not self.flags & (EXACT | EMPTY)
-        names = ["settings"] * bool(self.flags & OWN)
-        if self.labelled:
-            names.append("labels")
-        else:
-            names += ["missing"] * bool(self.flags & MISSING)
-            names += ["coefficients"] * coded + ["residual"] * bool(coded and self.flags & RESIDUAL)
-            names += ["exact"] * bool(self.flags & EXACT)
-            names += ["mask"] * (self.masked and not self.flags & EMPTY)
-        found = sections_in(data[5 if coded else 1 :])
-        self.sections = dict(zip(names, found, strict=True))
-        self.digest = int.from_bytes(data[1:5], "little")
+    def __init__(
+        self, data: memoryview, shape: Sequence[int], dtype: Any, shared: Settings | None
+    ) -> None:
+        if crc32c(data[4:]) != int.from_bytes(data[:4], "little"):
+            raise ValueError("the checksum of a tile differs")
+        flags, data = data[4], data[5:]
+        self.kind, self.masked = flags & 7, bool(flags & MASKED)
+        there = {
+            "settings": flags & OWN,
+            "missing": flags & MISSING,
+            "body": self.kind != EMPTY,
+            "residual": flags & RESIDUAL,
+            "mask": self.masked and self.kind not in (EMPTY, LABELS),
+        }
+        names = [name for name in there if there[name]]
+        self.sections = {}
+        for name in names[:-1]:
+            size, data = number_in(data)
+            self.sections[name], data = data[:size], data[size:]
+        self.sections |= {name: data for name in names[-1:]}
         own = self.sections.get("settings")
-        self.settings: Settings = shared or {} if own is None else json.loads(zlib.decompress(own))
+        self.settings = shared or {} if own is None else unpack_settings(own)
         self.shape, self.origin = tuple(shape), self.settings.get("origin", 0)
-        self.kind = np.dtype(np.int64 if self.origin else dtype)
+        self.dtype = np.dtype(np.int64 if self.origin else dtype)
         self.working = np.dtype(np.float64 if self.settings.get("double") else np.float32)
 
 
-def sections_in(data: memoryview) -> Iterator[memoryview]:
-    """Sections, each behind its length (LEB128)."""
-    while data:
-        size = shift = 0
-        while True:
-            byte, data = data[0], data[1:]
-            size |= (byte & 127) << shift
-            shift += 7
-            if byte < 128:
-                break
-        yield data[:size]
-        data = data[size:]
+def crc32c(data: bytes | memoryview) -> int:
+    """The checksum of some bytes, bit by bit."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
+
+
+def unpack_settings(data: bytes | memoryview) -> Settings:
+    """The settings in a block."""
+    rest = memoryview(data)
+
+    def take(form: str) -> tuple[Any, ...]:
+        nonlocal rest
+        size = struct.calcsize("<" + form)
+        numbers, rest = struct.unpack("<" + form, rest[:size]), rest[size:]
+        return numbers
+
+    def block() -> bytes:
+        nonlocal rest
+        size, rest = number_in(rest)
+        return take(f"{size}s")[0]
+
+    flags, *kinds = take("5B")
+    names = ("double", "clip", "labels", "trellis", "whole", "head", "mask", "predictor")
+    settings: Settings = {name: bool(flags >> bit & 1) for bit, name in enumerate(names)}
+    whole, has_head, has_mask, has_predictor = map(settings.pop, names[4:])
+    settings |= zip(("step", "quantum", "center"), take("3d"), strict=True)
+    settings["range"] = take("2q" if whole else "2d")
+    if whole:
+        settings["origin"] = int.from_bytes(take("9s")[0], "little", signed=True)
+    settings["offsets"] = take("6b" if settings["trellis"] else "3b")
+    settings["axes"] = [
+        Axis("klt", basis=unpack_basis(block()))
+        if kind >> 4 == 4
+        else Axis(("none", "haar", "5/3", "9/7")[kind >> 4], kind & 15)
+        for kind in kinds
+    ]
+    if has_head:
+        settings["head"] = unpack_head(block())
+    if has_mask:
+        (count,) = take("B")
+        edges, (reach,) = take(f"{count & 127}d"), take("B")
+        scores = [take(f"{len(edges) + 1}H") for _ in range(1 + (count >> 7))]
+        settings["mask"] = {"edges": edges, "reach": reach, "scores": scores}
+    if has_predictor:
+        step, origin, *levels, order, reach = take("2d6B")
+        passes = passes_of(levels, [order >> 2 * i & 3 for i in range(4)], reach, block())
+        settings["predictor"] = {"step": step, "origin": origin, "levels": levels, "passes": passes}
+    return settings
 
 
 def decode_tile(
-    data: bytes, shape: Sequence[int], dtype: Any, settings: Settings | None = None
+    data: bytes, shape: Sequence[int], dtype: Any, settings: bytes | None = None
 ) -> tuple[Values, Values | None]:
     """The values (t, z, y, x) of a stream, and which are occupied; None without a mask.
 
@@ -91,9 +126,10 @@ def decode_tile(
         data: the stream.
         shape: lengths of the tile along t, z, y, x.
         dtype: type of the array.
-        settings: settings that all tiles of the array share; a stream's own replace them.
+        settings: block that all tiles of the array share; a stream's own settings replace it.
     """
-    stream = Stream(memoryview(data), shape, dtype, settings)
+    shared = None if settings is None else unpack_settings(settings)
+    stream = Stream(memoryview(data), shape, dtype, shared)
     values, mask = decode_stream(stream)
     if stream.origin:
         limits = np.iinfo(dtype)
@@ -104,33 +140,30 @@ def decode_tile(
 
 def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
     """The values of a stream less the origin, and its mask."""
-    sections, kind, settings = stream.sections, stream.kind, stream.settings
+    sections, dtype, settings = stream.sections, stream.dtype, stream.settings
     nothing = np.zeros(stream.shape, int)
-    if stream.labelled:
-        many = bool(stream.flags & MANY)
-        values, mask = unpack_labelled(sections["labels"], stream.shape, kind, stream.masked, many)
-        return blanked(values.astype(kind), mask, settings), mask
-    if stream.flags & EXACT:
-        plain = np.frombuffer(zlib.decompress(sections["exact"]), np.uint8)
-        planes = np.ascontiguousarray(plain.reshape(kind.itemsize, -1).T)
-        values = planes.view(kind.newbyteorder("<")).reshape(stream.shape).astype(kind)
+    if stream.kind == LABELS:
+        values, mask = unpack_labelled(sections["body"], stream.shape, dtype, stream.masked)
+        return blanked(values.astype(dtype), mask, settings), mask
+    if stream.kind == EXACT:
+        values = unpack_planes(sections["body"], dtype).reshape(stream.shape)
         return values, unpack_mask(sections["mask"], (nothing, nothing)) if stream.masked else None
-    if stream.flags & EMPTY:
-        values = cast(np.full(stream.shape, float(settings["center"])), kind)
+    if stream.kind == EMPTY:
+        values = cast(np.full(stream.shape, float(settings["center"])), dtype)
         mask = np.zeros(stream.shape, bool) if stream.masked else None
     else:
-        before, values = predicted(stream) if stream.predicted else transformed(stream)
+        by_kind = {TRANSFORMED: transformed, PREDICTED: predicted}
+        before, values = by_kind[stream.kind](stream)
         mask = None
         if stream.masked:
             levels = mask_levels(before.astype(stream.working), settings["mask"])
             mask = unpack_mask(sections["mask"], levels)
-        if settings.get("clip"):
-            low, high = (in_type(end, kind) for end in settings["range"])
+        if settings["clip"]:
+            low, high = (in_type(end, dtype) for end in settings["range"])
             values = np.where(values < low, low, np.where(values > high, high, values))
     values = blanked(values, mask, settings)
     if "missing" in sections:
-        marks = decode_block(sections["missing"][4:], stream.shape)
-        check(marks, int.from_bytes(sections["missing"][:4], "little"))
+        marks = LabelDecoder(sections["missing"], 4, stream.shape).run()
         for mark, value in ((1, np.nan), (2, np.inf), (3, -np.inf)):
             values[marks == mark] = value
     return values, mask
@@ -139,55 +172,42 @@ def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
 def predicted(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by prediction: in float64, and in their type."""
     predictor = stream.settings["predictor"]
-    passes = passes_of(predictor, base64.b64decode)
-    coded = stream.sections["coefficients"]
-    integers = decode_predicted(coded, stream.shape, predictor["levels"], passes)
-    check(integers, stream.digest)
+    integers = decode_predicted(
+        stream.sections["body"], stream.shape, predictor["levels"], predictor["passes"]
+    )
     values = integers * np.float64(predictor["step"]) + np.float64(predictor["origin"])
     values = np.clip(values, *map(np.float64, stream.settings["range"]))
-    return values, cast(values, stream.kind)
+    return values, cast(values, stream.dtype)
 
 
 def transformed(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by transform: before head and residual, and in their type."""
     settings, shape, number = stream.settings, stream.shape, stream.working.type
-    axes = [axis_of(settings["transform"][name], base64.b64decode) for name in "tzyx"]
-    coded, trellis = stream.sections["coefficients"], settings.get("trellis", False)
-    integers = decode_integers(coded, shape, bands_of(axes, shape), trellis)
-    residual = None
-    if "residual" in stream.sections:
-        residual = decode_block(stream.sections["residual"], shape)
-    check(integers, stream.digest, residual)
+    bands = bands_of(settings["axes"], shape)
+    integers = decode_integers(stream.sections["body"], shape, bands, settings["trellis"])
     with np.errstate(all="ignore"):
         coefficients = dequantised(integers, settings, stream.working)
-        values = inverse(coefficients, axes) + number(settings["center"])
+        values = inverse(coefficients, settings["axes"]) + number(settings["center"])
         before = after = np.clip(values, *(number(end) for end in settings["range"]))
         if "head" in settings:
-            after = apply_head(before, unpack_head(base64.b64decode(settings["head"])))
-        if residual is not None:
+            after = apply_head(before, settings["head"])
+        if "residual" in stream.sections:
+            residual = decode_block(stream.sections["residual"], shape)
             after = after.astype(np.float64) + residual * np.float64(settings["quantum"])
-    return before, cast(after, stream.kind)
+    return before, cast(after, stream.dtype)
 
 
 def dequantised(integers: Values, settings: Settings, working: np.dtype[Any]) -> Values:
     """The coefficients of integers: a magnitude m > 0 stands for m + offset / 128 steps."""
-    offsets = settings.get("offsets", [0] * (6 if settings.get("trellis") else 3))
-    one, two, *more = offsets  # of magnitudes 1, 2, 3, 4, of odd ones from 5, of even ones from 6
+    one, two, *more = settings[
+        "offsets"
+    ]  # of magnitudes 1, 2, 3, 4, of odd ones from 5, of even ones from 6
     shifts = np.array([0, one, two, *(more if len(more) > 1 else more * 4)]) / 128
     magnitude = np.abs(integers)
     which = np.where(magnitude < 5, magnitude, 6 - (magnitude & 1))
     values = magnitude.astype(working) + shifts.astype(working)[which]
     values = values * working.type(settings["step"])
     return np.where(integers < 0, -values, values)
-
-
-def check(integers: Values, digest: int, residual: Values | None = None) -> None:
-    """Raises ValueError where decoded integers differ from their CRC-32."""
-    crc = zlib.crc32(integers.astype("<i4").tobytes())
-    if residual is not None:
-        crc = zlib.crc32(residual.astype("<i4").tobytes(), crc)
-    if crc != digest:
-        raise ValueError("the decoded integers of a tile differ from their digest")
 
 
 def cast(values: Values, kind: np.dtype[Any]) -> Values:

@@ -29,15 +29,6 @@ class Axis(NamedTuple):
     basis: Values | None = None
 
 
-def axis_of(value: Any, decode_base64: Any) -> Axis:
-    """The transform that the settings say."""
-    if isinstance(value, str):
-        return Axis(value)
-    if isinstance(value, dict):
-        return Axis("klt", basis=unpack_basis(decode_base64(value["klt"])))
-    return Axis(*value)
-
-
 def inverse(coefficients: Values, axes: Sequence[Axis]) -> Values:
     """The values of a tile (t, z, y, x), before the centre is added; in the working type."""
     dtype, (t, z, y, x) = coefficients.dtype, axes

@@ -20,11 +20,10 @@ from fhash_codec.compact.tiles.access import Tiling
 from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.transform.axes.basis import MAX_LENGTH
-from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
+from fhash_formats.transform.entropy.labels import MAX_LABELS
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.labelled import has_regions, surely_exceeds
+from fhash_formats.transform.tile.labelled import FEW, has_regions, surely_exceeds
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
@@ -34,7 +33,6 @@ __all__ = [
     "holds_beside",
     "is_hopeless",
     "look_at_labels",
-    "may_be_many",
     "rank_share",
     "tiled_labels",
     "with_step_of",
@@ -147,7 +145,7 @@ def _is_labels(tile: Tile, tiled: Blocks) -> bool:
     """Whether a tile has few enough different values to be coded as labels."""
     # Vertices that are not occupied take a label of their own.
     spare = not tiled.complete
-    most = (MAX_LABELS if has_regions(tile.values) else MAX_NARROW) - spare
+    most = (MAX_LABELS if has_regions(tile.values) else FEW) - spare
     return not surely_exceeds(tile.values, most) and np.unique(tile.values).size <= most
 
 
@@ -155,7 +153,7 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
     """Return the trial of labels on a sample of some tiles."""
     if not task.blocks.complete:
         settings = replace(settings, mask=MaskLevels())
-    settings = replace(settings, labels=True, many_labels=True, quantum=0.0, clip=False)
+    settings = replace(settings, labels=True, quantum=0.0, clip=False)
     coding = Coding(filled=True, density=0)
     exact = replace(coding, exact=True)
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
@@ -184,7 +182,7 @@ def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:
     guess: its outcome has the promise that is not an exact one.
     """
     mask = trial.attempt.settings.mask
-    settings = replace(guess.settings, labels=True, many_labels=True, mask=mask)
+    settings = replace(guess.settings, labels=True, mask=mask)
     coding = replace(trial.attempt.coding, bulk=guess.coding.bulk)
     return replace(trial, attempt=replace(trial.attempt, settings=settings, coding=coding))
 
@@ -199,11 +197,7 @@ def tiled_labels(task: PlanTask, trial: LabelTrial) -> Attempt:
         sample = Sample(task.blocks.retile(tiling.tile), LOOK_VERTICES, task.workers)
         sizes = {trial.tile: trial.size for trial in tiling.trials if not tiling.parts}
         outcome = replace(outcome, size=round(sizes.get(tiling.tile, outcome.size)))
-    settings = replace(
-        settings,
-        many_labels=may_be_many(task.value_range, sample),
-        transform=usual_transform(sample.blocks.tile),
-    )
+    settings = replace(settings, transform=usual_transform(sample.blocks.tile))
     return replace(attempt, sample=sample, settings=settings, outcome=outcome, tiling=tiling)
 
 
@@ -233,11 +227,3 @@ def _entropy(values: npt.NDArray[Any]) -> float:
     """Bytes of values by how often each occurs."""
     counts = np.unique(values, return_counts=True)[1]
     return float(-(counts * np.log2(counts / max(values.size, 1))).sum()) / 8
-
-
-def may_be_many(value_range: ValueRange, sample: Sample) -> bool:
-    """Whether a tile of the series may have more than MAX_NARROW labels."""
-    most = MAX_NARROW - (not sample.blocks.complete)
-    if sample.blocks.dtype.kind in "iu" and value_range.high - value_range.low < most:
-        return False
-    return not sample.complete or any(np.unique(tile.values).size > most for tile in sample.tiles)

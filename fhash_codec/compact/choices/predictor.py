@@ -18,6 +18,7 @@ from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Mask, Tile
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.entropy.coder import encode_block
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import (
     MAX_WEIGHT,
@@ -138,7 +139,7 @@ def best_predictor(
     predictor = _predictor(step, origin, chosen.levels, chosen.order, chosen.reach, training)
     sizes = _coded_sizes(codable, predictor)
     size = sum(weight * n for weight, n in zip(sample.weights, sizes, strict=True))
-    return predictor, size + len(predictor.to_dict()["weights"])
+    return predictor, size + _weight_bytes(predictor)
 
 
 class _Trials:
@@ -167,7 +168,7 @@ class _Trials:
             self._step, self._origin, (t, z, y, x), order, reach, self._training, TRIAL_ROWS
         )
         size = sum(_coded_sizes(self._tiles, predictor)) * self._factor
-        return size + len(predictor.to_dict()["weights"]), predictor
+        return size + _weight_bytes(predictor), predictor
 
 
 def _coded_sizes(tiles: list[IntegerTile], predictor: Predictor) -> list[int]:
@@ -207,6 +208,11 @@ def _predictor(
     return Predictor(
         step=step, origin=origin, levels=levels, order=order, reach=reach, weights=weights
     )
+
+
+def _weight_bytes(predictor: Predictor) -> int:
+    """Return the bytes of the weights in a file."""
+    return len(encode_block(np.array(predictor.weights, np.int32).reshape(1, 1, 1, -1)))
 
 
 def fit_weights(

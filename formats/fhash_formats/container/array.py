@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats.container.coding import CheckedCoder, chunk_coder
+from fhash_formats.container.coding import ChunkCoder, chunk_coder
 from fhash_formats.container.sharding import Sharding, parse_sharding
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.support.number_types import DTYPES
@@ -79,7 +79,7 @@ class ArrayMetadata:
         return parse_sharding(self.codecs, self.chunk_shape)
 
     @cached_property
-    def coder(self) -> CheckedCoder:
+    def coder(self) -> ChunkCoder:
         """The coder of full inner chunks."""
         codecs = self.codecs if self.sharding is None else self.sharding.codecs
         return chunk_coder(codecs, self.dtype, self.inner_shape)

@@ -1,13 +1,11 @@
 """The codecs that a container may name: values of a chunk to bytes and back.
 
-Every list of codecs ends in `crc32c`, so that any Zarr reader notices damage. The first codec makes
-bytes of an array and decides which codecs may follow it. `ARRAY_CODECS` is the one place where
-another first codec is added.
+The first codec makes bytes of an array and decides which codecs may follow it. Every chunk has a
+CRC-32C: `fhash.transform` puts it into its streams, other lists of codecs end in `crc32c`.
 """
 
 from __future__ import annotations
 
-import inspect
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
@@ -16,12 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats import native
-from fhash_formats.errors import (
-    DamagedFileError,
-    InputError,
-    UnsupportedFileError,
-)
+from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.native import crc32c
 
 if TYPE_CHECKING:
     from fhash_formats.transform.tile.settings import TileSettings
@@ -39,49 +33,78 @@ A block of at most 128 KiB takes at least a header of three bytes and one more (
 CRC32C: Codec = {"name": "crc32c"}
 
 _CRC = struct.Struct("<I")
-CRC_BYTES = _CRC.size
-"""Bytes of the CRC-32C behind a chunk."""
 _ZSTD_MARK = 0xFD2FB528
 _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
 class ChunkCoder(Protocol):
-    """A coder of chunks of one number type and full shape.
+    """A coder of chunks of one number type and full shape. All methods raise DamagedFileError for
+    bytes that do not fit, before they allocate for them.
 
-    `decode` raises DamagedFileError before it allocates for bytes that do not fit. Three abilities
-    are optional:
-
-    - A coder that can decode with less detail has `decode(data, lod)`; level of detail 0 is all.
-    - A coder whose chunks say which values are occupied has `masked` True and
-      `decode_masked(data)`, which returns values and mask.
-    - A coder that corrects its values last has `parted` True, `uncorrected(data, part)` and
-      `corrected(table, part)`, by which a part of a chunk is had sooner than all of it.
+    Attributes:
+        settings: settings that all chunks share (`TileSettings`); None for a coder without any.
+        axes: axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones.
+        masked: whether the chunks say which of their values are occupied.
+        parted: whether a part of a chunk may be had sooner than all of it, by the last two methods.
     """
+
+    settings: Any
+    axes: Any
+    masked: bool
+    parted: bool
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
 
-    def decode(self, data: memoryview | bytes) -> npt.NDArray[Any]:
-        """The full chunk in native byte order; it may be read-only."""
+    def check(self, data: memoryview) -> None:
+        """Raises DamagedFileError where the bytes of a chunk differ from their checksum."""
+
+    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk at a level of detail, in native byte order; it may be read-only.
+
+        Raises InputError for a level of detail other than 0 of a coder that has none.
+        """
+
+    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk before it is corrected, of a coder that tells both apart."""
+
+    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        """The full chunk and its mask, of a coder that is `masked`."""
+
+    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
+        """The chunk as `corrected` takes it, of a coder that is `parted`.
+
+        part: slices with explicit ends, of the values that will be wanted. The result is None
+            where they are so many that `decode` takes no longer, and for chunks that are coded
+            otherwise.
+        """
+
+    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """A part of a chunk, with the bits of `decode`. table: what `uncorrected` gave."""
 
 
 class PlainCoder:
-    """The coder of ordinary arrays: `bytes` (little-endian, C order), then `zstd`."""
+    """The coder of ordinary arrays: `bytes` (little-endian, C order), `zstd`, then `crc32c`."""
+
+    settings: Any = None
+    axes: Any = None
+    masked = False
+    parted = False
 
     def __init__(
         self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
     ) -> None:
-        """Raises UnsupportedFileError for codecs other than these two."""
+        """Raises UnsupportedFileError for codecs other than these three."""
         level = (
             codecs[1].get("configuration", {}).get("level")
-            if len(codecs) == 2 and codecs[1]["name"] == "zstd"
+            if len(codecs) == 3 and codecs[1]["name"] == "zstd" and codecs[2] == CRC32C
             else None
         )
         if isinstance(level, bool) or not isinstance(level, int):
             raise UnsupportedFileError(
                 f"codecs {_names(codecs)}; a container has bytes, zstd, crc32c"
             )
-        expected = plain_codecs(dtype, level)[:-1]
+        expected = plain_codecs(dtype, level)
         # Zarr lets one-byte types state an endianness, which then means nothing.
         allowed = [expected[0], _LITTLE] if dtype.itemsize == 1 else [expected[0]]
         if codecs[0] not in allowed or codecs[1] != expected[1]:
@@ -94,16 +117,25 @@ class PlainCoder:
         self._size = prod(shape) * dtype.itemsize
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
-        """The bytes of a full chunk."""
+        """The bytes of a full chunk, and their CRC-32C."""
         from numcodecs.zstd import compress
 
-        data: bytes = compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level)
-        return data
+        return with_crc32c(compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level))
 
-    def decode(self, data: memoryview | bytes) -> npt.NDArray[Any]:
-        """The full chunk; raises DamagedFileError for data that are not a full chunk."""
+    def check(self, data: memoryview) -> None:
+        """Raises DamagedFileError where the CRC-32C differs."""
+        without_crc32c(data)
+
+    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk; raises DamagedFileError for data that are not a full chunk.
+
+        Raises InputError for a level of detail other than 0.
+        """
         from numcodecs.zstd import decompress
 
+        if lod:
+            raise InputError(f"level of detail {lod}; the array has none but 0")
+        data = without_crc32c(data)
         declared = zstd_content_size(data)
         if declared != self._size:
             raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
@@ -122,6 +154,22 @@ class PlainCoder:
             raise DamagedFileError(f"zstd data are damaged: {error}") from error
         return values.astype(self._native, copy=False)
 
+    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk, which nothing corrects."""
+        return self.decode(data)
+
+    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        """Raises NotImplementedError: the chunks have no mask."""
+        raise NotImplementedError
+
+    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
+        """Raises NotImplementedError: nothing is corrected."""
+        raise NotImplementedError
+
+    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Raises NotImplementedError: nothing is corrected."""
+        raise NotImplementedError
+
 
 def _transform_coder(
     codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
@@ -137,91 +185,15 @@ ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...
     "bytes": PlainCoder,
     TRANSFORM: _transform_coder,
 }
-"""Coder by the name of the first codec; the coder is given all codecs but the last, `crc32c`."""
+"""Coder by the name of the first codec; the coder is given all codecs."""
 
 
 def transform_codecs(settings: TileSettings) -> list[Codec]:
     """The codecs of an array whose tiles share some settings."""
-    return [{"name": TRANSFORM, "configuration": settings.to_dict()}, CRC32C]
+    return [{"name": TRANSFORM, "configuration": {"settings": settings.to_text()}}]
 
 
-class CheckedCoder:
-    """A coder that puts the CRC-32C of a chunk's bytes behind them, and checks it on decoding."""
-
-    def __init__(self, coder: ChunkCoder) -> None:
-        self._coder = coder
-
-    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
-        """The bytes of a full chunk and their CRC-32C."""
-        return with_crc32c(self._coder.encode(chunk))
-
-    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk at a level of detail; 0 is all of it.
-
-        Raises DamagedFileError for damaged data, and InputError for another level of detail of a
-        coder that has none.
-        """
-        coded = without_crc32c(data)
-        if lod == 0:
-            return self._coder.decode(coded)
-        if lod < 0 or "lod" not in inspect.signature(self._coder.decode).parameters:
-            raise InputError(f"level of detail {lod}; the array has none but 0")
-        return self._coder.decode(coded, lod)  # type: ignore[call-arg]
-
-    @property
-    def settings(self) -> Any:
-        """Settings that all chunks share, of a coder that has some (`TileSettings`); else None."""
-        return getattr(self._coder, "settings", None)
-
-    @property
-    def axes(self) -> Any:
-        """Axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones."""
-        return getattr(self._coder, "axes", None)
-
-    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk before it is corrected, for a coder that tells both apart.
-
-        Raises DamagedFileError.
-        """
-        coded = without_crc32c(data)
-        decode = getattr(self._coder, "decode_table", None)
-        values: npt.NDArray[Any] = decode(coded, lod) if decode else self._coder.decode(coded)
-        return values
-
-    @property
-    def parted(self) -> bool:
-        """Whether a part of a chunk may be had sooner than all of it, by the next two."""
-        return bool(getattr(self._coder, "parted", False))
-
-    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
-        """The chunk as `corrected` takes it, for a coder that is `parted`.
-
-        part: slices with explicit ends, of the values that will be wanted. The result is None
-            where they are so many that `decode` takes no longer, and for chunks that are coded
-            otherwise. Raises DamagedFileError.
-        """
-        table: npt.NDArray[Any] | None = self._coder.uncorrected(without_crc32c(data), part)  # type: ignore[attr-defined]
-        return table
-
-    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """A part of a chunk, with the bits of `decode`. table: what `uncorrected` gave."""
-        values: npt.NDArray[Any] = self._coder.corrected(table, part)  # type: ignore[attr-defined]
-        return values
-
-    @property
-    def masked(self) -> bool:
-        """Whether the chunks say which of their values are occupied."""
-        return bool(getattr(self._coder, "masked", False))
-
-    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-        """The full chunk and its mask, for a coder that is `masked`; raises DamagedFileError."""
-        values, occupied = self._coder.decode_masked(without_crc32c(data))  # type: ignore[attr-defined]
-        return values, occupied
-
-
-def chunk_coder(
-    codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> CheckedCoder:
+def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> ChunkCoder:
     """The coder for chunks of this number type and full shape.
 
     Raises DamagedFileError for a list that is none of codecs, UnsupportedFileError for codecs that
@@ -231,12 +203,11 @@ def chunk_coder(
         has_name = isinstance(codec, Mapping) and isinstance(codec.get("name"), str)
         if not has_name or not isinstance(codec.get("configuration", {}), Mapping):
             raise DamagedFileError("an array's codecs are not a list of {name, configuration}")
-    if len(codecs) < 2 or codecs[-1] != CRC32C or codecs[0]["name"] not in ARRAY_CODECS:
+    if not codecs or codecs[0]["name"] not in ARRAY_CODECS:
         raise UnsupportedFileError(
-            f"codecs {_names(codecs)}; "
-            f"known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end"
+            f"codecs {_names(codecs)}; known are {', '.join(ARRAY_CODECS)} at the beginning"
         )
-    return CheckedCoder(ARRAY_CODECS[codecs[0]["name"]](codecs[:-1], dtype, shape))
+    return ARRAY_CODECS[codecs[0]["name"]](codecs, dtype, shape)
 
 
 def plain_codecs(dtype: np.dtype[Any], level: int = ZSTD_LEVEL) -> list[Codec]:
@@ -276,12 +247,6 @@ def zstd_content_size(data: memoryview | bytes) -> int | None:
     if size_bytes == 0:
         return None
     return int.from_bytes(data[at : at + size_bytes], "little") + (256 if size_bytes == 2 else 0)
-
-
-def crc32c(data: bytes | memoryview) -> int:
-    """CRC-32C (Castagnoli) of `data`."""
-    given = data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8).ctypes.data
-    return int(native.library().fhash_crc32c(given, len(data), 0, 0))
 
 
 def _names(codecs: Sequence[Codec]) -> str:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import Codec, with_crc32c
+from fhash_formats.container.coding import Codec
 from fhash_formats.container.sharding import pack_index, sharding_codecs
 from fhash_formats.container.writer import ContainerWriter, Mark
 from fhash_formats.container.zip_file import Member
@@ -131,10 +131,10 @@ class GrowingContainer(ContainerWriter):
         """Write a layer of an array.
 
         number: of the layer, from 0. streams: the bytes that the coder made of the tiles, in C
-        order, without CRC-32C. Raises InputError for a layer that takes too many bytes.
+        order. Raises InputError for a layer that takes too many bytes.
         """
         assert len(streams) == prod(array.layer_grid)
-        parts = [with_crc32c(stream) for stream in streams]
+        parts = list(streams)
         if array.is_sharded:
             present = np.ones(len(parts), dtype=bool)
             parts.append(pack_index([len(part) for part in parts], present))

@@ -26,9 +26,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.coding import CRC32C, Codec, crc32c, with_crc32c
+from fhash_formats.container.coding import CRC32C, Codec, with_crc32c
 from fhash_formats.container.zip_file import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.native import crc32c
 
 SHARDING = "sharding_indexed"
 """Name of the codec that makes the chunks of an array shards."""

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import CRC_BYTES, without_crc32c
 from fhash_formats.container.sharding import (
     ENTRY_BYTES,
     Index,
@@ -27,7 +26,7 @@ from fhash_formats.container.sharding import (
 )
 from fhash_formats.container.source import Range, Source, damage_named
 from fhash_formats.container.zip_file import Member, check_member, read_member
-from fhash_formats.errors import DamagedFileError, FhashError, RegionError
+from fhash_formats.errors import DamagedFileError, FhashError, InputError, RegionError
 from fhash_formats.support.fork_lock import ForkLock
 from fhash_formats.support.slabs import common_part, region_bounds
 from fhash_formats.support.threads import in_threads, usable_threads
@@ -381,6 +380,8 @@ class StoredArray:
             DamagedFileError: for a damaged chunk; the message names the member of the file.
         """
         self._check_index(index)
+        if lod < 0:
+            raise InputError(f"level of detail {lod}; 0 is all of it, and others are coarser")
         with damage_named(self._path, self._source):
             return self._chunk(tuple(index), lod, keep=True)
 
@@ -573,12 +574,12 @@ class StoredArray:
     def coded(self, index: Index) -> memoryview:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""
         with self._stored_chunk(index) as data:
-            return without_crc32c(data)
+            self._metadata.coder.check(data)
+            return data
 
     def coded_bytes(self, index: Index) -> int:
         """The number of bytes that `coded` returns, without reading them."""
-        size = self.chunks[index].size if self._shards is None else self._place(index)[1]
-        return size - CRC_BYTES
+        return self.chunks[index].size if self._shards is None else self._place(index)[1]
 
     @contextmanager
     def _stored_chunk(self, index: Index) -> Iterator[memoryview]:

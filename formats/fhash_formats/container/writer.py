@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import Codec, plain_codecs, with_crc32c
+from fhash_formats.container.coding import Codec, plain_codecs
 from fhash_formats.container.header import FORMAT, POSITIONS, TABLE, brief
 from fhash_formats.container.hierarchy import GROUP
 from fhash_formats.container.reader import Container
@@ -125,12 +125,12 @@ def shard_parts(
 
 
 def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
-    """The bytes of a chunk with their CRC-32C, from its values or from its bytes without.
+    """The bytes of a chunk, from its values or as they are.
 
     Raises InputError as `full_chunk` does.
     """
     if isinstance(chunk, bytes):
-        return with_crc32c(chunk)
+        return chunk
     return metadata.coder.encode(full_chunk(name, metadata, index, chunk))
 
 
@@ -330,7 +330,7 @@ class ContainerWriter:
             chunk_shape: shape of a full chunk.
             chunks: the chunks in C order of their grid; those at an end of the array reach as far
                 as the array does. A chunk may also be the bytes that the coder of its first codec
-                made of the full chunk, without CRC-32C.
+                made of the full chunk.
             dimension_names: names of the axes.
             attributes: JSON values.
             codecs: a list as in Zarr's metadata; by default `bytes`, `zstd`, `crc32c`.
@@ -378,7 +378,7 @@ class ContainerWriter:
             chunks: the chunks in the order of `shard_order`. Each may instead come as (index,
                 chunk) with its index in the grid of chunks: then shards come in C order, and the
                 chunks of a shard in any order. A chunk is an array as in `add_array`, or the bytes
-                that the coder of its first codec made of the full chunk, without CRC-32C.
+                that its coder made of the full chunk.
             dimension_names: names of the axes.
             attributes: JSON values.
             codecs: of the chunks, as in `add_array`.

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fhash_formats.errors import MissingDependencyError
 from fhash_formats.support.fork_lock import ForkLock
 
@@ -26,11 +28,12 @@ __all__ = [
     "INTEGER",
     "PROTOTYPES",
     "REAL",
+    "crc32c",
     "library",
     "load_library",
 ]
 
-ABI_VERSION = 11
+ABI_VERSION = 12
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -49,7 +52,7 @@ _SIZED = (ARRAY, INTEGER)
 _STATE = _SIZED * 3
 """Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
 _TRANSFORM = (ARRAY,) * 9
-_RECONSTRUCT = (*_TRANSFORM, ARRAY, INTEGER)
+_RECONSTRUCT = (*_TRANSFORM, ARRAY)
 _HEAD = (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
 _DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
@@ -84,10 +87,8 @@ PROTOTYPES: Prototypes = {
     # mask_levels.cpp
     **{f"fhash_mask_levels_{kind}": _MASK_LEVELS for kind in _TYPES},
     # labels.cpp
-    "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
-    "fhash_encode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
-    "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
-    "fhash_decode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
+    "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
+    "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_SIZED),
     # predict.cpp
     "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
     "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
@@ -124,6 +125,12 @@ _LOADED: dict[tuple[Path, str, int], ctypes.CDLL] = {}
 def library() -> ctypes.CDLL:
     """The native library of this package; see `load_library`."""
     return load_library(_FOLDER, "_core", ABI_VERSION, PROTOTYPES)
+
+
+def crc32c(data: bytes | memoryview) -> int:
+    """CRC-32C (Castagnoli) of some bytes."""
+    given = data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8).ctypes.data
+    return int(library().fhash_crc32c(given, len(data), 0, 0))
 
 
 def load_library(

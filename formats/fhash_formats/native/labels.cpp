@@ -7,10 +7,8 @@
 // Where all segments around are of one label, a flag stands for SEGMENT vertices of a row.
 // tests/reference/labels.py explains it.
 //
-// Up to 256 labels are uint8. More of them (WIDE) are uint16; there a label chooses its estimates
-// by a hash, and a flag says whether a label is the one after the highest so far.
-#include <type_traits>
-
+// A label chooses its estimates by a hash. Before its bits, a flag says whether it is the one after
+// the highest so far.
 #include "mixing.hpp"
 #include "rows.hpp"
 
@@ -28,34 +26,44 @@ const int ALONE = 256;           // stands for a second candidate where there is
 const int RATE = 2;              // LEARNING_RATE of labels
 const int SIZES[CONTEXTS] = {3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288};
 const int CANDIDATE_SETS = TESTED * NEAR + TESTED * FOUND;  // sets of weights of candidates
-const int NEXT = 10;                   // simple estimate of the label after the highest so far
-const uint32_t SCATTER = 40503;        // multiplier of hashes: 2^16 over the golden ratio
+const int BIT_LEVELS = 16;       // sets of weights of bits
+const int NEXT = 10;             // simple estimate of the label after the highest so far
+const uint32_t SCATTER = 40503;  // multiplier of hashes: 2^16 over the golden ratio
+const int NONE = 65536;          // label of vertices that do not exist
+const int MIXED = NONE + 1;      // state of a segment of more than one label
+const int NOTHING = NONE + 2;    // state of a segment that does not exist
+
+// A state that has learned nothing: even odds, and weights that believe the estimates.
+State blank_state(int bit_size) {
+    State state;
+    int slots = BIT_CONTEXTS * bit_size;
+    for (int size : SIZES) slots += size;
+    state.slots.assign((size_t)slots, {32768, 32768, 0, 0});
+    state.weights.assign((size_t)((CANDIDATE_SETS + BIT_LEVELS + TESTED + 1) * SET), 0);
+    std::fill_n(state.weights.begin(), TESTED * NEAR * SET, (int16_t)3072);
+    std::fill_n(state.weights.begin() + CANDIDATE_SETS * SET, BIT_LEVELS * SET, (int16_t)4096);
+    state.simples.assign(NEXT + 1, {32768, 0});
+    return state;
+}
 
 // One run over labels.
-template <bool DECODES, bool WIDE> struct LabelCoder {
-    using Label = typename std::conditional<WIDE, uint16_t, uint8_t>::type;
-    using Known = typename std::conditional<WIDE, int32_t, int16_t>::type;
-    static constexpr int NONE = WIDE ? 65536 : 256;  // label of vertices that do not exist
-    static constexpr int MIXED = NONE + 1;           // state of a segment of more than one label
-    static constexpr int NOTHING = NONE + 2;         // state of a segment that does not exist
-    static constexpr int BIT_LEVELS = WIDE ? 16 : 8;  // sets of weights of bits
-    static constexpr int BIT_SIZE = WIDE ? 65536 : 16384;  // contexts of an estimate of bits
-
+template <bool DECODES> struct LabelCoder {
     typename std::conditional<DECODES, Decoder, Encoder>::type range;
-    State* state;
+    int count;         // number of labels
+    int bit_size;      // contexts of an estimate of bits
+    State blank;
+    State* state = &blank;
     Slot *slots[CONTEXTS], *bit_slots[BIT_CONTEXTS];
-    int count;        // number of labels
-    int highest = -1;  // highest label so far; only where WIDE
+    int highest = -1;  // highest label so far
 
     // Number below 256 by which a label chooses its estimates.
     FHASH_INLINE static int key(int label) {
-        return WIDE ? (int)(((uint32_t)label * SCATTER >> 8) & 255) : label;
+        return (int)(((uint32_t)label * SCATTER >> 8) & 255);
     }
 
     // Context of a bit of a label, by another label.
-    FHASH_INLINE static int beside(int label, int node) {
-        if (WIDE) return (int)(((uint32_t)label * SCATTER + (uint32_t)node) & (BIT_SIZE - 1));
-        return (label * 256 + node) & (BIT_SIZE - 1);
+    FHASH_INLINE int beside(int label, int node) const {
+        return (int)(((uint32_t)label * SCATTER + (uint32_t)node) & (uint32_t)(bit_size - 1));
     }
 
     // Code whether a vertex has candidate k of `found`. around: the labels of the neighbours.
@@ -100,7 +108,7 @@ template <bool DECODES, bool WIDE> struct LabelCoder {
 
     // Code a label that is none of the first `tested` candidates, from its highest bit on.
     FHASH_INLINE int spell(int label, const int* candidates, int tested, const int* around) {
-        if (WIDE && highest + 1 < count &&
+        if (highest + 1 < count &&
             code_simple(range, state->simples[NEXT], label == highest + 1))
             return highest + 1;
         int low = 0, node = 1, level = significant((uint32_t)(count - 1));
@@ -157,31 +165,30 @@ template <bool DECODES, bool WIDE> struct LabelCoder {
     }
 
     // Code all labels (t, z, y, x), each below `count`.
-    FHASH_INLINE void run(Label* labels, const int64_t* shape) {
+    FHASH_INLINE void run(uint16_t* labels, const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
         const int segments = (n3 + SEGMENT - 1) / SEGMENT;
         // Strides of labels and of the states of segments.
         const int64_t S2 = n3, S1 = S2 * n2, S0 = S1 * n1;
         const int64_t G2 = segments + 2, G1 = G2 * n2, G0 = G1 * n1;
-        PaddedRows<Known> known(shape, NONE);
-        std::vector<Known> segment_states((size_t)G0 * n0, NOTHING);
-        std::vector<Known> no_states((size_t)G2, NOTHING);
+        PaddedRows<int32_t> known(shape, NONE);
+        std::vector<int32_t> segment_states((size_t)G0 * n0, NOTHING);
+        std::vector<int32_t> no_states((size_t)G2, NOTHING);
         slots[0] = state->slots.data();
         for (int i = 1; i < CONTEXTS; i++) slots[i] = slots[i - 1] + SIZES[i - 1];
         bit_slots[0] = slots[CONTEXTS - 1] + SIZES[CONTEXTS - 1];
-        bit_slots[1] = bit_slots[0] + (WIDE ? BIT_SIZE : 256);
-        for (int i = 2; i < BIT_CONTEXTS; i++) bit_slots[i] = bit_slots[i - 1] + BIT_SIZE;
+        for (int i = 1; i < BIT_CONTEXTS; i++) bit_slots[i] = bit_slots[i - 1] + bit_size;
 
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
             const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
-            Label* const out = labels + t * S0 + z * S1 + y * S2;
+            uint16_t* const out = labels + t * S0 + z * S1 + y * S2;
             const auto [K, N, NN, P, PP, PN, PS, B, BB, BN, BS, BP, BF] = known.around(t, z, y);
             // States of the segments of this row and of the rows before it.
-            Known* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
-            const Known* const no_state = no_states.data() + 1;
-            const Known* const GN = has_y ? G - G2 : no_state;
-            const Known* const GP = has_z ? G - G1 : no_state;
-            const Known* const GB = has_t ? G - G0 : no_state;
+            int32_t* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
+            const int32_t* const no_state = no_states.data() + 1;
+            const int32_t* const GN = has_y ? G - G2 : no_state;
+            const int32_t* const GP = has_z ? G - G1 : no_state;
+            const int32_t* const GB = has_t ? G - G0 : no_state;
 
             for (int s = 0; s < segments; s++) {
                 const int x0 = s * SEGMENT, x1 = min(x0 + SEGMENT, n3);
@@ -196,10 +203,10 @@ template <bool DECODES, bool WIDE> struct LabelCoder {
                     if (!DECODES) for (int x = x0; x < x1; x++) uniform &= out[x] == same;
                     if (code_simple(range, state->simples[around * 2 + differing], uniform)) {
                         for (int x = x0; x < x1; x++) {
-                            out[x] = (Label)same;
-                            K[x] = (Known)same;
+                            out[x] = (uint16_t)same;
+                            K[x] = same;
                         }
-                        G[s] = (Known)same;
+                        G[s] = same;
                         continue;
                     }
                 }
@@ -211,109 +218,67 @@ template <bool DECODES, bool WIDE> struct LabelCoder {
                         BF[x],    BP[x],    K[x - 2], NN[x], PP[x],    BB[x],
                     };
                     const int label = vertex(DECODES ? 0 : out[x], neighbours);
-                    if (DECODES) out[x] = (Label)label;
-                    K[x] = (Known)label;
-                    if (WIDE) highest = max(highest, label);
+                    if (DECODES) out[x] = (uint16_t)label;
+                    K[x] = label;
+                    highest = max(highest, label);
                     if (x == x0) first = label;
                     differs |= label != first;
                 }
-                G[s] = (Known)(differs ? MIXED : first);
+                G[s] = (differs ? MIXED : first);
             }
         }
     }
 };
 
-template <class Coder, class Label>
-FHASH_INLINE int64_t run_all(Coder& coder, Label* labels, const int64_t* shape) {
+// Contexts of an estimate of bits: more, where there are more labels.
+int bit_contexts(int64_t count) {
+    return 256 << min(significant((uint32_t)(count - 1)), 8);
+}
+
+template <class Coder> FHASH_INLINE int64_t run_all(Coder& coder, uint16_t* labels,
+                                                    const int64_t* shape) {
     return guarded([&]() FHASH_LAMBDA -> int64_t {
         coder.run(labels, shape);
         return 0;
     });
 }
-FHASH_CLONES int64_t encode(LabelCoder<false, false>& coder, uint8_t* labels,
-                            const int64_t* shape) {
+FHASH_CLONES int64_t encode(LabelCoder<false>& coder, uint16_t* labels, const int64_t* shape) {
     return run_all(coder, labels, shape);
 }
-FHASH_CLONES int64_t encode(LabelCoder<false, true>& coder, uint16_t* labels,
-                            const int64_t* shape) {
-    return run_all(coder, labels, shape);
-}
-FHASH_CLONES int64_t decode(LabelCoder<true, false>& coder, uint8_t* labels,
-                            const int64_t* shape) {
-    return run_all(coder, labels, shape);
-}
-FHASH_CLONES int64_t decode(LabelCoder<true, true>& coder, uint16_t* labels,
-                            const int64_t* shape) {
+FHASH_CLONES int64_t decode(LabelCoder<true>& coder, uint16_t* labels, const int64_t* shape) {
     return run_all(coder, labels, shape);
 }
 
-// The exported functions, for labels of either type.
-template <bool WIDE, class Label>
-int64_t encode_all(Label* labels, int64_t count, const int64_t* shape, const uint16_t* slots,
-                   int64_t slot_count, const int32_t* weights, int64_t weight_count,
-                   const uint16_t* simples, int64_t simple_count, uint8_t* data,
-                   int64_t capacity) {
+}  // namespace
+
+// Encode labels (t, z, y, x), each from 0 to `count` - 1; count is 1 to 65536. The labels are
+// written to, but keep their values.
+//
+// data: receives the bytes if they fit the capacity.
+//
+// Returns the number of bytes, or NO_MEMORY.
+FHASH_EXPORT int64_t fhash_encode_labels(uint16_t* labels, int64_t count, const int64_t* shape,
+                                         uint8_t* data, int64_t capacity) {
     return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
-                                 LANES);
+        const int size = bit_contexts(count);
         std::vector<uint8_t> out;
-        LabelCoder<false, WIDE> coder{{&out}, &state, {}, {}, (int)count};
+        LabelCoder<false> coder{{&out}, (int)count, size, blank_state(size)};
         const int64_t code = encode(coder, labels, shape);
         if (code < 0) return code;
         coder.range.finish();
         return put(out, data, capacity);
     });
 }
-template <bool WIDE, class Label>
-int64_t decode_all(Label* labels, int64_t count, const int64_t* shape, const uint16_t* slots,
-                   int64_t slot_count, const int32_t* weights, int64_t weight_count,
-                   const uint16_t* simples, int64_t simple_count, const uint8_t* data,
-                   int64_t size) {
-    return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
-                                 LANES);
-        LabelCoder<true, WIDE> coder{{data, size}, &state, {}, {}, (int)count};
-        return decode(coder, labels, shape);
-    });
-}
 
-}  // namespace
-
-#define FHASH_LABEL_STATE                                                                          \
-    const uint16_t *slots, int64_t slot_count, const int32_t *weights, int64_t weight_count,       \
-        const uint16_t *simples, int64_t simple_count
-
-// Encode labels (t, z, y, x), each from 0 to `count` - 1; count is 1 to 256, or to 65536 for wide
-// ones. The labels are written to, but keep their values.
-//
-// slots, weights, simples: the state to begin from (transform/entropy/labels.py).
-// data: receives the bytes if they fit the capacity.
-//
-// Returns the number of bytes, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_encode_labels(uint8_t* labels, int64_t count, const int64_t* shape,
-                                         FHASH_LABEL_STATE, uint8_t* data, int64_t capacity) {
-    return encode_all<false>(labels, count, shape, slots, slot_count, weights, weight_count,
-                             simples, simple_count, data, capacity);
-}
-FHASH_EXPORT int64_t fhash_encode_wide_labels(uint16_t* labels, int64_t count,
-                                              const int64_t* shape, FHASH_LABEL_STATE,
-                                              uint8_t* data, int64_t capacity) {
-    return encode_all<true>(labels, count, shape, slots, slot_count, weights, weight_count,
-                            simples, simple_count, data, capacity);
-}
-
-// Decode into labels; the other arguments are those of the functions above. Any bytes give labels
-// below `count`: the caller must check a digest.
+// Decode into labels; the other arguments are those of the function above. Any bytes give labels
+// below `count`.
 //
 // Returns 0 or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode_labels(uint8_t* labels, int64_t count, const int64_t* shape,
-                                         FHASH_LABEL_STATE, const uint8_t* data, int64_t size) {
-    return decode_all<false>(labels, count, shape, slots, slot_count, weights, weight_count,
-                             simples, simple_count, data, size);
-}
-FHASH_EXPORT int64_t fhash_decode_wide_labels(uint16_t* labels, int64_t count,
-                                              const int64_t* shape, FHASH_LABEL_STATE,
-                                              const uint8_t* data, int64_t size) {
-    return decode_all<true>(labels, count, shape, slots, slot_count, weights, weight_count,
-                            simples, simple_count, data, size);
+FHASH_EXPORT int64_t fhash_decode_labels(uint16_t* labels, int64_t count, const int64_t* shape,
+                                         const uint8_t* data, int64_t size) {
+    return guarded([&]() -> int64_t {
+        const int contexts = bit_contexts(count);
+        LabelCoder<true> coder{{data, size}, (int)count, contexts, blank_state(contexts)};
+        return decode(coder, labels, shape);
+    });
 }

@@ -48,7 +48,7 @@ i64 transform(const T* in, T* out, const i64* shape, const i64* kinds, const i64
 template <class T>
 i64 reconstruct(const std::int32_t* in, T* out, const i64* shape, const i64* kinds,
                 const i64* depths, const i64* ranks, const T* const* matrices, const T* scale_tz,
-                const T* scale_yx, const double* numbers, i64 crc) {
+                const T* scale_yx, const double* numbers) {
     Axis<T> axes[4];
     if (!read_axes(shape, kinds, depths, ranks, matrices, axes)) return BAD_ARGUMENT;
     Tile<T> tile(axes, scale_tz, scale_yx, true);
@@ -56,7 +56,8 @@ i64 reconstruct(const std::int32_t* in, T* out, const i64* shape, const i64* kin
     Reconstruction<T> values = {(T)numbers[0], {}};
     for (int i = 1; i <= 6; i++) values.offsets[i] = (T)numbers[i];
     const Limits<T> limits = {(T)numbers[7], (T)numbers[8], (T)numbers[9]};
-    return tile.reconstruct(in, out, values, limits, (std::uint32_t)crc);
+    tile.reconstruct(in, out, values, limits);
+    return 0;
 }
 
 }  // namespace
@@ -97,18 +98,16 @@ FHASH_EXPORT i64 fhash_transform_inverse_f64(const double* in, double* out, cons
 // numbers: step, six offsets (of |q| = 1, 2, 3, 4, odd ones from 5 on, even ones from 6 on, in
 // steps), center (not -0), low, high.
 //
-// The other arguments are those of the inverse transform. Returns the CRC-32 of the integers in
-// little-endian order, continued from `crc`, or one of the errors above.
+// The other arguments and the result are those of the inverse transform.
 FHASH_EXPORT i64 fhash_reconstruct_f32(const std::int32_t* in, float* out, const i64* shape,
                                        const i64* kinds, const i64* depths, const i64* ranks,
                                        const float* const* matrices, const float* tz,
-                                       const float* yx, const double* numbers, std::int64_t crc) {
-    return reconstruct<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers, crc);
+                                       const float* yx, const double* numbers) {
+    return reconstruct<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers);
 }
 FHASH_EXPORT i64 fhash_reconstruct_f64(const std::int32_t* in, double* out, const i64* shape,
                                        const i64* kinds, const i64* depths, const i64* ranks,
                                        const double* const* matrices, const double* tz,
-                                       const double* yx, const double* numbers, std::int64_t crc) {
-    return reconstruct<double>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers,
-                               crc);
+                                       const double* yx, const double* numbers) {
+    return reconstruct<double>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers);
 }

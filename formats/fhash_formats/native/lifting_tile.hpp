@@ -5,7 +5,6 @@
 #include <cstring>
 #include <memory>
 
-#include "checksum.hpp"
 #include "core.hpp"
 #include "lifting.hpp"
 
@@ -426,11 +425,10 @@ public:
     }
 
     // The inverse from integers, moved and clipped. in: may be the memory of `out` where numbers
-    // have the size of integers. crc: of what is before the integers; the result is that with them.
-    std::uint32_t reconstruct(const std::int32_t* in, T* out, const Reconstruction<T>& values,
-                              const Limits<T>& limits, std::uint32_t crc) {
+    // have the size of integers.
+    void reconstruct(const std::int32_t* in, T* out, const Reconstruction<T>& values,
+                     const Limits<T>& limits) {
         unsigned char *const planes = filled.get() + y.n, *const frames = planes + z.n;
-        const std::uint32_t zeros = crc32_power(plane);
         for (i64 i = 0; i < t.n; i++) {
             T* const frame = out + i * z.n * plane;
             frames[i] = 0;
@@ -439,14 +437,11 @@ public:
                 T* const to = frame + k * plane;
                 planes[k] = any_integer(from, plane);
                 if (planes[k]) {
-                    crc = crc32_of(from, plane, crc);
                     pass_integers(from, y.n, x.n, values, spare, filled.get());
                     inverse_plane(spare, to, scale_tz[i * z.n + k], filled.get());
                     frames[i] = 1;
-                } else {
-                    crc = crc32_of_zeros(zeros, crc);
-                    // A product does not read what is 0, and writes all.
-                    if (z.kind != KLT) std::memset(to, 0, bytes_of<T>(plane));
+                } else if (z.kind != KLT) {  // a product does not read what is 0, and writes all
+                    std::memset(to, 0, bytes_of<T>(plane));
                 }
             }
             // The last of the axes that are not idle clips.
@@ -461,7 +456,6 @@ public:
             }
         }
         if (!t.idle()) rows(out, out, z.n * plane, t, true, &limits, frames);
-        return crc;
     }
 
 private:

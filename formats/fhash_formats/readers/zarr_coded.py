@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.coding import crc32c
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.native import crc32c
 from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import condense, refusing
 from fhash_formats.readers.common.file_series import FileSeries
@@ -275,7 +275,8 @@ class CodedArray:
     def _configuration(self) -> dict[str, Any]:
         """The settings that all chunks share, and the axes where they are not the usual ones."""
         codec = self._coding.codec
-        shared = {} if codec.settings is None else codec.settings.to_dict()
+        settings = codec.settings
+        shared = {} if settings is None else {"settings": settings.to_text()}
         axes = self._axes()
         return shared if axes.usual else {**shared, "axes": list(axes.names)}
 

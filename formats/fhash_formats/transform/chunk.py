@@ -19,6 +19,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.support.number_types import exact_number, integer_origin
 from fhash_formats.transform.axes.candidates import NO_TRANSFORM, candidates
 from fhash_formats.transform.axes.spec import TransformSpec
+from fhash_formats.transform.entropy.labels import MAX_LABELS
 from fhash_formats.transform.tile.decoding import decode_tile, transform_for
 from fhash_formats.transform.tile.encoding import (
     CodedTile,
@@ -28,7 +29,7 @@ from fhash_formats.transform.tile.encoding import (
     labelled_tile,
 )
 from fhash_formats.transform.tile.integers import OFFSETS, TRELLIS_WEIGHT, WEIGHT, with_trellis
-from fhash_formats.transform.tile.labelled import has_regions
+from fhash_formats.transform.tile.labelled import FEW, has_regions
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import within
@@ -62,6 +63,9 @@ _CLEARLY = 4
 _MAX_WINDOW = 1 << 16
 """Most values of the window on which settings are tried at effort 2; each further effort has four
 times as many."""
+_WRITTEN = 4
+"""Bounds that decoded fill values are away at most: each time that a part of a chunk is written
+adds one."""
 _QUANTUM_SHARE = 1 - 1e-6
 """Quantum as a share of twice the largest error, so that rounding cannot break the bound."""
 _MAX_STEPS = 2.5e8
@@ -156,7 +160,9 @@ def encode_chunk(
     NaN and infinities come back where they were and take no part in range or bound. Stores put fill
     values where nothing was written, and beyond the end of an array. So these take no part in the
     range of `max_error_rel` either, nor does a value that is the only one of a plane at either end
-    of an axis: a filter may have changed the fill value, and some stores do not tell it.
+    of an axis: a filter may have changed the fill value, and some stores do not tell it. Where
+    parts of a chunk are written one after the other, the same holds for what the bound made of a
+    fill value.
 
     Args:
         values: array of a type that `supported` accepts; its axes become those of `tile_shape`.
@@ -277,7 +283,9 @@ def _encode(
     constant = _encode_constant(task)
     if constant is not None:
         return constant
-    labelled = labelled_tile(tile, many=has_regions(tile)) if task.lossless else None
+    labelled = None
+    if task.lossless:
+        labelled = labelled_tile(tile, most=MAX_LABELS if has_regions(tile) else FEW)
     if labelled is not None and _CLEARLY * len(labelled.data) < len(exact_tile(tile).data):
         return labelled
     others = [_transformed(task, specs, effort), labelled]
@@ -319,6 +327,8 @@ def _task(tile: Values, quality: Quality, fills: Sequence[Any]) -> _Task | None:
     low, high = low - origin, high - origin
     with_bound = quality.step is None
     kept = values[np.logical_and.reduce([values != fill for fill in fills])] if fills else values
+    for fill in fills:
+        kept = _without_moved(kept, float(fill), float(quality.max_error_rel or 0.0))
     ends = (kept.min().item(), kept.max().item()) if kept.size else (0, 0)
     error, reach = _bound(quality, low, high, ends, tile.dtype) if with_bound else (None, 0.0)
     mask = None if all_finite else finite
@@ -332,6 +342,24 @@ def _task(tile: Values, quality: Quality, fills: Sequence[Any]) -> _Task | None:
         error=error,
         reach=reach,
     )
+
+
+def _without_moved(values: Values, fill: float, fraction: float) -> Values:
+    """The values without those that stood for `fill` in a chunk that was coded before.
+
+    Who writes a part of a chunk codes what was decoded of the rest once more. Beside values far
+    away those would give a range, and so a bound, as wide as the way to the fill value.
+    """
+    if not values.size:
+        return values
+    with np.errstate(over="ignore", invalid="ignore"):
+        ways = np.abs(values.astype(np.float64) - fill)
+        near = ways <= fraction * float(np.ptp(values.astype(np.float64)))
+        others = values[~near]
+        if not near.any() or not others.size:
+            return values
+        bound = fraction * float(np.ptp(others.astype(np.float64)))
+    return others if ways[near].max() <= _WRITTEN * bound else values
 
 
 def _bound(

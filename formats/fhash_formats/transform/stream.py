@@ -14,13 +14,25 @@ from fhash_formats.transform.array_axes import TILE_AXES, take_axes
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.part import corrected_part, uncorrected
-from fhash_formats.transform.tile.sections import Shape
+from fhash_formats.transform.tile.sections import Shape, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["MAX_TILE_VERTICES", "TransformCoder"]
+__all__ = ["MAX_TILE_VERTICES", "TransformCoder", "settings_of"]
 
 MAX_TILE_VERTICES = 1 << 27
 """Vertices of a tile. Decoding takes some 30 bytes each; a damaged file may claim any number."""
+
+
+def settings_of(configuration: Mapping[str, Any]) -> TileSettings | None:
+    """The settings in a configuration without axes; None where each stream has its own.
+
+    Raises InputError or DamagedFileError for anything else.
+    """
+    if not configuration:
+        return None
+    if set(configuration) != {"settings"}:
+        raise InputError("the configuration has settings, and axes, or is empty")
+    return TileSettings.from_text(configuration["settings"])
 
 
 class TransformCoder:
@@ -41,7 +53,8 @@ class TransformCoder:
         """A coder from an array's metadata.
 
         Args:
-            codecs: the codecs in the metadata; one, `{"name": ..., "configuration": ...}`.
+            codecs: the codecs in the metadata; one, `{"name": ..., "configuration": ...}`, whose
+                configuration has `settings`, the base64 of a packed block, or none, and `axes`.
             dtype: type of the values.
             shape: shape of a chunk, of at most 4 axes.
 
@@ -54,7 +67,7 @@ class TransformCoder:
             )
         if len(codecs) != 1:
             raise UnsupportedFileError(
-                "nothing may stand between the codecs fhash.transform and crc32c"
+                "no codec may follow fhash.transform, whose chunks have a checksum of their own"
             )
         if len(shape) > 4:
             raise DamagedFileError(
@@ -64,12 +77,10 @@ class TransformCoder:
         self._tile_shape: Shape = (t, z, y, x)
         try:
             configuration, self.axes = take_axes(codecs[0].get("configuration", {}))
-            self.settings = (
-                TileSettings.from_dict(configuration) if "transform" in configuration else None
-            )
+            self.settings = settings_of(configuration)
             if self.axes is not None:
                 self._tile_shape = self.axes.tile_shape(shape)
-        except InputError as error:
+        except (InputError, DamagedFileError) as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
@@ -86,6 +97,10 @@ class TransformCoder:
         if self.axes is not None:
             return encode_tile(self.axes.to_tile(chunk), self.settings).data
         return encode_tile(chunk.reshape(self._tile_shape), self.settings).data
+
+    def check(self, data: memoryview | bytes) -> None:
+        """Raises DamagedFileError for a stream that is damaged."""
+        parse_stream(data)
 
     def decode(self, data: memoryview | bytes, lod: int = 0) -> npt.NDArray[Any]:
         """The full chunk, or with `lod` every 2^lod-th vertex along z, y, x.

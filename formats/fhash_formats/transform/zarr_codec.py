@@ -10,10 +10,10 @@
         compressors=None,
     )
 
-Each chunk is one tile. Do not compress the chunks again: use `compressors=None`, or the checksum
-`crc32c`. Zarr pads chunks at the border of the array with the fill value, which takes no part in
-the range of `max_error_rel`. NaN is the best fill value, since it takes hardly any bytes; beside
-another one, decoded values may lie between it and the others, within the bound.
+Each chunk is one tile, which has a checksum. Do not compress the chunks again: use
+`compressors=None`. Zarr pads chunks at the border of the array with the fill value, which takes no
+part in the range of `max_error_rel`. NaN is the best fill value, since it takes hardly any bytes;
+beside another one, decoded values may lie between it and the others, within the bound.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from fhash_formats.transform.chunk import (
     supported,
     tile_shape,
 )
+from fhash_formats.transform.stream import settings_of
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -69,8 +70,7 @@ class TransformCodec(ArrayBytesCodec):
         transform: transform along the last four axes (t, z, y, x); None for the one that codes each
             chunk best.
         effort: as in `encode_chunk`: 1 is the fastest, 9 tries the most.
-        settings: settings that all chunks share, as in containers. In the metadata they are a
-            configuration with the key `center`.
+        settings: settings that all chunks share, as in containers.
         reading: whether the codec only decodes streams with their own settings, as in containers
             whose configuration is empty.
         axes: for each axis of the array, the axis "t", "z", "y" or "x" of its tiles, or "" for one
@@ -118,10 +118,9 @@ class TransformCodec(ArrayBytesCodec):
             )
         configuration, given = take_axes(configuration)
         axes = None if given is None else given.names
-        if "center" in configuration:
-            return cls(settings=TileSettings.from_dict(configuration), axes=axes)
-        if not configuration:
-            return cls(reading=True, axes=axes)
+        if "settings" in configuration or not configuration:
+            settings = settings_of(configuration)
+            return cls(settings=settings, reading=settings is None, axes=axes)
         keys = ("max_error", "max_error_rel", "step", "transform", "effort")
         unknown = [key for key in configuration if key not in keys]
         if unknown:
@@ -133,7 +132,7 @@ class TransformCodec(ArrayBytesCodec):
         """The inverse of `from_dict`."""
         configuration: dict[str, Any]
         if self.settings is not None:
-            configuration = self.settings.to_dict()
+            configuration = {"settings": self.settings.to_text()}
         elif self.reading:
             configuration = {}
         else:
@@ -162,14 +161,14 @@ class TransformCodec(ArrayBytesCodec):
             raise InputError(f"{NAME}: axes {list(self.axes)} of an array with {len(shape)} axes")
 
     def __repr__(self) -> str:
-        """One line: the settings of tiles hold a base64 text of all weights of a head."""
-        shared = None if self.settings is None else self.settings.to_dict()
+        """One line: settings may hold all weights of a head."""
+        shared = self.settings
         given = {
             "max_error": self.max_error,
             "max_error_rel": self.max_error_rel,
-            "step": self.step if shared is None else shared["step"],
-            "head": None if shared is None else "head" in shared or None,
-            "mask": None if shared is None else "mask" in shared or None,
+            "step": self.step if shared is None else shared.step,
+            "head": None if shared is None else shared.head is not None or None,
+            "mask": None if shared is None else shared.mask is not None or None,
             "reading": self.reading or None,
         }
         told = (f"{name}={value!r}" for name, value in given.items() if value is not None)

@@ -9,6 +9,7 @@ import fhash_codec
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, MissingInputError
 from fhash_codec.appending.resuming import bound_of_file, continued
 from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.coding import transform_codecs
 
 BOUND = 0.02
 CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile="2x4x6x4")
@@ -25,7 +26,6 @@ def with_array(run, path, name, values, dimension_names):
     """A copy of a file with another array."""
     with Container.open(run) as container, ContainerWriter(path) as writer:
         table = container.arrays["tables/level_1"]
-        codec = {"name": "fhash.transform", "configuration": table.settings.to_dict()}
         writer.add_sharded(
             "tables/level_1",
             shape=table.shape,
@@ -34,7 +34,7 @@ def with_array(run, path, name, values, dimension_names):
             shard_shape=table.shard_shape,
             chunks=(bytes(table.coded(index)) for index in np.ndindex(*table.grid)),
             dimension_names=table.dimension_names,
-            codecs=[codec, {"name": "crc32c"}],
+            codecs=transform_codecs(table.settings),
         )
         writer.add_whole(name, values, dimension_names=dimension_names, attributes={"a": 1})
         header = dict(container.header)

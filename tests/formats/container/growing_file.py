@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container import Container
-from fhash_formats.container.coding import CRC32C, TRANSFORM
+from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
 from fhash_formats.transform.chunk import encode_chunk
 
@@ -31,7 +31,7 @@ def growing_array(frame: tuple[int, int, int] = FRAME) -> GrowingArray:
         frame=frame,
         dtype=np.dtype(np.float32),
         tile=TILE,
-        codecs=[{"name": TRANSFORM, "configuration": {}}, CRC32C],
+        codecs=[{"name": TRANSFORM, "configuration": {}}],
     )
 
 

@@ -35,7 +35,6 @@ from fhash_formats.container.zip_file import FORMAT_VERSION
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.number_types import DTYPES
-from fhash_formats.transform.tile.settings import TileSettings
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
 
@@ -116,11 +115,6 @@ def test_no_key_of_the_example_can_be_left_out_but_defaults() -> None:
             with pytest.raises(DamagedFileError, match=key):
                 read_variables(root, [])
         assert f"| `{key}` |" in DOCUMENT
-
-
-def test_the_settings_of_the_example_are_those_of_a_tile() -> None:
-    settings = example("fhash.transform")
-    assert TileSettings.from_dict(settings).to_dict() == settings
 
 
 def test_every_file_that_is_named_exists() -> None:

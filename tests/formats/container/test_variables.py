@@ -14,7 +14,7 @@ from table_files import PLAIN, table_parts, write_table
 
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import CRC32C, plain_codecs, with_crc32c
+from fhash_formats.container.coding import plain_codecs, with_crc32c
 from fhash_formats.container.variables import free_node, part_place, shows_values
 from fhash_formats.errors import UnsupportedFileError
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
@@ -50,12 +50,12 @@ SHAPE = (4, 3, 4, 6)
 
 
 def table(dtype: str, settings: TileSettings | None) -> ArrayMetadata:
-    configuration = {} if settings is None else settings.to_dict()
+    configuration = {} if settings is None else {"settings": settings.to_text()}
     return ArrayMetadata(
         shape=SHAPE,
         dtype=np.dtype(dtype),
         chunk_shape=SHAPE,
-        codecs=[{"name": "fhash.transform", "configuration": configuration}, CRC32C],
+        codecs=[{"name": "fhash.transform", "configuration": configuration}],
     )
 
 

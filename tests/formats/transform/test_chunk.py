@@ -11,6 +11,7 @@ import pytest
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
+from fhash_formats.transform.tile.sections import KIND, LABELS, TRANSFORMED
 
 FLOATS = ["f2", "f4", "f8", ">f4"]
 INTEGERS = ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">i2"]
@@ -232,13 +233,13 @@ def grains(count: int, dtype: str) -> npt.NDArray[Any]:
 def test_labels_without_loss_are_coded_as_labels(count: int, dtype: str, error: float) -> None:
     values = grains(count, dtype)
     data = check(values, 0, max_error=error)
-    assert data[0] >> 5 == 5
+    assert data[4] & KIND == LABELS
     assert 40 * len(data) < values.nbytes
 
 
 @pytest.mark.parametrize(("dtype", "error"), [("i4", 1), ("f4", 0.5)])
 def test_a_looser_bound_codes_no_labels(dtype: str, error: float) -> None:
-    assert check(grains(60, dtype), error, max_error=error)[0] >> 5 == 1
+    assert check(grains(60, dtype), error, max_error=error)[4] & KIND == TRANSFORMED
 
 
 def test_labels_keep_every_bit_of_floats() -> None:

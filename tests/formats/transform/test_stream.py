@@ -18,8 +18,12 @@ from fhash_formats.transform.tile.settings import TileSettings
 FLOAT = np.dtype(np.float32)
 
 
+def named(settings: TileSettings) -> dict[str, Any]:
+    return {"settings": settings.to_text()}
+
+
 def coder(settings: TileSettings | None, shape: tuple[int, ...] = SHAPE) -> TransformCoder:
-    configuration = {} if settings is None else settings.to_dict()
+    configuration = {} if settings is None else named(settings)
     return TransformCoder([{"configuration": configuration}], FLOAT, shape)
 
 
@@ -57,9 +61,10 @@ def test_the_mask_comes_with_the_values() -> None:
 @pytest.mark.parametrize(
     ("codecs", "shape", "error", "message"),
     [
-        ([{}, {}], SHAPE, UnsupportedFileError, "between the codecs"),
+        ([{}, {}], SHAPE, UnsupportedFileError, "no codec may follow"),
         ([{}], (1, *SHAPE), DamagedFileError, "at most 4 axes"),
-        ([{"configuration": {"transform": 3}}], SHAPE, DamagedFileError, "fhash.transform"),
+        ([{"configuration": {"transform": 3}}], SHAPE, DamagedFileError, "has settings, and axes"),
+        ([{"configuration": {"settings": "a"}}], SHAPE, DamagedFileError, "no base64"),
     ],
 )
 def test_other_configurations_are_refused(
@@ -76,35 +81,35 @@ AXES = ("y", "x", "t", "z")
 def test_a_chunk_is_coded_along_the_axes_that_are_named(settings: TileSettings | None) -> None:
     order = ["tzyx".index(axis) for axis in AXES]
     values = wave().transpose(order)
-    configuration = {**({} if settings is None else settings.to_dict()), "axes": list(AXES)}
-    named = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
+    configuration = {**({} if settings is None else named(settings)), "axes": list(AXES)}
+    given = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
     coded = encode_tile(wave(), SETTINGS, Coding(own_settings=settings is None))
-    assert not named.parted
-    assert same(named.decode(coded.data), coded.decoded.transpose(order))
+    assert not given.parted
+    assert same(given.decode(coded.data), coded.decoded.transpose(order))
     if settings is not None:
-        assert named.encode(values) == coded.data
+        assert given.encode(values) == coded.data
 
 
 def test_a_level_of_detail_keeps_every_position_along_the_first_axis() -> None:
     plain, data = coder(SETTINGS), encode_tile(wave(), SETTINGS).data
-    time_first = {**SETTINGS.to_dict(), "axes": ["t", "x", "y", "z"]}
+    time_first = {**named(SETTINGS), "axes": ["t", "x", "y", "z"]}
     shape = tuple(wave().transpose(0, 3, 2, 1).shape)
-    named = TransformCoder([{"configuration": time_first}], FLOAT, shape)
-    assert same(named.decode(data, lod=1), plain.decode(data, lod=1).transpose(0, 3, 2, 1))
-    swapped = {**SETTINGS.to_dict(), "axes": ["z", "t", "y", "x"]}
+    given = TransformCoder([{"configuration": time_first}], FLOAT, shape)
+    assert same(given.decode(data, lod=1), plain.decode(data, lod=1).transpose(0, 3, 2, 1))
+    swapped = {**named(SETTINGS), "axes": ["z", "t", "y", "x"]}
     shape = tuple(wave().transpose(1, 0, 2, 3).shape)
-    named = TransformCoder([{"configuration": swapped}], FLOAT, shape)
+    given = TransformCoder([{"configuration": swapped}], FLOAT, shape)
     everything = plain.decode(data).transpose(1, 0, 2, 3)
-    assert same(named.decode(data, lod=1), everything[:, ::2, ::2, ::2])
+    assert same(given.decode(data, lod=1), everything[:, ::2, ::2, ::2])
 
 
 def test_axes_come_with_masks() -> None:
     settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
-    configuration = {**settings.to_dict(), "axes": ["x", "z", "y", "t"]}
+    configuration = {**named(settings), "axes": ["x", "z", "y", "t"]}
     shape = tuple(wave().transpose(3, 1, 2, 0).shape)
-    named = TransformCoder([{"configuration": configuration}], FLOAT, shape)
+    given = TransformCoder([{"configuration": configuration}], FLOAT, shape)
     coded = encode_tile(wave(), settings, in_coreset=occupied)
-    values, mask = named.decode_masked(coded.data)
+    values, mask = given.decode_masked(coded.data)
     assert same(values, coded.decoded.transpose(3, 1, 2, 0))
     assert np.array_equal(mask, occupied.transpose(3, 1, 2, 0))
 

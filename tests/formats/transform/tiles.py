@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from specs import spec_of
 
+from fhash_formats.native import crc32c
 from fhash_formats.transform.tile.encoding import Coding, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -50,6 +51,11 @@ def streams() -> dict[str, tuple[Values, bytes]]:
         "exact": (holes, exact_tile(holes).data),
         "integers": (integers, encode_tile(integers, replace(SETTINGS, high=99.0), own).data),
     }
+
+
+def resealed(data: bytes) -> bytes:
+    """A changed stream with the checksum of what it is now."""
+    return crc32c(data[4:]).to_bytes(4, "little") + data[4:]
 
 
 def damaged_copies(data: bytes) -> list[bytes]:

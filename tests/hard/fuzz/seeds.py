@@ -20,14 +20,14 @@ from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.coder import encode_integers
-from fhash_formats.transform.entropy.labels import blank_label_state, encode_labels
+from fhash_formats.transform.entropy.labels import encode_labels
 from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
 from fhash_formats.transform.entropy.trellis import choose_levels
-from fhash_formats.transform.tile.sections import parse_stream, unpack_settings
+from fhash_formats.transform.tile.sections import TRANSFORMED, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
@@ -111,14 +111,7 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             data = np.ascontiguousarray(array).tobytes()
             file.write(struct.pack("<q", len(data)) + data)
 
-        labels = blank_label_state(), blank_label_state(wide=True)
-        for state in (
-            prior_state(False),
-            prior_state(True),
-            mask_prior_state(),
-            blank_state(),
-            *labels,
-        ):
+        for state in (prior_state(False), prior_state(True), mask_prior_state(), blank_state()):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))
@@ -226,7 +219,7 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
                 for index in np.ndindex(*array.grid):
                     stream = bytes(array.coded(index))
                     own = parse_stream(stream).settings
-                    settings = array.settings if own is None else unpack_settings(own)
+                    settings = array.settings if own is None else TileSettings.from_bytes(own)
                     if settings is not None:  # else the stream has no coded integers
                         yield stream, settings, (t, z, y, x)
 
@@ -236,13 +229,11 @@ def coded_sections(
 ) -> Iterator[tuple[bytes, Table, bool]]:
     """Yield the coded integers of a tile: bytes, bands, and whether of two quantisers."""
     parts = parse_stream(stream)
-    if parts.coded and not parts.predicted and parts.body is not None:
+    if parts.kind == TRANSFORMED and parts.body is not None:
         table = band_table(settings.transform, shape)
         yield bytes(parts.body), table, settings.trellis
     if parts.residual is not None:
         yield bytes(parts.residual), single_band(shape), False
-    if parts.missing is not None:
-        yield bytes(parts.missing[4:]), single_band(shape), False
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:

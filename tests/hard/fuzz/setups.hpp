@@ -33,7 +33,7 @@ struct Passes {
 class Setups {
 public:
     State coders[2];  // of one quantiser and of two
-    State mask, predictor, labels, wide_labels;
+    State mask, predictor;
     std::vector<Bands> bands;
     std::vector<Passes> passes;
 
@@ -43,8 +43,7 @@ public:
             std::fprintf(stderr, "FHASH_FUZZ_SETUPS names no file that can be read\n");
             std::exit(2);
         }
-        for (State* state :
-             {&coders[0], &coders[1], &mask, &predictor, &labels, &wide_labels}) {
+        for (State* state : {&coders[0], &coders[1], &mask, &predictor}) {
             get(file, state->slots);
             get(file, state->weights);
             get(file, state->simples);

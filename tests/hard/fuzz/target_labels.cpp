@@ -11,36 +11,17 @@ namespace {
 
 using Bytes = std::vector<std::uint8_t>;
 
-// The coder of up to 256 labels.
-struct Narrow {
-    using Labels = std::vector<std::uint8_t>;
-    static const State& state() { return setups().labels; }
-    static constexpr auto encode = fhash_encode_labels;
-    static constexpr auto decode = fhash_decode_labels;
-};
-
-// The coder of more labels.
-struct Wide {
-    using Labels = std::vector<std::uint16_t>;
-    static const State& state() { return setups().wide_labels; }
-    static constexpr auto encode = fhash_encode_wide_labels;
-    static constexpr auto decode = fhash_decode_wide_labels;
-};
+using Labels = std::vector<std::uint16_t>;
 
 struct Tile {
     std::vector<int64_t> shape;
     int64_t count;  // of different labels
 };
 
-template <class Coder> typename Coder::Labels decoded(const Tile& tile, const Bytes& data) {
-    const State& blank = Coder::state();
-    typename Coder::Labels labels(static_cast<std::size_t>(volume(tile.shape)), 255);
-    const int64_t code = Coder::decode(
-        labels.data(), tile.count, tile.shape.data(), blank.slots.data(),
-        static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
-        static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
-        static_cast<int64_t>(blank.simples.size() / 2), data.data(),
-        static_cast<int64_t>(data.size()));
+Labels decoded(const Tile& tile, const Bytes& data) {
+    Labels labels(static_cast<std::size_t>(volume(tile.shape)), 255);
+    const int64_t code = fhash_decode_labels(labels.data(), tile.count, tile.shape.data(),
+                                             data.data(), static_cast<int64_t>(data.size()));
     require(code == 0, "bytes that are refused");
     for (const int64_t label : labels) require(label < tile.count, "a label that does not exist");
     return labels;
@@ -48,19 +29,13 @@ template <class Coder> typename Coder::Labels decoded(const Tile& tile, const By
 
 // The bytes of labels, by a first call with little room and a second one with as much as it asked
 // for. The coder may write to its labels.
-template <class Coder>
-Bytes encoded(const Tile& tile, const typename Coder::Labels& labels, std::size_t room) {
-    const State& blank = Coder::state();
+Bytes encoded(const Tile& tile, const Labels& labels, std::size_t room) {
     Bytes data(room);
-    typename Coder::Labels work;
+    Labels work;
     const auto encode = [&] {
         work = labels;
-        return Coder::encode(
-            work.data(), tile.count, tile.shape.data(), blank.slots.data(),
-            static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
-            static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
-            static_cast<int64_t>(blank.simples.size() / 2), data.data(),
-            static_cast<int64_t>(data.size()));
+        return fhash_encode_labels(work.data(), tile.count, tile.shape.data(), data.data(),
+                                   static_cast<int64_t>(data.size()));
     };
     const int64_t size = encode();
     require(size >= 0, "labels that are refused");
@@ -76,10 +51,10 @@ Bytes encoded(const Tile& tile, const typename Coder::Labels& labels, std::size_
 
 // Labels below a count in regions, of which the input says how long they are along x, y, z and t,
 // and which vertices have a label of their own.
-template <class Labels> Labels drawn(Reader& in, const Tile& tile) {
+Labels drawn(Reader& in, const Tile& tile) {
     int64_t lengths[4];
     for (int64_t& length : lengths) length = in.within(1, 40);
-    using Label = typename Labels::value_type;
+    using Label = std::uint16_t;
     const Labels palette = in.numbers<Label>(16), others = in.numbers<Label>(8);
     const std::uint8_t noise = in.byte();
     Labels labels;
@@ -103,28 +78,22 @@ Tile tile_of(Reader& in) {
     Tile tile;
     // Rows of up to three segments.
     for (const int64_t most : {4, 4, 6, 40}) tile.shape.push_back(in.within(1, most));
-    // A byte, and another one that counts where it is odd: as many narrow tiles as wide ones.
+    // A byte, and another one that counts where it is odd: as many tiles of few labels as of many.
     const int64_t low = in.byte(), high = in.byte();
     tile.count = 1 + low + (high % 2 ? 256 * high : 0);
     return tile;
-}
-
-template <class Coder> void round_trip(Reader& in, const Tile& tile) {
-    const std::size_t room = in.byte();
-    const auto labels = drawn<typename Coder::Labels>(in, tile);
-    require(decoded<Coder>(tile, encoded<Coder>(tile, labels, room)) == labels, "other labels");
 }
 
 }  // namespace
 
 void decode_label_bytes(Reader& in) {
     const Tile tile = tile_of(in);
-    if (tile.count > 256) decoded<Wide>(tile, in.rest());
-    else decoded<Narrow>(tile, in.rest());
+    decoded(tile, in.rest());
 }
 
 void label_round_trip(Reader& in) {
     const Tile tile = tile_of(in);
-    if (tile.count > 256) round_trip<Wide>(in, tile);
-    else round_trip<Narrow>(in, tile);
+    const std::size_t room = in.byte();
+    const auto labels = drawn(in, tile);
+    require(decoded(tile, encoded(tile, labels, room)) == labels, "other labels");
 }

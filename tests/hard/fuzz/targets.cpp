@@ -126,7 +126,7 @@ void transform(Reader& in, F function, R reconstruct, bool whole) {
         const std::vector<double> numbers = in.numbers<double>(10);
         const std::vector<std::int32_t> from = integers(in, volume(shape));
         reconstruct(from.data(), out.data(), shape.data(), kinds, depths, ranks, pointers,
-                    tz.data(), yx.data(), numbers.data(), 0);
+                    tz.data(), yx.data(), numbers.data());
         return;
     }
     function(values.data(), out.data(), shape.data(), kinds, depths, ranks, pointers, tz.data(),

@@ -64,20 +64,19 @@ class _Plan:
         """The transformed values. Raises MemoryError."""
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         result = np.empty(values.shape, values.dtype)
-        _checked_code(
+        _check_code(
             getattr(native.library(), f"fhash_transform_{direction}_f{width}")(
                 *self._native_arguments(values, result, inverse)
             )
         )
         return result
 
-    def reconstruct(self, integers: Integers, result: Values, numbers: Sequence[float]) -> int:
-        """Write the values of integers into `result`; the CRC-32 of the integers."""
-        return _checked_code(
+    def reconstruct(self, integers: Integers, result: Values, numbers: Sequence[float]) -> None:
+        """Write the values of integers into `result`. Raises MemoryError."""
+        _check_code(
             getattr(native.library(), f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
                 *self._native_arguments(integers, result, inverse=True),
                 (ctypes.c_double * len(numbers))(*numbers),
-                0,
             )
         )
 
@@ -111,12 +110,11 @@ class _Plan:
         ]
 
 
-def _checked_code(code: int) -> int:
-    """The code that a native transform returned; raises MemoryError where it had no memory."""
+def _check_code(code: int) -> None:
+    """Raises MemoryError where a native transform had no memory."""
     if code == -2:
         raise MemoryError("no memory for the transform of a tile")
-    assert code >= 0, f"the native transform refused its arguments ({code})"
-    return code
+    assert code == 0, f"the native transform refused its arguments ({code})"
 
 
 class Transform:
@@ -192,8 +190,8 @@ class Transform:
 
     def reconstruct(
         self, integers: Integers, numbers: Sequence[float], *, in_place: bool = False
-    ) -> tuple[Values, int] | None:
-        """Values of a tile from its quantised coefficients, and the CRC-32 of these.
+    ) -> Values | None:
+        """Values of a tile from its quantised coefficients.
 
         They are `dequantise`, `inverse` and `clip_shifted` in one run over the memory. The result
         is None where only those three can do it.
@@ -212,7 +210,8 @@ class Transform:
         result = integers.view(np.float32) if over else np.empty(self.shape, self.dtype)
         if 0 not in self._plans:
             self._plans[0] = self._inverse_plan(0)
-        return result, self._plans[0].reconstruct(integers, result, numbers)
+        self._plans[0].reconstruct(integers, result, numbers)
+        return result
 
     @cached_property
     def _forward_plan(self) -> _Plan:

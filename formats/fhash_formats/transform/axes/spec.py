@@ -1,4 +1,4 @@
-"""The transform of each axis of a tile, and its form in a codec's configuration.
+"""The transform of each axis of a tile, and the JSON by which a user names it.
 
 A wavelet of depth d splits an axis d times into a low and a high band, (n + 1) // 2 and n // 2
 long. The low band stands first and is the one that is split again. A level on a length of 1 is the
@@ -9,14 +9,11 @@ along its whole length on its own (packets).
 
 from __future__ import annotations
 
-import base64
-import binascii
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
-from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.basis import Basis
 
 __all__ = ["AXES", "KINDS", "MAX_DEPTH", "WAVELETS", "AxisTransform", "TransformSpec"]
@@ -33,9 +30,6 @@ WAVELETS = ("haar", "5/3", "9/7")
 """Kinds that split an axis into bands."""
 MAX_DEPTH = 10
 """Most levels of a wavelet."""
-
-_MAX_TEXT = 1 << 21
-"""Most characters of a packed basis in base64."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +65,9 @@ class AxisTransform:
         return self.kind in WAVELETS
 
     def to_json(self) -> Any:
-        """The JSON value: `"none"`, `[kind, depth]` or `{"klt": base64 of the packed basis}`."""
+        """The JSON value: `"none"` or `[kind, depth]`. Raises InputError for a basis."""
         if self.basis is not None:
-            return {"klt": base64.b64encode(self.basis.to_bytes()).decode("ascii")}
+            raise InputError("a basis of the data's own is no JSON value")
         return [self.kind, self.depth] if self.wavelet else self.kind
 
     @classmethod
@@ -83,11 +77,7 @@ class AxisTransform:
             return cls(kind=value)
         if isinstance(value, (list, tuple)) and len(value) == 2 and isinstance(value[0], str):
             return cls(kind=value[0], depth=value[1])
-        if isinstance(value, Mapping) and set(value) == {"klt"} and isinstance(value["klt"], str):
-            return cls(kind="klt", basis=_basis_from_text(value["klt"]))
-        raise InputError(
-            f'a transform is "none", [kind, depth] or {{"klt": base64}}, not {value!r:.60}'
-        )
+        raise InputError(f'a transform is "none" or [kind, depth], not {value!r:.60}')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,16 +136,3 @@ def _axis(key: str, value: Any) -> AxisTransform:
         return AxisTransform.from_json(value)
     except InputError as error:
         raise InputError(f"transform, key {key!r}: {error}") from error
-
-
-@lru_cache(maxsize=64)
-def _basis_from_text(text: str) -> Basis:
-    # Decoding a basis, and coding it again to check it, takes a third of what opening a file does.
-    if len(text) > _MAX_TEXT:
-        raise InputError(f"a packed basis has at most {_MAX_TEXT} characters, not {len(text)}")
-    try:
-        return Basis.from_bytes(base64.b64decode(text.encode("ascii"), validate=True))
-    except (binascii.Error, UnicodeEncodeError) as error:
-        raise InputError(f"a packed basis is base64 ({error})") from error
-    except DamagedFileError as error:
-        raise InputError(str(error)) from error

@@ -10,7 +10,6 @@ compared, and scores are whole numbers, so the levels are the same on every mach
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -105,33 +104,3 @@ class MaskLevels:
         )
         checked(code)
         return first, second
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values, without those that have their default."""
-        named: dict[str, Any] = {"edges": list(self.edges)} if self.edges else {}
-        if self.scores != (0,):
-            named["scores"] = list(self.scores)
-        if self.others:
-            named["others"] = list(self.others)
-        if self.reach:
-            named["reach"] = self.reach
-        return named
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> MaskLevels:
-        """The inverse of `to_dict`; raises InputError for anything else."""
-        keys = {"edges", "scores", "others", "reach"}
-        if not isinstance(values, Mapping) or not set(values) <= keys:
-            raise InputError(
-                f"mask is {values!r:.80}; an object of edges, scores, others and reach is needed"
-            )
-        lists = {
-            name: values.get(name, default)
-            for name, default in (("edges", []), ("scores", [0]), ("others", []))
-        }
-        if not all(isinstance(numbers, list | tuple) for numbers in lists.values()):
-            raise InputError("edges, scores and others of a mask are lists")
-        return cls(
-            **{name: tuple(numbers) for name, numbers in lists.items()},
-            reach=values.get("reach", 0),
-        )

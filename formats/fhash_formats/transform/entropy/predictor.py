@@ -9,10 +9,7 @@ from the base. The encoder trains the weights.
 
 from __future__ import annotations
 
-import base64
-import binascii
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
@@ -21,8 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.entropy.coder import decode_block, encode_block
+from fhash_formats.errors import InputError
 
 __all__ = [
     "CLASSES",
@@ -32,6 +28,7 @@ __all__ = [
     "Predictor",
     "pass_arrays",
     "passes_of",
+    "tap_count",
 ]
 
 CLASSES = 16
@@ -49,6 +46,8 @@ MAX_LEVELS = 8
 MAX_REACH = 2
 """Largest reach of the taps."""
 
+Axes = tuple[int, int, int, int]
+"""A number of each axis (t, z, y, x)."""
 Tap = tuple[int, int, int, int, int]
 """A vertex that a prediction uses: the lattice, then offsets along t, z, y, x in that lattice.
 
@@ -89,8 +88,8 @@ class Predictor:
 
     step: float
     origin: float
-    levels: tuple[int, int, int, int]
-    order: tuple[int, int, int, int]
+    levels: Axes
+    order: Axes
     reach: int
     weights: tuple[int, ...]
 
@@ -105,20 +104,7 @@ class Predictor:
                 raise InputError(f"predictor: {name} is {value!r:.40}; a finite number is needed")
         if self.step <= 0:
             raise InputError(f"predictor: step is {self.step}; it must be above 0")
-        if not _are_integers(self.levels, 4, 0, MAX_LEVELS):
-            raise InputError(
-                f"predictor: levels are {self.levels!r:.60}; "
-                f"four whole numbers from 0 to {MAX_LEVELS} are needed"
-            )
-        if not _is_order(self.order):
-            raise InputError(
-                f"predictor: order is {self.order!r:.60}; 0, 1, 2, 3 in some order are needed"
-            )
-        if type(self.reach) is not int or not 0 <= self.reach <= MAX_REACH:
-            raise InputError(
-                f"predictor: reach is {self.reach!r:.40}; 0 to {MAX_REACH} is possible"
-            )
-        count = sum(len(a_pass.taps) for a_pass in self.passes)
+        count = tap_count(self.levels, self.order, self.reach)
         if not _are_integers(self.weights, count, -MAX_WEIGHT, MAX_WEIGHT):
             raise InputError(f"predictor: {count} weights within +-{MAX_WEIGHT} are needed")
 
@@ -127,72 +113,23 @@ class Predictor:
         """The passes, in order."""
         return passes_of(self.levels, self.order, self.reach)
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values; the weights are coded as a block, in base64."""
-        packed = encode_block(np.array(self.weights, dtype=np.int32).reshape(1, 1, 1, -1))
-        return {
-            "step": self.step,
-            "origin": self.origin,
-            "levels": list(self.levels),
-            "order": list(self.order),
-            "reach": self.reach,
-            "weights": base64.b64encode(packed).decode("ascii"),
-        }
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Predictor:
-        """The inverse of `to_dict`.
-
-        Raises InputError, naming the key, or DamagedFileError for anything else.
-        """
-        keys = ("step", "origin", "levels", "order", "reach", "weights")
-        if not isinstance(values, Mapping):
-            raise InputError(
-                f"a predictor is a mapping with the keys {', '.join(keys)}, not {values!r:.60}"
-            )
-        for key in (*values, *keys):
-            if key not in keys or key not in values:
-                raise InputError(
-                    f"predictor: {'unknown' if key not in keys else 'missing'} key {key!r:.40}; "
-                    f"the keys are {', '.join(keys)}"
-                )
-        levels, order = (
-            tuple(values[key]) if isinstance(values[key], list | tuple) else ()
-            for key in ("levels", "order")
+def tap_count(levels: Axes, order: Axes, reach: int) -> int:
+    """The number of weights of a predictor; raises InputError for what is no lattice."""
+    if not _are_integers(levels, 4, 0, MAX_LEVELS):
+        raise InputError(
+            f"predictor: levels are {levels!r:.60}; "
+            f"four whole numbers from 0 to {MAX_LEVELS} are needed"
         )
-        # The number of weights follows from these three, so they are checked before the weights.
-        if not _are_integers(levels, 4, 0, MAX_LEVELS) or not _is_order(order):
-            raise InputError(
-                f"predictor: levels {levels!r:.60} and order {order!r:.60} are no such lists"
-            )
-        if type(values["reach"]) is not int or not 0 <= values["reach"] <= MAX_REACH:
-            raise InputError(
-                f"predictor: reach is {values['reach']!r:.40}; 0 to {MAX_REACH} is possible"
-            )
-        passes = passes_of(levels, order, values["reach"])
-        count = sum(len(a_pass.taps) for a_pass in passes)
-        try:
-            block = decode_block(
-                base64.b64decode(values["weights"], validate=True), (1, 1, 1, count)
-            )
-        except (binascii.Error, TypeError, ValueError) as error:
-            if isinstance(error, DamagedFileError):
-                raise
-            raise DamagedFileError("the weights of a predictor are not base64") from error
-        return cls(
-            step=values["step"],
-            origin=values["origin"],
-            levels=levels,
-            order=order,
-            reach=values["reach"],
-            weights=tuple(block.ravel().tolist()),
-        )
+    if not _is_order(order):
+        raise InputError(f"predictor: order is {order!r:.60}; 0, 1, 2, 3 in some order are needed")
+    if type(reach) is not int or not 0 <= reach <= MAX_REACH:
+        raise InputError(f"predictor: reach is {reach!r:.40}; 0 to {MAX_REACH} is possible")
+    return sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))
 
 
 @lru_cache(maxsize=64)
-def passes_of(
-    levels: tuple[int, int, int, int], order: tuple[int, int, int, int], reach: int
-) -> tuple[Pass, ...]:
+def passes_of(levels: Axes, order: Axes, reach: int) -> tuple[Pass, ...]:
     """The passes of a predictor: the first lattice, then each level along the axes in order."""
     axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
     first = Pass(axis=-1, kind=CLASSES - 1, taps=_first_taps())

@@ -306,17 +306,12 @@ class NeighbourHead:
     def from_bytes(cls, data: bytes) -> NeighbourHead:
         """The head that `to_bytes` packed.
 
-        Raises DamagedFileError for all other bytes, also for another code of the same head.
+        Raises DamagedFileError for bytes that are no head.
         """
         try:
-            head = cls._read(data)
+            return cls._read(data)
         except (struct.error, ValueError, IndexError) as error:
             raise DamagedFileError(f"a damaged neighbourhood head: {error}") from error
-        if head.to_bytes() != data:
-            raise DamagedFileError(
-                "a damaged neighbourhood head: packing it again gives other bytes"
-            )
-        return head
 
     @classmethod
     def _read(cls, data: bytes) -> NeighbourHead:
@@ -346,6 +341,8 @@ class NeighbourHead:
         weight_count = sum(rows * columns for rows, columns in zip(inputs, widths, strict=True))
         if len(data) - position > _MAX_WEIGHT_BYTES * weight_count + 1:
             raise ValueError(f"{len(data)} bytes are too many")
+        if not data[position:] or not data[-1]:
+            raise ValueError("its weights are cut, or have zeros after their end")
         state = int.from_bytes(data[position:], "little")
         layers = []
         for (weight_scale, bias_scale, spread), columns, bias in zip(

@@ -6,8 +6,9 @@ gets.
 
 from __future__ import annotations
 
-import zlib
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -24,16 +25,17 @@ from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.tile.labelled import unpack_labelled
 from fhash_formats.transform.tile.sections import (
+    EMPTY,
     EXACT,
-    MANY,
+    LABELS,
+    PREDICTED,
+    TRANSFORMED,
     Shape,
     TileStream,
-    little_endian,
     parse_stream,
     restore_missing,
-    unpack_exact,
     unpack_mask,
-    unpack_settings,
+    unpack_planes,
     zero_levels,
 )
 from fhash_formats.transform.tile.settings import TileSettings
@@ -124,12 +126,12 @@ def decode_tile_table(
     coded by transform, they are its values; `center` stands for those that are not finite.
     Arguments and errors are those of `decode_tile`.
     """
-    table, origin = table_about_origin(data, shape, dtype, settings, lod)
+    table, origin = table_about_origin(parse_stream(data), shape, dtype, settings, lod)
     return table.astype(np.float64) + origin if origin else table
 
 
 def table_about_origin(
-    data: bytes | memoryview,
+    stream: TileStream,
     shape: Shape,
     dtype: npt.DTypeLike,
     settings: TileSettings | None,
@@ -137,20 +139,20 @@ def table_about_origin(
 ) -> tuple[Values, int]:
     """The table of a tile less the origin of its settings, in their working type; and the origin.
 
-    Arguments and errors are those of `decode_tile_table`.
+    The other arguments and the errors are those of `decode_tile_table`.
     """
-    stream, settings = _parsed(data, settings)
+    settings = _own(stream, settings)
     kind = np.dtype(dtype) if settings is None else _coded_type(settings, np.dtype(dtype))
-    if settings is None or not stream.coded or stream.predicted:
+    if settings is None or stream.kind != TRANSFORMED:
         values = _decode_stream(stream, shape, kind, settings, lod)[0]
         working = np.dtype(np.float64) if settings is None else settings.dtype
         with np.errstate(over="ignore"):
             values = values.astype(working)
         values[~np.isfinite(values)] = 0.0 if settings is None else settings.center
         return values, 0 if settings is None else settings.origin
-    assert stream.body is not None
     _check_numbers(settings, kind)
-    table = _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
+    without = replace(stream, residual=None)
+    table = _linear_and_residual(without, shape, settings, lod)[0]
     return table, settings.origin
 
 
@@ -161,20 +163,17 @@ def _decode(
     settings: TileSettings | None,
     lod: int,
 ) -> Decoded:
-    stream, settings = _parsed(data, settings)
-    kind = np.dtype(dtype)
+    stream = parse_stream(data)
+    settings, kind = _own(stream, settings), np.dtype(dtype)
     if settings is None or not settings.origin:
         return _decode_stream(stream, shape, kind, settings, lod)
     values, mask = _decode_stream(stream, shape, _coded_type(settings, kind), settings, lod)
     return at_origin(values, settings.origin, kind), mask
 
 
-def _parsed(
-    data: bytes | memoryview, settings: TileSettings | None
-) -> tuple[TileStream, TileSettings | None]:
-    """The parts of a stream, and its settings: its own, or those that all tiles share."""
-    stream = parse_stream(data)
-    return stream, settings if stream.settings is None else unpack_settings(stream.settings)
+def _own(stream: TileStream, shared: TileSettings | None) -> TileSettings | None:
+    """The settings of a stream: its own, or those that all tiles share."""
+    return shared if stream.settings is None else TileSettings.from_bytes(stream.settings)
 
 
 def _coded_type(settings: TileSettings, kind: np.dtype[Any]) -> np.dtype[Any]:
@@ -193,31 +192,30 @@ def _decode_stream(
     lod: int,
 ) -> Decoded:
     """The values of a stream less the origin of its settings, and which are occupied."""
-    if stream.flags & EXACT:
+    if stream.kind == EXACT:
         return _decode_exact(stream, shape, kind, lod)
-    if settings is None and not (stream.labelled and not stream.masked):
+    if settings is None and not (stream.kind == LABELS and not stream.masked):
         raise DamagedFileError("a coded tile has no settings")
-    if stream.labelled:
+    if stream.kind == LABELS:
         return _decode_labelled(stream, shape, kind, settings, lod)
     assert settings is not None
     largest = _check_numbers(settings, kind)
-    if stream.body is None:
+    if stream.kind == EMPTY:
         values = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
         mask = np.zeros(shape, bool) if stream.masked else None
-    elif stream.predicted:
-        values, mask = _decode_predicted(stream, stream.body, shape, kind, settings, lod)
+    elif stream.kind == PREDICTED:
+        values, mask = _decode_predicted(stream, shape, kind, settings, lod)
     else:
-        values, mask = _decode_transformed(stream, stream.body, shape, kind, settings, lod, largest)
+        values, mask = _decode_transformed(stream, shape, kind, settings, lod, largest)
     if lod:
         return values, None
-    missing = b"" if stream.missing is None else bytes(stream.missing)
-    return restore_missing(blank_unoccupied(values, mask, settings), missing), mask
+    return restore_missing(blank_unoccupied(values, mask, settings), stream.missing), mask
 
 
 def _decode_exact(stream: TileStream, shape: Shape, kind: np.dtype[Any], lod: int) -> Decoded:
     """The values and mask of a tile that is stored without loss."""
     assert stream.body is not None, "an exact stream has a body"
-    values = unpack_exact(stream.body, shape, kind)
+    values = unpack_planes(stream.body, prod(shape), kind).reshape(shape)
     mask = None if stream.mask is None else unpack_mask(stream.mask, zero_levels(shape))
     return values[_every(lod)] if lod else values, mask
 
@@ -231,8 +229,7 @@ def _decode_labelled(
 ) -> Decoded:
     """The values and mask of a tile of labels."""
     assert stream.body is not None, "a stream of labels has a body"
-    many = bool(stream.flags & MANY)
-    values, mask = unpack_labelled(stream.body, shape, kind, masked=stream.masked, many=many)
+    values, mask = unpack_labelled(stream.body, shape, kind, masked=stream.masked)
     if settings is not None:
         values = blank_unoccupied(values, mask, settings)
     return (values[_every(lod)], None) if lod else (values, mask)
@@ -240,7 +237,6 @@ def _decode_labelled(
 
 def _decode_predicted(
     stream: TileStream,
-    body: memoryview,
     shape: Shape,
     kind: np.dtype[Any],
     settings: TileSettings,
@@ -249,8 +245,8 @@ def _decode_predicted(
     """The values and mask of a tile that is coded by prediction."""
     if settings.predictor is None:
         raise DamagedFileError("a tile is coded by prediction, but its settings have no predictor")
-    integers = decode_predicted(body, shape, settings.predictor)
-    _check_digest(stream, zlib.crc32(little_endian(integers)), None)
+    assert stream.body is not None, "a predicted stream has a body"
+    integers = decode_predicted(stream.body, shape, settings.predictor)
     values = predicted_values(integers, settings.predictor, settings)
     if lod:
         return within_range(cast(values[_every(lod)], kind), settings), None
@@ -260,7 +256,6 @@ def _decode_predicted(
 
 def _decode_transformed(
     stream: TileStream,
-    body: memoryview,
     shape: Shape,
     kind: np.dtype[Any],
     settings: TileSettings,
@@ -271,7 +266,7 @@ def _decode_transformed(
 
     largest: the largest number of the type of the source and of the working type.
     """
-    linear, residual = _linear_and_residual(stream, body, shape, settings, lod)
+    linear, residual = _linear_and_residual(stream, shape, settings, lod)
     if lod:
         return within_range(cast(linear, kind), settings), None
     mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
@@ -286,11 +281,11 @@ def _decode_transformed(
 
 
 def _linear_and_residual(
-    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings, lod: int
+    stream: TileStream, shape: Shape, settings: TileSettings, lod: int
 ) -> tuple[Values, Integers | None]:
     """The values of a tile that is coded by transform, before head and residual, and its residual.
 
-    Both are checked against the digest.
+    The residual is left out at a level of detail.
     """
     # Built before anything is decoded: the bands of a spec that does not fit lie beyond the tile.
     try:
@@ -299,46 +294,25 @@ def _linear_and_residual(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
-    integers, residual = _integers_and_residual(stream, body, shape, settings)
-    # Only the coarse coefficients of a level of detail are transformed, but all are checked.
-    fused = None if lod else _reconstructed(integers, transform, settings, in_place=True)
-    if fused is None:
-        _check_digest(stream, zlib.crc32(little_endian(integers)), residual)
-        return linear_values(integers, transform, settings, lod), residual
-    linear, crc = fused
-    _check_digest(stream, crc, residual)
-    return linear, residual
-
-
-def _integers_and_residual(
-    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings
-) -> tuple[Integers, Integers | None]:
-    """The coefficients of a tile that is coded by transform, and its residual."""
+    body, rest = stream.body, stream.residual
+    assert body is not None, "a transformed stream has a body"
 
     def coefficients() -> Integers:
         table = band_table(settings.transform, shape)
         return decode_integers(body, shape, table, trellis=settings.trellis)
 
-    def residual() -> Integers:
-        assert stream.residual is not None
-        table = single_band(shape)
-        return decode_integers(stream.residual, shape, table)
-
-    if stream.residual is None:
-        return coefficients(), None
-    integers, rest = in_threads(lambda decode: decode(), [coefficients, residual])
-    return integers, rest
+    residual = None
+    if rest is None or lod:
+        integers = coefficients()
+    else:
+        decoders = [coefficients, partial(decode_integers, rest, shape, single_band(shape))]
+        integers, residual = in_threads(_call, decoders)
+    return linear_values(integers, transform, settings, lod, in_place=True), residual
 
 
-def _check_digest(stream: TileStream, crc: int, residual: Integers | None) -> None:
-    """Raises DamagedFileError where the digest is that of other integers.
-
-    crc: CRC-32 of the integers before the residual.
-    """
-    if residual is not None:
-        crc = zlib.crc32(little_endian(residual), crc)
-    if crc != stream.digest:
-        raise DamagedFileError("the decoded integers of a tile differ from their digest")
+def _call(decode: Any) -> Integers:
+    integers: Integers = decode()
+    return integers
 
 
 def _check_numbers(settings: TileSettings, kind: np.dtype[Any]) -> float:
@@ -357,7 +331,12 @@ def _check_numbers(settings: TileSettings, kind: np.dtype[Any]) -> float:
 
 
 def linear_values(
-    integers: Integers, transform: Transform, settings: TileSettings, lod: int = 0
+    integers: Integers,
+    transform: Transform,
+    settings: TileSettings,
+    lod: int = 0,
+    *,
+    in_place: bool = False,
 ) -> Values:
     """Values before head and residual, in the working type, clipped to the range.
 
@@ -366,23 +345,19 @@ def linear_values(
         transform: the transform of the tile.
         settings: settings of the tile.
         lod: level of detail, as in `decode_tile`.
+        in_place: whether the integers may be overwritten.
     """
-    fused = None if lod else _reconstructed(integers, transform, settings)
-    if fused is not None:
-        return fused[0]
+    if not lod:
+        one, two, *more = (offset / OFFSET_UNIT for offset in settings.offsets)
+        offsets = (one, two, *(more if len(more) > 1 else more * 4))
+        numbers = (settings.step, *offsets, settings.center, settings.low, settings.high)
+        values = transform.reconstruct(integers, numbers, in_place=in_place)
+        if values is not None:
+            return values
     coefficients = dequantise(integers, settings.step, settings.offsets, settings.dtype)
-    values = transform.inverse(coefficients, lod)
-    return clip_shifted(values, settings.center, settings.low, settings.high)
-
-
-def _reconstructed(
-    integers: Integers, transform: Transform, settings: TileSettings, *, in_place: bool = False
-) -> tuple[Values, int] | None:
-    """`linear_values` of a full tile and the CRC-32 of its integers, as `Transform.reconstruct`."""
-    one, two, *more = (offset / OFFSET_UNIT for offset in settings.offsets)
-    offsets = (one, two, *(more if len(more) > 1 else more * 4))
-    ends = (settings.center, settings.low, settings.high)
-    return transform.reconstruct(integers, (settings.step, *offsets, *ends), in_place=in_place)
+    return clip_shifted(
+        transform.inverse(coefficients, lod), settings.center, settings.low, settings.high
+    )
 
 
 def predicted_values(

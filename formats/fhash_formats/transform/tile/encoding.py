@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.entropy.coder import MAX_INTEGER
+from fhash_formats.transform.entropy.labels import MAX_LABELS
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.tile.decoding import (
@@ -25,8 +26,11 @@ from fhash_formats.transform.tile.decoding import (
 )
 from fhash_formats.transform.tile.filling import filled
 from fhash_formats.transform.tile.integers import choose_integers, code_coefficients
-from fhash_formats.transform.tile.labelled import build_labelled_stream
+from fhash_formats.transform.tile.labelled import labelled_stream
 from fhash_formats.transform.tile.sections import (
+    EMPTY,
+    PREDICTED,
+    TRANSFORMED,
     Shape,
     build_exact_stream,
     build_stream,
@@ -182,14 +186,13 @@ def labelled_tile(
     values: Values,
     settings: TileSettings | None = None,
     occupied: Mask | None = None,
-    *,
-    many: bool = False,
+    most: int = MAX_LABELS,
 ) -> CodedTile | None:
     """A tile stored as labels, without loss; None for one of too many different values.
 
-    The arguments are those of `exact_tile`, and `many` of `build_labelled_stream`.
+    The arguments are those of `exact_tile`, and `most` of `labelled_stream`.
     """
-    data = build_labelled_stream(values, settings, occupied, many=many)
+    data = labelled_stream(values, settings, occupied, most)
     return None if data is None else CodedTile(data=data, decoded=values.copy(), nonzero=0)
 
 
@@ -275,8 +278,7 @@ def _task(values: Values, settings: TileSettings, coding: Coding, in_coreset: Ma
 
 def _labelled_tile(task: _Task) -> CodedTile | None:
     """A tile of labels, without loss; None for one of too many different values."""
-    many = task.settings.many_labels
-    tile = labelled_tile(task.values, task.own_settings, task.occupied, many=many)
+    tile = labelled_tile(task.values, task.own_settings, task.occupied)
     if tile is None:
         return None
     decoded = blank_unoccupied(tile.decoded, task.occupied, task.settings)
@@ -286,7 +288,7 @@ def _labelled_tile(task: _Task) -> CodedTile | None:
 def _empty_tile(task: _Task) -> CodedTile:
     """A tile in which no value counts."""
     mask = None if task.occupied is None else b""
-    data = build_stream(task.own_settings, task.missing, b"", None, None, mask)
+    data = build_stream(EMPTY, task.own_settings, task.missing, mask=mask)
     center = np.full(task.values.shape, task.settings.center)
     return task.coded(data, cast(center, task.values.dtype), 0)
 
@@ -302,9 +304,7 @@ def _predicted_tile(task: _Task, predictor: Predictor, error: float) -> CodedTil
     if not within(task.values, decoded, error, task.counted):
         return task.exact()
     mask = task.mask_section(linear)
-    stream = build_stream(
-        task.own_settings, task.missing, data, integers, None, mask, predicted=True
-    )
+    stream = build_stream(PREDICTED, task.own_settings, task.missing, data, mask=mask)
     return task.coded(stream, decoded, int(np.count_nonzero(integers)))
 
 
@@ -335,7 +335,7 @@ def _transformed_tile(task: _Task) -> CodedTile:
     decoded = within_range(decoded, settings)
     if error is not None and not within(task.values, decoded, error, task.counted):
         return task.exact()
-    stream = build_stream(task.own_settings, task.missing, data, integers, residual, mask)
+    stream = build_stream(TRANSFORMED, task.own_settings, task.missing, data, residual, mask)
     return task.coded(stream, decoded, int(np.count_nonzero(integers)))
 
 

@@ -2,50 +2,39 @@
 
 The palette holds the bits of each value; NaN of other bits are other values. Where the tile has a
 mask, vertices that are not occupied have the last label, which has no value. The section is: the
-CRC-32 of the labels (4 bytes), the length of the palette in bytes (4 bytes), the deflated palette
-(little-endian values in ascending order of their bits), the coded labels (entropy/labels.py).
-
-More than MAX_NARROW labels are *many*. Their stream has a flag of its own, and their palette holds
-the difference of each value from the one before: first all first bytes, then all second ones.
+number of values in the palette and the bytes of the packed palette (LEB128 each), the palette, and
+the coded labels (entropy/labels.py). The palette ascends; packed is the difference of each value
+from the one before (`sections.pack_planes`).
 """
 
 from __future__ import annotations
 
-import zlib
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.entropy.labels import (
-    MAX_LABELS,
-    MAX_NARROW,
-    decode_labels,
-    encode_labels,
-)
+from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels, encode_labels
 from fhash_formats.transform.tile.sections import (
-    LABELS,
-    LABELS_MASKED,
-    MANY,
-    OWN,
     Shape,
-    pack_settings,
-    section,
+    build_labelled_stream,
+    pack_planes,
+    unpack_planes,
 )
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.tile.settings import TileSettings, read_varint, varint
 
-__all__ = ["build_labelled_stream", "has_regions", "surely_exceeds", "unpack_labelled"]
+__all__ = ["FEW", "has_regions", "labelled_stream", "surely_exceeds", "unpack_labelled"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
+FEW = 256
+"""Labels that are tried whether or not values lie in regions."""
 REGION_SHARE = 0.5
 """Share of vertices with an equal neighbour from which on many different values may be labels."""
 _LOOK = 4096
 """Values that are looked at, at least, where there are as many."""
-_HEAD = 8
-"""Bytes before the palette."""
 
 
 def has_regions(values: Values) -> bool:
@@ -66,8 +55,11 @@ def surely_exceeds(values: Values, most: int) -> bool:
     return bool(np.unique(flat[:: max(1, flat.size // _LOOK)]).size > most)
 
 
-def build_labelled_stream(
-    values: Values, settings: TileSettings | None, occupied: Mask | None, *, many: bool = False
+def labelled_stream(
+    values: Values,
+    settings: TileSettings | None,
+    occupied: Mask | None,
+    most: int = MAX_LABELS,
 ) -> bytes | None:
     """The stream of a tile; None for one of too many different values.
 
@@ -75,9 +67,8 @@ def build_labelled_stream(
         values: the tile (t, z, y, x).
         settings: the tile's own settings; None for none.
         occupied: the mask; None for a stream without one. The other values are not stored.
-        many: whether there may be MAX_LABELS labels, not only MAX_NARROW.
+        most: labels that there may be.
     """
-    most = MAX_LABELS if many else MAX_NARROW
     bits = np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}").reshape(-1)
     kept = bits if occupied is None else bits[occupied.reshape(-1)]
     if surely_exceeds(kept, most):
@@ -86,74 +77,34 @@ def build_labelled_stream(
     count = palette.size + (occupied is not None)
     if count > most:
         return None
-    labels = np.searchsorted(palette, bits).astype(np.int64)
+    labels = np.searchsorted(palette, bits).astype(np.uint16)
     if occupied is not None:
         labels[~occupied.reshape(-1)] = palette.size
-    many = count > MAX_NARROW
-    small = labels.astype("<u2" if many else "u1").reshape(values.shape)
-    packed = zlib.compress(_palette_bytes(palette, many), 9)
-    body = b"".join(
-        [
-            zlib.crc32(small.data).to_bytes(4, "little"),
-            len(packed).to_bytes(4, "little"),
-            packed,
-            encode_labels(small, count),
-        ]
-    )
-    flags = (LABELS if occupied is None else LABELS_MASKED) | (OWN if settings else 0)
-    flags |= MANY if many else 0
-    return bytes([flags]) + b"".join(map(section, [*pack_settings(settings), body]))
+    packed = pack_planes(np.diff(palette, prepend=palette.dtype.type(0)))
+    body = [varint(palette.size), varint(len(packed)), packed]
+    body.append(encode_labels(labels.reshape(values.shape), count))
+    return build_labelled_stream(b"".join(body), settings, masked=occupied is not None)
 
 
 def unpack_labelled(
-    body: memoryview, shape: Shape, dtype: np.dtype[Any], *, masked: bool, many: bool
+    body: memoryview, shape: Shape, dtype: np.dtype[Any], *, masked: bool
 ) -> tuple[Values, Mask | None]:
     """The values in a section, and which are occupied; None without a mask.
 
     Values that are not occupied are arbitrary. Raises DamagedFileError.
     """
-    palette = _unpack_palette(body, dtype, many)
-    count = palette.size + masked
-    low, high = (MAX_NARROW + 1, MAX_LABELS) if many else (1, MAX_NARROW)
-    if not low <= count <= high:
-        raise DamagedFileError(f"a coded tile has {count} labels; {low} to {high} are possible")
-    start = _HEAD + int.from_bytes(body[4:8], "little")
-    labels = decode_labels(body[start:], count, shape)
-    stored = np.ascontiguousarray(labels, dtype="<u2" if many else "u1")
-    if zlib.crc32(stored.data).to_bytes(4, "little") != body[:4]:
-        raise DamagedFileError("the decoded labels of a tile differ from their digest")
-    # The label of unoccupied vertices has no value: any stands there.
-    values = np.append(palette, np.zeros(1, palette.dtype))[labels].view(dtype)
-    return values, labels < palette.size if masked else None
-
-
-def _palette_bytes(palette: Values, many: bool) -> bytes:
-    """The bytes of a palette before they are deflated."""
-    if not many:
-        return palette.astype(palette.dtype.newbyteorder("<")).tobytes()
-    steps = np.diff(palette, prepend=palette.dtype.type(0))
-    planes = steps.astype(palette.dtype.newbyteorder("<")).view(np.uint8)
-    return planes.reshape(palette.size, -1).T.tobytes()
-
-
-def _unpack_palette(body: memoryview, dtype: np.dtype[Any], many: bool) -> Values:
-    """The bits of the values of a palette. Raises DamagedFileError."""
-    size, most = int.from_bytes(body[4:8], "little"), MAX_LABELS if many else MAX_NARROW
-    if len(body) < _HEAD + size:
+    size, body = read_varint(body)
+    length, body = read_varint(body)
+    count = size + masked
+    if not 1 <= count <= MAX_LABELS:
+        raise DamagedFileError(f"a coded tile has {count} labels; 1 to {MAX_LABELS} are possible")
+    if length > len(body):
         raise DamagedFileError("a coded tile is cut short")
-    try:
-        inflate = zlib.decompressobj()
-        plain = inflate.decompress(body[_HEAD : _HEAD + size], most * dtype.itemsize + 1)
-    except zlib.error as error:
-        raise DamagedFileError(f"a coded tile is damaged: {error}") from error
-    if not inflate.eof or inflate.unused_data or len(plain) % dtype.itemsize:
-        raise DamagedFileError("the palette of a coded tile is damaged")
-    if many:
-        planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-        steps = np.ascontiguousarray(planes.T).view(f"<u{dtype.itemsize}").reshape(-1)
-        palette = np.cumsum(steps, dtype=f"u{dtype.itemsize}")
-    else:
-        palette = np.frombuffer(plain, f"<u{dtype.itemsize}").astype(f"u{dtype.itemsize}")
+    steps = unpack_planes(body[:length], size, np.dtype(f"u{dtype.itemsize}"))
+    palette = np.cumsum(steps, dtype=steps.dtype)
     if (palette[1:] <= palette[:-1]).any():
         raise DamagedFileError("the palette of a coded tile does not ascend")
-    return palette
+    labels = decode_labels(body[length:], count, shape)
+    # The label of unoccupied vertices has no value: any stands there.
+    values = np.append(palette, np.zeros(1, palette.dtype))[labels].view(dtype)
+    return values, labels < size if masked else None

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.transform.tile.decoding import table_about_origin, within_range
-from fhash_formats.transform.tile.sections import Shape, parse_stream
+from fhash_formats.transform.tile.sections import TRANSFORMED, Shape, parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import at_origin, corrected
 
@@ -47,9 +47,9 @@ def uncorrected(
         return None
     stream = parse_stream(data)
     more = (stream.settings, stream.missing, stream.residual)
-    if not stream.coded or stream.predicted or stream.masked or any(x is not None for x in more):
+    if stream.kind != TRANSFORMED or stream.masked or any(x is not None for x in more):
         return None
-    return table_about_origin(data, shape, dtype, settings)[0]
+    return table_about_origin(stream, shape, dtype, settings)[0]
 
 
 def corrected_part(

@@ -1,14 +1,30 @@
 """Settings with which tiles are coded: transform, step, range, trained head.
 
-All tiles of an array share their settings, or a tile has its own.
+All tiles of an array share their settings, or a tile has its own. In a file they are a block of
+bytes (`TileSettings.to_bytes`), little-endian:
+
+    flags             u8: 1 double, 2 clip, 4 labels, 8 trellis, 16 whole ends, 32 head, 64 mask,
+                      128 predictor
+    transform         u8 along t, z, y, x each: the kind's number in KINDS times 16, plus the depth
+    step, quantum     float64 each
+    center, low, high float64 each; with whole ends low and high int64
+    origin            9 bytes, signed; only with whole ends
+    offsets           int8, three, or six with trellis
+    bases             of each axis with one, in order: a length and the packed basis
+    head              a length and the packed head
+    mask              u8 number of edges, plus 128 with others; the edges, float64; then u8 reach,
+                      and scores and others, uint16
+    predictor         float64 step and origin; u8 levels of t, z, y, x; u8 the order, two bits for
+                      each axis, the first lowest; u8 reach; a length and the coded weights
+
+A length is that of the bytes that follow (LEB128).
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
+import struct
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,32 +33,32 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.number_types import is_wide_integer, is_within
-from fhash_formats.transform.axes.spec import TransformSpec
+from fhash_formats.transform.axes.basis import Basis
+from fhash_formats.transform.axes.spec import KINDS, AxisTransform, TransformSpec
+from fhash_formats.transform.entropy.coder import decode_block, encode_block
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.entropy.predictor import Predictor
+from fhash_formats.transform.entropy.predictor import Predictor, tap_count
 from fhash_formats.transform.head.head import NeighbourHead
 from fhash_formats.transform.values.quantise import OFFSET_UNIT
 
-__all__ = ["TileSettings"]
+__all__ = ["TileSettings", "read_varint", "varint"]
 
-_REQUIRED = frozenset({"transform", "step", "center", "range"})
-"""Keys of settings that have no default."""
-_SWITCHES = ("double", "clip", "labels", "many_labels", "trellis")
-"""Keys of settings that are true or false."""
-_KEYS = _REQUIRED | {
-    "offsets",
-    "quantum",
-    "head",
-    "mask",
-    "predictor",
-    "origin",
-    *_SWITCHES,
-}
-"""All keys of settings."""
+_DOUBLE, _CLIP, _LABELS, _TRELLIS, _WHOLE, _HEAD, _MASK, _PREDICTOR = (1 << n for n in range(8))
+"""Flags of a packed block."""
+_OTHERS = 128
+"""Added to the number of edges of a mask with other scores."""
+_ORIGIN = 9
+"""Bytes of an origin: one of uint64 and one of int64 fit."""
+_EXACT = 1 << 53
+"""Whole numbers up to this one are exact in float64."""
+_FARTHEST = 1 << 63
+"""First whole number that is no end of a range."""
 _LARGEST = sys.float_info.max
-"""Largest magnitude of a number; whole numbers of JSON may be larger."""
-_LISTS = "range is [low, high] and offsets are three whole numbers, six with trellis"
-"""Message for a range or offsets that are no lists."""
+"""Largest magnitude of a number; whole numbers may be larger."""
+_MAX_TEXT = 1 << 23
+"""Most characters of a block in base64."""
+_MOST_BITS = 35
+"""Bits of the largest number in LEB128."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +81,9 @@ class TileSettings:
         predictor: predictor of tiles that are coded by prediction instead of the transform; None
             where no tile is.
         clip: whether decoded values are clipped to the range once more at the end, in the type of
-            the array, so that neither residual nor rounding takes them beyond it. Files up to
-            version 1.1 never are.
-        labels: whether tiles may be coded as labels, without loss.
-        many_labels: whether such tiles may have 65,536 labels instead of 256; needs `labels`.
+            the array, so that neither residual nor rounding takes them beyond it.
+        labels: whether tiles are also tried as labels, without loss. Decoding needs none of it; a
+            file that grows goes on as it began.
         trellis: whether coefficients are quantised by two quantisers in turn (entropy/trellis.py).
             Integers are then in steps, of which each quantiser has every other one.
         origin: integer that is subtracted from the values before anything else, for arrays of
@@ -88,7 +103,6 @@ class TileSettings:
     predictor: Predictor | None = None
     clip: bool = False
     labels: bool = False
-    many_labels: bool = False
     trellis: bool = False
     origin: int = 0
 
@@ -104,18 +118,16 @@ class TileSettings:
         if not (self.double or smallest < self.step < largest):
             raise InputError(f"step {self.step} is not for float32")
         if len(self.offsets) != (6 if self.trellis else 3) or not all(
-            type(offset) is int and abs(offset) <= OFFSET_UNIT for offset in self.offsets
+            type(offset) is int and abs(offset) < OFFSET_UNIT for offset in self.offsets
         ):
             raise InputError(
                 f"offsets are {self.offsets!r:.60}; {'six' if self.trellis else 'three'} whole "
-                f"numbers within +-{OFFSET_UNIT} are needed"
+                f"numbers within +-{OFFSET_UNIT - 1} are needed"
             )
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
         if type(self.origin) is not int or not -(1 << 63) <= self.origin < 1 << 64:
             raise InputError(f"origin is {self.origin!r:.40}; a 64-bit integer is needed")
-        if self.many_labels and not self.labels:
-            raise InputError("many_labels needs labels")
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -138,97 +150,205 @@ class TileSettings:
             raise InputError(f"an array of {dtype} has no values about the origin {self.origin}")
         return np.dtype(np.int64)
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values, without the settings that have their default."""
-        result: dict[str, Any] = {
-            "transform": self.transform.to_dict(),
-            "step": self.step,
-            "center": self.center,
-            "range": [self.low, self.high],
-        }
-        if any(self.offsets):
-            result["offsets"] = list(self.offsets)
-        if self.double:
-            result["double"] = True
-        if self.quantum:
-            result["quantum"] = self.quantum
-        if self.head is not None:
-            result["head"] = base64.b64encode(self.head.to_bytes()).decode("ascii")
+    def to_bytes(self) -> bytes:
+        """The packed block; the module's docstring describes its bytes."""
+        whole = self.origin != 0 or any(
+            type(end) is int and abs(end) > _EXACT for end in (self.low, self.high)
+        )
+        ends = tuple(map(int, (self.low, self.high))) if whole else (self.low, self.high)
+        if whole and (
+            ends != (self.low, self.high) or not -_FARTHEST <= ends[0] <= ends[1] < _FARTHEST
+        ):
+            raise InputError(f"range {self.low} to {self.high} about an origin is of int64")
+        flags = sum(
+            flag
+            for flag, there in (
+                (_DOUBLE, self.double),
+                (_CLIP, self.clip),
+                (_LABELS, self.labels),
+                (_TRELLIS, self.trellis),
+                (_WHOLE, whole),
+                (_HEAD, self.head is not None),
+                (_MASK, self.mask is not None),
+                (_PREDICTOR, self.predictor is not None),
+            )
+            if there
+        )
+        axes = self.transform.axes
+        parts = [
+            bytes([flags, *(KINDS.index(axis.kind) << 4 | axis.depth for axis in axes)]),
+            struct.pack("<3d", self.step, self.quantum, self.center),
+            struct.pack("<2q" if whole else "<2d", *ends),
+            self.origin.to_bytes(_ORIGIN, "little", signed=True) if whole else b"",
+            struct.pack(f"{len(self.offsets)}b", *self.offsets),
+        ]
+        blocks = [axis.basis.to_bytes() for axis in axes if axis.basis is not None]
+        blocks += [] if self.head is None else [self.head.to_bytes()]
+        parts += [part for block in blocks for part in (varint(len(block)), block)]
         if self.mask is not None:
-            result["mask"] = self.mask.to_dict()
+            parts.append(_pack_mask(self.mask))
         if self.predictor is not None:
-            result["predictor"] = self.predictor.to_dict()
-        if self.clip:
-            result["clip"] = True
-        if self.labels:
-            result["labels"] = True
-        if self.many_labels:
-            result["many_labels"] = True
-        if self.trellis:
-            result["trellis"] = True
-        if self.origin:
-            result["origin"] = self.origin
-        return result
+            parts.append(_pack_predictor(self.predictor))
+        return b"".join(parts)
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> TileSettings:
-        """The inverse of `to_dict`. Raises InputError or DamagedFileError for anything else."""
-        unknown = sorted(str(key)[:40] for key in set(values) - _KEYS)
-        if unknown:
-            raise InputError(f"unknown setting {unknown[0]!a}; known: {', '.join(sorted(_KEYS))}")
-        missing = sorted(_REQUIRED - set(values))
-        if missing:
-            raise InputError(f"setting {missing[0]} is missing")
-        low, high = _range(values["range"])
-        switches = {name: values.get(name, False) for name in _SWITCHES}
-        for name, switch in switches.items():
-            if not isinstance(switch, bool):
-                raise InputError(f"{name} is true or false")
-        offsets = values.get("offsets", [0] * (6 if switches["trellis"] else 3))
-        if not isinstance(offsets, list | tuple):
-            raise InputError(_LISTS)
-        mask, predictor = values.get("mask"), values.get("predictor")
-        return cls(
-            transform=TransformSpec.from_dict(values["transform"]),
-            step=values["step"],
-            center=values["center"],
-            low=low,
-            high=high,
-            offsets=tuple(offsets),
-            **switches,
-            origin=values.get("origin", 0),
-            quantum=values.get("quantum", 0.0),
-            head=_unpack_head(values.get("head")),
-            mask=None if mask is None else MaskLevels.from_dict(mask),
-            predictor=None if predictor is None else Predictor.from_dict(predictor),
-        )
+    def from_bytes(cls, data: bytes | memoryview) -> TileSettings:
+        """The inverse of `to_bytes`. Raises DamagedFileError for anything else.
+
+        The same object for the same bytes.
+        """
+        return _unpacked(bytes(data))
+
+    def to_text(self) -> str:
+        """The packed block in base64, as JSON documents have it."""
+        return base64.b64encode(self.to_bytes()).decode("ascii")
+
+    @classmethod
+    def from_text(cls, text: Any) -> TileSettings:
+        """The inverse of `to_text`. Raises DamagedFileError for anything else."""
+        if not isinstance(text, str) or len(text) > _MAX_TEXT:
+            raise DamagedFileError(f"settings of tiles are base64, not {text!r:.40}")
+        try:
+            return cls.from_bytes(base64.b64decode(text, validate=True))
+        except ValueError as error:
+            raise DamagedFileError(f"settings of tiles are no base64 ({error})") from error
+
+
+@lru_cache(maxsize=64)
+def _unpacked(data: bytes) -> TileSettings:
+    # Unpacking a basis or a head takes as long as decoding a small tile.
+    try:
+        return _read(_Bytes(memoryview(data)))
+    except (InputError, ValueError) as error:
+        raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
+
+
+class _Bytes:
+    """Bytes that are read from their start on. Raises DamagedFileError at their end."""
+
+    def __init__(self, rest: memoryview) -> None:
+        self.rest = rest
+
+    def take(self, count: int) -> bytes:
+        """So many bytes."""
+        if count > len(self.rest):
+            raise DamagedFileError("the settings of a coded tile are cut short")
+        taken, self.rest = bytes(self.rest[:count]), self.rest[count:]
+        return taken
+
+    def numbers(self, form: str) -> tuple[Any, ...]:
+        """Numbers, by a form of `struct`."""
+        return struct.unpack(f"<{form}", self.take(struct.calcsize(f"<{form}")))
+
+    def block(self) -> bytes:
+        """Bytes behind their length."""
+        count, self.rest = read_varint(self.rest)
+        return self.take(count)
+
+
+def _read(data: _Bytes) -> TileSettings:
+    flags, *axes = data.numbers("5B")
+    step, quantum, center = data.numbers("3d")
+    low, high = data.numbers("2q" if flags & _WHOLE else "2d")
+    origin = int.from_bytes(data.take(_ORIGIN), "little", signed=True) if flags & _WHOLE else 0
+    offsets = data.numbers("6b" if flags & _TRELLIS else "3b")
+    t, z, y, x = (_read_axis(data, *divmod(axis, 16)) for axis in axes)
+    head = NeighbourHead.from_bytes(data.block()) if flags & _HEAD else None
+    mask = _read_mask(data) if flags & _MASK else None
+    predictor = _read_predictor(data) if flags & _PREDICTOR else None
+    if len(data.rest):
+        raise DamagedFileError("the settings of a coded tile have bytes after their end")
+    return TileSettings(
+        transform=TransformSpec(axes=(t, z, y, x)),
+        step=step,
+        center=center,
+        low=low,
+        high=high,
+        offsets=offsets,
+        double=bool(flags & _DOUBLE),
+        quantum=quantum,
+        head=head,
+        mask=mask,
+        predictor=predictor,
+        clip=bool(flags & _CLIP),
+        labels=bool(flags & _LABELS),
+        trellis=bool(flags & _TRELLIS),
+        origin=origin,
+    )
+
+
+def _read_axis(data: _Bytes, kind: int, depth: int) -> AxisTransform:
+    if kind >= len(KINDS):
+        raise DamagedFileError(f"a coded tile has a transform of kind {kind}")
+    basis = Basis.from_bytes(data.block()) if KINDS[kind] == "klt" else None
+    return AxisTransform(kind=KINDS[kind], depth=depth, basis=basis)
+
+
+def _pack_mask(mask: MaskLevels) -> bytes:
+    count = len(mask.edges)
+    return struct.pack(
+        f"<B{count}dB{count + 1 + len(mask.others)}H",
+        count | (_OTHERS if mask.others else 0),
+        *mask.edges,
+        mask.reach,
+        *mask.scores,
+        *mask.others,
+    )
+
+
+def _read_mask(data: _Bytes) -> MaskLevels:
+    (count,) = data.numbers("B")
+    edges = data.numbers(f"{count % _OTHERS}d")
+    (reach,) = data.numbers("B")
+    scores = data.numbers(f"{len(edges) + 1}H")
+    others = data.numbers(f"{len(edges) + 1}H") if count & _OTHERS else ()
+    return MaskLevels(edges=edges, scores=scores, others=others, reach=reach)
+
+
+def _pack_predictor(predictor: Predictor) -> bytes:
+    order = sum(axis << 2 * place for place, axis in enumerate(predictor.order))
+    weights = encode_block(np.array(predictor.weights, dtype=np.int32).reshape(1, 1, 1, -1))
+    numbers = (predictor.step, predictor.origin, *predictor.levels, order, predictor.reach)
+    return struct.pack("<2d6B", *numbers) + varint(len(weights)) + weights
+
+
+def _read_predictor(data: _Bytes) -> Predictor:
+    step, origin, t, z, y, x, places, reach = data.numbers("2d6B")
+    order = (places & 3, places >> 2 & 3, places >> 4 & 3, places >> 6)
+    count = tap_count((t, z, y, x), order, reach)  # raises for what is no lattice
+    block = decode_block(data.block(), (1, 1, 1, count))
+    return Predictor(
+        step=step,
+        origin=origin,
+        levels=(t, z, y, x),
+        order=order,
+        reach=reach,
+        weights=tuple(block.ravel().tolist()),
+    )
+
+
+def varint(number: int) -> bytes:
+    """The bytes of a whole number from 0 on: seven bits a byte, lowest first (LEB128)."""
+    data = bytearray()
+    while True:
+        data.append(number & 127 | (128 if number > 127 else 0))
+        number >>= 7
+        if not number:
+            return bytes(data)
+
+
+def read_varint(data: memoryview) -> tuple[int, memoryview]:
+    """The number at the start of some bytes, and the bytes after it. Raises DamagedFileError."""
+    number = shift = 0
+    for at, byte in enumerate(data[: _MOST_BITS // 7]):
+        number |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            return number, data[at + 1 :]
+    raise DamagedFileError("a coded tile is cut short")
 
 
 def _check_finite(name: str, value: Any) -> None:
     """Raises InputError unless a setting is a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
         raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
-
-
-def _range(values: Any) -> tuple[Any, Any]:
-    """The ends of a range; `TileSettings` checks that they are numbers. Raises InputError."""
-    if not isinstance(values, list | tuple) or len(values) != 2:
-        raise InputError(_LISTS)
-    return values[0], values[1]
-
-
-def _unpack_head(text: Any) -> NeighbourHead | None:
-    """The head in base64. Raises DamagedFileError."""
-    if text is None:
-        return None
-    try:
-        packed = base64.b64decode(text, validate=True)
-    except (binascii.Error, TypeError, ValueError) as error:
-        raise DamagedFileError("the head is not base64") from error
-    return _head_of(packed)
-
-
-@lru_cache(maxsize=64)
-def _head_of(packed: bytes) -> NeighbourHead:
-    # Decoding a head, and coding it again to check it, takes half of what opening a file does.
-    return NeighbourHead.from_bytes(packed)

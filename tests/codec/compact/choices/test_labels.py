@@ -45,7 +45,7 @@ def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.
     figures = fhash_codec.encode(values, path, config, force=True)
     with fhash_codec.open(path) as volume:
         settings = volume.container.arrays["tables/level_1"].settings
-        used = {name for name in ("labels", "many_labels", "mask") if getattr(settings, name)}
+        used = {name for name in ("labels", "mask") if getattr(settings, name)}
         return figures["bytes"], used, volume[...]
 
 
@@ -117,7 +117,7 @@ def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:
 
         def attempt(costs: list[float] | None, *, labels: bool) -> Attempt:
             sample = Sample(tiled, 1, workers, costs)
-            found = replace(settings, labels=labels, many_labels=labels)
+            found = replace(settings, labels=labels)
             outcome = sample.run(found, coding)
             return Attempt(sample=sample, settings=found, outcome=outcome, coding=coding)
 
@@ -149,12 +149,11 @@ def grains(count: int) -> np.ndarray:
     return values.astype("u2") * 7
 
 
-@pytest.mark.parametrize(("count", "many"), [(256, False), (257, True), (600, True)])
-def test_many_labels_are_a_setting(tmp_path, count, many) -> None:
+@pytest.mark.parametrize("count", [256, 257, 600])
+def test_few_and_many_labels_take_few_bytes(tmp_path, count) -> None:
     values = grains(count)
     size, features, decoded = encoded(tmp_path, values)
     assert "labels" in features
-    assert ("many_labels" in features) is many
     np.testing.assert_array_equal(decoded, values)
     assert 20 * size < values.nbytes
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -78,14 +77,12 @@ def test_one_run_gives_the_bits_of_its_three_steps(
     expected = clip_shifted(transform.inverse(coefficients), center, -20.0, 20.0)
     one, two, *more = (offset / OFFSET_UNIT for offset in offsets)
     six = (one, two, *(more if len(more) > 1 else more * 4))
-    checksum = zlib.crc32(integers.astype("<i4"))
     for in_place in (False, True):
         result = transform.reconstruct(
             integers, (0.75, *six, center, -20.0, 20.0), in_place=in_place
         )
         assert result is not None
-        assert result[0].tobytes() == expected.tobytes()
-        assert result[1] == checksum
+        assert result.tobytes() == expected.tobytes()
 
 
 def test_a_centre_of_minus_zero_takes_three_steps() -> None:

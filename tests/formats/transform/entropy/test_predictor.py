@@ -1,19 +1,15 @@
-"""Settings of a predictor: JSON and back, refusals, and the taps of its passes."""
+"""Settings of a predictor: refusals, and the taps of its passes."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from predictors import Four, predictor_of
 
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
-
-
-def test_a_predictor_survives_json() -> None:
-    predictor = predictor_of((0, 3, 2, 1), (3, 0, 2, 1), 2, step=0.25, origin=-3.5)
-    assert Predictor.from_dict(predictor.to_dict()) == predictor
+from fhash_formats.errors import InputError
+from fhash_formats.transform.entropy.predictor import pass_arrays, passes_of
 
 
 @pytest.mark.parametrize(
@@ -22,29 +18,18 @@ def test_a_predictor_survives_json() -> None:
         {"step": 0.0},
         {"step": "1"},
         {"origin": float("nan")},
-        {"levels": [1, 2, 3]},
-        {"levels": [1, 2, 3, 9]},
-        {"levels": [1, 2, 3, True]},
-        {"order": [0, 1, 2, 2]},
-        {"order": None},
+        {"levels": (1, 2, 3)},
+        {"levels": (1, 2, 3, 9)},
+        {"levels": (1, 2, 3, True)},
+        {"order": (0, 1, 2, 2)},
         {"reach": 3},
         {"reach": 1.0},
-        {"weights": "@"},
-        {"weights": "AAAA"},
-        {"weights": 3},
-        {"more": 1},
+        {"weights": (1, 2)},
     ],
 )
 def test_a_bad_predictor_is_refused(change: dict[str, Any]) -> None:
-    with pytest.raises((InputError, DamagedFileError)):
-        Predictor.from_dict({**predictor_of().to_dict(), **change})
-
-
-def test_a_missing_key_is_named() -> None:
-    values = predictor_of().to_dict()
-    del values["reach"]
-    with pytest.raises(InputError, match="missing key 'reach'"):
-        Predictor.from_dict(values)
+    with pytest.raises(InputError):
+        replace(predictor_of(), **change)
 
 
 def test_taps_are_known_when_they_are_needed() -> None:

@@ -12,8 +12,16 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.labelled import build_labelled_stream, has_regions
-from fhash_formats.transform.tile.sections import MANY
+from fhash_formats.transform.tile.labelled import has_regions, labelled_stream, unpack_labelled
+from fhash_formats.transform.tile.sections import (
+    KIND,
+    LABELS,
+    MASKED,
+    TRANSFORMED,
+    pack_planes,
+    parse_stream,
+)
+from fhash_formats.transform.tile.settings import read_varint, varint
 
 SHAPE = (2, 4, 9, 20)
 LABELLED = replace(SETTINGS, labels=True, quantum=0.0)
@@ -35,7 +43,7 @@ def test_every_type_comes_back_bit_by_bit(dtype: str, own: bool) -> None:
     values = regions(dtype)
     coding = Coding(error=0.0, own_settings=own, keep_missing=False)
     coded = encode_tile(values, LABELLED, coding)
-    assert coded.data[0] >> 5 == 5
+    assert coded.data[4] & KIND == LABELS
     assert coded.decoded.tobytes() == values.tobytes()
     decoded = decode_tile(coded.data, SHAPE, values.dtype, None if own else LABELLED)
     assert decoded.tobytes() == values.tobytes()
@@ -51,7 +59,7 @@ def test_a_mask_is_one_more_label(dtype: str) -> None:
         values[np.isnan(values)] = 9.0
     settings = replace(LABELLED, mask=MaskLevels())
     coded = encode_tile(values, settings, Coding(error=0.0), in_coreset=occupied)
-    assert coded.data[0] >> 5 == 6
+    assert coded.data[4] == LABELS | MASKED
     decoded, mask = decode_tile_mask(coded.data, SHAPE, values.dtype, settings)
     np.testing.assert_array_equal(mask, occupied)
     assert same(decoded, coded.decoded)
@@ -59,14 +67,22 @@ def test_a_mask_is_one_more_label(dtype: str) -> None:
 
 
 @pytest.mark.parametrize(("count", "there"), [(256, True), (257, False)])
-def test_at_most_256_values(count: int, there: bool) -> None:
+def test_the_most_labels_are_kept_and_unoccupied_vertices_take_one(count: int, there: bool) -> None:
     values = (np.arange(600).reshape(1, 1, 20, 30) % count).astype("i4")
-    data = build_labelled_stream(values, None, None)
+    data = labelled_stream(values, None, None, 256)
     assert (data is not None) is there
     if data is not None:
         assert same(decode_tile(data, values.shape, "i4"), values)
-    masked = build_labelled_stream(values, None, np.ones(values.shape, bool))
-    assert masked is None
+    assert labelled_stream(values, None, np.ones(values.shape, bool), 256) is None
+    occupied = np.ones(values.shape, bool)
+    occupied[0, 0, 19] = False
+    masked = labelled_stream(values, None, occupied)
+    assert masked is not None
+    decoded, mask = decode_tile_mask(
+        masked, values.shape, "i4", replace(LABELLED, mask=MaskLevels())
+    )
+    np.testing.assert_array_equal(mask, occupied)
+    np.testing.assert_array_equal(decoded[mask], values[mask])
 
 
 def test_smooth_values_are_not_coded_as_labels() -> None:
@@ -74,20 +90,17 @@ def test_smooth_values_are_not_coded_as_labels() -> None:
     values = np.rint(100 + 90 * np.sin(x / 30) * np.cos(x[:40, None] / 25)).astype("i2")[None, None]
     settings = replace(LABELLED, low=10.0, high=190.0, center=100.0, quantum=0.99, step=1.0)
     coded = encode_tile(values, settings, Coding(error=0.5))
-    assert coded.data[0] >> 5 == 1
+    assert coded.data[4] & KIND == TRANSFORMED
     np.testing.assert_array_equal(coded.decoded, values)
 
 
-def test_damage_is_an_error_or_changes_nothing() -> None:
+def test_damage_is_an_error() -> None:
     values = np.ascontiguousarray(regions("i2")[:1, :2])
-    data = build_labelled_stream(values, None, None)
+    data = labelled_stream(values, None, None)
     assert data is not None
     for damaged in damaged_copies(data):
-        try:
-            decoded = decode_tile(damaged, values.shape, "i2", SETTINGS)
-        except DamagedFileError:
-            continue
-        assert same(decoded, values)
+        with pytest.raises(DamagedFileError):
+            decode_tile(damaged, values.shape, "i2", SETTINGS)
 
 
 @pytest.mark.parametrize("dtype", ["u2", "i4", "u8", "f4", "f8"])
@@ -96,54 +109,35 @@ def test_many_labels_come_back_bit_by_bit(dtype: str) -> None:
     values = numbers.repeat(4, 2).repeat(5, 3).astype(dtype)
     if dtype[0] == "f":
         values[0, 0, 0, :4] = [np.nan, -0.0, np.inf, -np.inf]
-    settings = replace(LABELLED, many_labels=True)
-    coded = encode_tile(values, settings, Coding(error=0.0, keep_missing=False))
-    assert coded.data[0] == 5 << 5 | MANY
-    assert decode_tile(coded.data, values.shape, dtype, settings).tobytes() == values.tobytes()
-
-
-@pytest.mark.parametrize("count", [256, 257])
-def test_many_labels_are_those_above_256(count: int) -> None:
-    values = (np.arange(600).reshape(1, 1, 20, 30) % count).astype("i4")
-    data = build_labelled_stream(values, None, None, many=True)
-    assert data is not None
-    assert bool(data[0] & MANY) is (count > 256)
-    # The label of unoccupied vertices counts.
-    occupied = np.ones(values.shape, bool)
-    occupied[0, 0, 19] = False
-    masked = build_labelled_stream(values, None, occupied, many=True)
-    assert masked is not None
-    assert masked[0] & MANY
-    settings = replace(LABELLED, mask=MaskLevels(), many_labels=True)
-    decoded, mask = decode_tile_mask(masked, values.shape, "i4", settings)
-    np.testing.assert_array_equal(mask, occupied)
-    np.testing.assert_array_equal(decoded[mask], values[mask])
+    coded = encode_tile(values, LABELLED, Coding(error=0.0, keep_missing=False))
+    assert coded.data[4] == LABELS
+    assert decode_tile(coded.data, values.shape, dtype, LABELLED).tobytes() == values.tobytes()
 
 
 @pytest.mark.parametrize(("count", "there"), [(65536, True), (65537, False)])
 def test_at_most_65536_many_labels(count: int, there: bool) -> None:
     values = (np.arange(65600).reshape(1, 1, 200, 328) % count * 3).astype("i4")
-    assert (build_labelled_stream(values, None, None, many=True) is not None) is there
+    assert (labelled_stream(values, None, None) is not None) is there
 
 
 def test_a_palette_of_consecutive_values_takes_few_bytes() -> None:
     values = np.arange(40, 440, dtype="i4").reshape(1, 1, 20, 20).repeat(4, 2).repeat(4, 3)
-    data = build_labelled_stream(values, None, None, many=True)
+    data = labelled_stream(values, None, None)
     assert data is not None
-    assert int.from_bytes(data[7:11], "little") < 40
+    size, rest = read_varint(parse_stream(data).body)
+    assert size == 400
+    assert read_varint(rest)[0] < 40
 
 
-def test_damage_of_many_labels_is_an_error_or_changes_nothing() -> None:
-    values = (np.arange(280).reshape(1, 1, 14, 20) * 5).astype("i2")
-    data = build_labelled_stream(values, None, None, many=True)
-    assert data is not None
-    few = bytes([data[0] & ~MANY]) + data[1:]
-    for damaged in [few, *list(damaged_copies(data))[::7]]:
-        try:
-            decoded = decode_tile(damaged, values.shape, "i2", SETTINGS)
-        except DamagedFileError:
-            continue
-        assert same(decoded, values)
+@pytest.mark.parametrize(
+    ("size", "length", "steps"),
+    [(65537, 1, [1]), (0, 1, []), (2, 1 << 30, [1, 1]), (2, None, [1, 0]), (2, None, [1, 65535])],
+)
+def test_hostile_palettes_are_damage(size: int, length: int | None, steps: list[int]) -> None:
+    packed = pack_planes(np.array(steps, np.uint16))
+    body = varint(size) + varint(len(packed) if length is None else length) + packed
+    with pytest.raises(DamagedFileError):
+        unpack_labelled(memoryview(body), (1, 1, 2, 3), np.dtype("u2"), masked=False)
 
 
 @pytest.mark.parametrize(("equal", "regions"), [(49, False), (50, True)])

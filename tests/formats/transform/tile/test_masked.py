@@ -15,6 +15,7 @@ from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.sections import MASKED
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (2, 3, 12, 17)
@@ -60,7 +61,7 @@ def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: 
     assert np.abs(decoded.astype(float) - values.astype(float))[care].max() <= options.get(
         "error", 4.0
     )
-    assert coded.data[0] >> 5 == 2
+    assert coded.data[4] & MASKED
 
 
 def coded_with(occupied: npt.NDArray[np.bool_] | None) -> CodedTile:
@@ -71,18 +72,18 @@ def test_all_or_nothing_costs_next_to_nothing() -> None:
     values = tile()[0]
     plain = encode_tile(values, replace(SETTINGS, mask=None))
     for care in (None, np.ones(SHAPE, bool)):
-        assert len(coded_with(care).data) == len(plain.data) + 1
+        assert len(coded_with(care).data) <= len(plain.data) + 2
         assert decode_tile_mask(coded_with(care).data, SHAPE, "f4", SETTINGS)[1].all()
     nothing = coded_with(np.zeros(SHAPE, bool))
     decoded, mask = decode_tile_mask(nothing.data, SHAPE, "f4", SETTINGS)
-    assert len(nothing.data) == 1
+    assert len(nothing.data) == 5
     assert not mask.any()
     assert np.isnan(decoded).all()
 
 
 def test_without_a_mask_all_is_occupied_and_the_stream_is_what_it_was() -> None:
     plain = encode_tile(tile()[0], replace(SETTINGS, mask=None))
-    assert plain.data[0] >> 5 == 1
+    assert not plain.data[4] & MASKED
     assert decode_tile_mask(plain.data, SHAPE, "f4", SETTINGS)[1].all()
 
 
@@ -131,14 +132,6 @@ def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
         "exact": exact_tile(values, occupied=care).data,
         "empty": encode_tile(values, SETTINGS, own, in_coreset=np.zeros(small, bool)).data,
     }[name]
-    sound, mask = decode_tile_mask(data, small, "f4")
-    damaged = damaged_copies(data)
-    refused = 0
-    for other in damaged:
-        try:
-            found, other_mask = decode_tile_mask(other, small, "f4")
-            assert np.array_equal(found, sound, equal_nan=True)
-            assert np.array_equal(other_mask, mask)
-        except DamagedFileError:
-            refused += 1
-    assert refused > 0.95 * len(damaged)
+    for other in damaged_copies(data):
+        with pytest.raises(DamagedFileError):
+            decode_tile_mask(other, small, "f4")

@@ -14,7 +14,7 @@ from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.entropy.predictor import Predictor, passes_of
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.sections import EXACT
+from fhash_formats.transform.tile.sections import EXACT, KIND, PREDICTED
 from fhash_formats.transform.tile.settings import TileSettings
 
 Values = npt.NDArray[Any]
@@ -83,7 +83,7 @@ def test_the_bound_is_kept_in_every_type(dtype: str, error: float) -> None:
     values = _values(dtype)
     settings = _settings(values, error)
     coded = encode_tile(values, settings, Coding(error=error))
-    assert not coded.data[0] & EXACT
+    assert coded.data[4] & KIND == PREDICTED
     decoded = decode_tile(coded.data, SHAPE, dtype, settings)
     assert decoded.dtype == values.dtype
     np.testing.assert_array_equal(decoded, coded.decoded)
@@ -94,7 +94,7 @@ def test_the_bound_is_kept_in_every_type(dtype: str, error: float) -> None:
 def test_numbers_that_float64_cannot_hold_are_stored_exactly() -> None:
     values = (np.int64(2**62) + np.arange(np.prod(SHAPE)).reshape(SHAPE)).astype(np.int64)
     coded = encode_tile(values, _settings(values, 1.0), Coding(error=1.0))
-    assert coded.data[0] & EXACT
+    assert coded.data[4] & KIND == EXACT
     np.testing.assert_array_equal(
         decode_tile(coded.data, SHAPE, "int64", _settings(values, 1.0)), values
     )
@@ -132,7 +132,7 @@ def test_a_stream_with_its_own_settings_and_a_mask() -> None:
     np.testing.assert_array_equal(mask, in_coreset)
     assert np.isnan(decoded[~in_coreset]).all()
     assert np.abs(decoded - values)[in_coreset].max() <= 0.5
-    assert TileSettings.from_dict(settings.to_dict()) == settings
+    assert TileSettings.from_bytes(settings.to_bytes()) == settings
 
 
 @pytest.mark.parametrize("lod", [1, 2])
