@@ -17,10 +17,7 @@ from fhash_formats.container import (
     ContainerWriter,
     read_metadata,
 )
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import plain_codecs
 from fhash_formats.container.header import DEFAULTS, LOWEST, MASK_ARRAY, MISSING_ARRAY, STEPS
-from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.variables import (
     ARRAY,
     CONSOLIDATED,
@@ -92,17 +89,6 @@ def test_paths_are_those_of_the_document(tmp_path) -> None:
 def test_defaults_are_those_of_the_document() -> None:
     for key in DEFAULTS:
         assert f"| `{key}` |" in DOCUMENT
-
-
-def test_sharded_array_is_what_the_writer_writes() -> None:
-    values = example("array")
-    metadata = ArrayMetadata.from_dict(values)
-    assert metadata.to_dict() == values
-    assert metadata.grid == (1, 1, 1, 1)
-    assert metadata.inner_grid == (2, 2, 2, 2)
-    inner = values["codecs"][0]["configuration"]
-    assert inner["codecs"] == plain_codecs(metadata.dtype)
-    assert sharding_codecs(inner["chunk_shape"], inner["codecs"]) == values["codecs"]
 
 
 def test_no_key_of_the_example_can_be_left_out_but_defaults() -> None:
