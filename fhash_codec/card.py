@@ -20,7 +20,7 @@ from fhash_codec.paper.model import PaperModel
 from fhash_codec.provenance import metadata_of
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
-from fhash_formats.container.header import MASK_ARRAY, TABLE
+from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.source_metadata import SourceMetadata
@@ -139,19 +139,11 @@ class Card:
         """The bits of all key frames, or what stands in their place."""
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
         arrays = self.container.arrays
-        model = self._model
         names = [str(name) for name in self.container.header["features"]]
-        apart = isinstance(model, PaperModel) and model.features_apart and len(names) > 1
-        own = sum(
-            array.nbytes_stored
-            for name, array in arrays.items()
-            if name.startswith("occupancy/feature_")
-        )
-        for name in ("occupancy/bits", MASK_ARRAY):
+        apart = names if isinstance(self._model, PaperModel) and len(names) > 1 else []
+        for name in (MASK_ARRAY, BITS_ARRAY):
             if name in arrays:
-                place = self._place(name, "")
-                place["bytes"] += own
-                return {"shape": shape, **place, "apart": names if apart else []}
+                return {"shape": shape, **self._place(name, ""), "apart": apart}
         masked = self.container.arrays[TABLE].masked
         coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}

@@ -77,7 +77,7 @@ def encode_dataset(
     names = list(variables) if variables is not None else _all_variables(source)
     configs = _by_name(config, names)
     sources = _Sources(source, open_variable)
-    labels, files = _described(sources, names, configs)
+    files = _files_of(sources, names, configs)
     check_output(path, force, sources=files)
     encoded: dict[str, EncodedVariable] = {}
     stages: dict[str, list[dict[str, Any]]] = {}
@@ -85,7 +85,6 @@ def encode_dataset(
         writer.attributes = json_attributes(getattr(source, "attrs", {}))
         for number, name in enumerate(names):
             told = _of_variable(progress, f"{name}, {number + 1} of {len(names)}")
-            writer.begin(name, labels[name])
             # A function of its own, so that nothing of a variable is held with the next one.
             encoded[name], stages[name] = _encoded(sources, name, writer, configs[name], path, told)
         missed = [name for name in names if encoded[name].missed is not None]
@@ -157,30 +156,28 @@ def _encoded(
     return encoded, clock.to_list()
 
 
-def _described(
+def _files_of(
     sources: _Sources, names: Sequence[str], configs: Mapping[str, EncodeConfig]
-) -> tuple[dict[str, dict[str, Any]], list[str | Path]]:
-    """Attributes that the arrays show, by variable, and the files that are read.
+) -> list[str | Path]:
+    """The files that are read.
 
     Every variable is opened once, so that one that cannot be read is refused before the work.
     """
-    labels: dict[str, dict[str, Any]] = {}
     files: list[str | Path] = []
     for name in names:
         config = configs[name]
         if config.profile == "paper":
             need_torch("profile paper")
             choose_device(config.device)
-        labels[name], read = _looked_at(sources, name)
-        files += [*read, *mask_files(config)]
-    return labels, files
+        # A function of its own, so that nothing of a variable is held with the next one.
+        files += [*_read_from(sources, name), *mask_files(config)]
+    return files
 
 
-def _looked_at(sources: _Sources, name: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
-    """Attributes that the array of a variable shows, and the files that it is read from."""
+def _read_from(sources: _Sources, name: str) -> tuple[Path, ...]:
+    """The files that a variable is read from."""
     with sources.opened(name) as series:
-        units = {"units": str(series.units)} if series.units else {}
-        return {**series.attributes, **units}, tuple(series.files)
+        return tuple(series.files)
 
 
 def _by_name(config: Configs | None, names: Sequence[str]) -> dict[str, EncodeConfig]:

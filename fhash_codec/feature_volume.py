@@ -65,20 +65,16 @@ def only_features(volume: Volume, features: Sequence[str]) -> Volume:
     if set(numbers) == set(range(len(_names(volume)))):
         return volume
     if not holds_features_apart(volume):
-        reason = (
-            "it is from a version that did not keep them apart; encode it again"
-            if volume.profile == "paper"
-            else "encode with --profile paper, which keeps several features apart"
-        )
         raise InputError(
-            f"{volume.path}: its features are merged, none can be taken alone; {reason}"
+            f"{volume.path}: its features are merged, none can be taken alone; "
+            "encode with --profile paper, which keeps several features apart"
         )
     return FeatureVolume(volume.container, numbers, fill=volume._asked_fill)
 
 
 def holds_features_apart(volume: Volume) -> bool:
     """Whether a file keeps the occupancy of each of its features."""
-    return isinstance(volume._model, PaperModel) and volume._model.features_apart
+    return isinstance(volume._model, PaperModel)
 
 
 def _numbers(volume: Volume, features: Sequence[str]) -> tuple[int, ...]:

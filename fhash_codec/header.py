@@ -6,7 +6,7 @@ Each profile adds what it alone knows, such as its model.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.occupancy import write_bits
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.provenance import date_of, source_parts
@@ -28,13 +29,10 @@ from fhash_formats.container import (
     ContainerWriter,
     describe_coordinates,
 )
-from fhash_formats.container.header import HISTORY, MISSING, NOT_STORED, STEP_FIGURES
+from fhash_formats.container.header import HISTORY, MISSING_ARRAY, NOT_STORED, STEP_FIGURES
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 from fhash_formats.support.number_types import is_within
-
-MISSING_CHUNK_BYTES = 1 << 20
-"""Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
 
 MAX_POINTS = 24
 """Points of a training history that a file of the profile paper keeps at most."""
@@ -44,9 +42,6 @@ HEAD_POINTS = 8
 
 DIGITS = 6
 """Significant digits of a figure over all steps."""
-
-OUTSIDE = MISSING[0]
-"""Value of the header's `missing`: the vertices outside the coreset are those without a value."""
 
 GAIN = ("what", "bytes", "seconds")
 """Entries of a list in `model.gains`, in this order; the last one is left out with the times."""
@@ -101,39 +96,52 @@ def describe_source(
     }
 
 
-def begin_variable(writer: ContainerWriter, variable: Mapping[str, Any]) -> None:
-    """Begin the variable of a header entry, in a file of its own."""
-    units = {"units": variable["units"]} if variable["units"] else {}
-    writer.begin(variable["name"], {**variable["attributes"], **units})
-
-
 def write_series(
     writer: ContainerWriter,
     series: Series,
     scanned: Scan,
     key_frames: Sequence[int],
     *,
-    variable: Mapping[str, Any],
-    brief: bool = False,
     everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
-    variable: header entry after which the table is named, unless the writer has begun it.
-    brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows, but for the coordinates of one of several variables, which share their arrays.
-    everything: all finite values are in the coreset of every step, so that its mask says
-    which are missing. Returns the header entries that then stand for the arrays.
+    The writer begins the variable of the series. Each array that the header can say in fewer bytes
+    is left out, but for the coordinates of one of several variables, which share their arrays.
+    Returns the header's `coordinates`, which stand for these arrays.
+
+    Args:
+        writer: of the container.
+        series: what is encoded.
+        scanned: its values that are not finite.
+        key_frames: steps of the key frames.
+        everything: whether the coreset of each step says which values are not finite, where every
+            step is a key frame: all others are in it, and are read from there.
     """
     coords = _storable_coords(series)
-    if not writer.begun:
-        begin_variable(writer, variable)
+    writer.begin(describe_variable(series))
     described = {}
     if not writer.one_of_several:
         names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
-        described = describe_coordinates(coords, names) if brief else {}
+        described = describe_coordinates(coords, names)
     for name, array in source_parts(series, coords, {})[1].items():
         writer.add_whole(name, array)
+    write_coordinates(writer, coords, described)
+    every_step = len(key_frames) == series.shape[0]
+    if not every_step:
+        writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
+    if scanned.missing and not (everything and every_step):
+        write_missing(writer, series.shape, scanned)
+    return {"coordinates": described}
+
+
+def write_coordinates(
+    writer: ContainerWriter, coords: Mapping[str, Coordinate], described: Collection[str] = ()
+) -> None:
+    """Write an array for each axis whose positions do not stand in the header.
+
+    coords: a coordinate for each of "t", "z", "y" and "x". described: the axes in the header.
+    """
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = coords[axis]
@@ -142,14 +150,6 @@ def write_series(
                 coordinate.values,
                 attributes={**coordinate.attributes, "name": coordinate.name},
             )
-    if not brief or len(key_frames) < series.shape[0]:
-        writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
-    if not scanned.missing:
-        return {"coordinates": described} if brief else {}
-    if brief and everything and len(key_frames) == series.shape[0]:
-        return {"coordinates": described, "missing": OUTSIDE}
-    write_missing(writer, series.shape, scanned)
-    return {"coordinates": described} if brief else {}
 
 
 def _storable_coords(series: Series) -> dict[str, Coordinate]:
@@ -167,24 +167,13 @@ def _storable(coordinate: Coordinate) -> Coordinate:
 
 
 def write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
-    """Write one row of bits per step, 1 = not finite, several rows to a chunk."""
-    steps = shape[0]
+    """Write one row of bits per step, 1 = not finite."""
     empty = np.zeros(-(-prod(shape[1:]) // 8), dtype=np.uint8)
-    rows = max(1, min(steps, MISSING_CHUNK_BYTES // empty.size))
-    writer.add_array(
-        "missing/bits",
-        shape=(steps, empty.size),
-        dtype=empty.dtype,
-        chunk_shape=(rows, empty.size),
-        chunks=(
-            np.stack(
-                [
-                    scanned.missing.get(step, empty)
-                    for step in range(start, min(start + rows, steps))
-                ]
-            )
-            for start in range(0, steps, rows)
-        ),
+    write_bits(
+        writer,
+        MISSING_ARRAY,
+        (shape[0], empty.size),
+        lambda step: scanned.missing.get(step, empty),
     )
 
 
@@ -193,7 +182,7 @@ def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray
 
     None if every value of the source is finite.
     """
-    stored = container.arrays.get("missing/bits")
+    stored = container.arrays.get(MISSING_ARRAY)
     if stored is None:
         return None
     _, y, x = container.header["domain"]["shape"][1:]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -19,20 +18,18 @@ import numpy.typing as npt
 from fhash_codec.compact.plain import correction_of, correction_type, predicted
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import pack, packed_bytes
-from fhash_codec.header import begin_variable
+from fhash_codec.coreset.occupancy import pack, packed_bytes, write_bits
+from fhash_codec.header import write_coordinates
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
-from fhash_codec.paper.storage import BITS, feature_bits
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
-from fhash_formats.container.header import MASK_ARRAY, PLAIN_FEATURE, STEPS
+from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, SPARSE, STEPS
 from fhash_formats.container.source_entry import AUXILIARY
-from fhash_formats.container.sparse import SPARSE
+from fhash_formats.container.variables import COORDINATES
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.atomic import check_output
 from fhash_formats.support.slabs import chunk_region, slab_shape
 from fhash_formats.transform.head.head import NeighbourHead
@@ -95,7 +92,7 @@ class _Export:
         self._volume, self._writer, self._progress = volume, writer, progress
         self._arrays = volume.container.arrays
         self._header = volume.container.header
-        begin_variable(writer, self._header["variable"])
+        writer.begin(self._header["variable"])
         names = [coordinate.name for coordinate in volume.coords.values()]
         writer.name_axes(names, volume.shape)
         self._done, self._total = 0, 1
@@ -113,18 +110,18 @@ class _Export:
         copied = {
             name: array
             for name, array in self._arrays.items()
-            if not f"{name}/".startswith(rewritten)
+            if not f"{name}/".startswith((*rewritten, COORDINATES))
         }
         keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
         self._total = sum(prod(array.grid) for array in copied.values()) + keys
         self._total += sum(map(_chunk_count, coded))
+        write_coordinates(self._writer, self._volume.coords)
         for name, array in copied.items():
             self._copy(name, array)
         for table in coded:
             self._write_table(table)
         if keys:
             self._write_occupancy(keys)
-            self._write_features_apart(keys)
         tables, mlp = self._volume.tables, self._volume.mlp
         changed = {
             "tables": coded[0].dtype.name if coded else model["tables"],
@@ -132,6 +129,7 @@ class _Export:
         }
         return {
             **self._header,
+            "coordinates": {},
             "model": {key: model[key] for key in model if key != SPARSE} | changed,
             "required_features": [],
         }
@@ -249,13 +247,7 @@ class _Export:
 
     def _write_axes(self) -> None:
         """Write positions and key frames as arrays, and arrays of the source beside the values."""
-        for axis, stored in AXIS_NAMES.items():
-            coordinate = self._volume.coords[axis]
-            self._writer.add_whole(
-                f"coords/{stored}",
-                coordinate.values,
-                attributes={**coordinate.attributes, "name": coordinate.name},
-            )
+        write_coordinates(self._writer, self._volume.coords)
         key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
         self._writer.add_whole("key_frames", key_frames)
         for name, array in self._arrays.items():
@@ -278,44 +270,21 @@ class _Export:
                 self._writer.add_whole(f"mlp/{name}_{number}", values, attributes=attributes)
 
     def _write_occupancy(self, keys: int) -> None:
-        """Write the bits of every key frame."""
-        region = Box.of_shape(self._volume.box.shape)
-        self._write_bits(BITS, keys, lambda key: self._volume._model.occupied(key, key, region))
+        """Write the bits of every key frame, in the profile paper those of each feature."""
+        model, box = self._volume._model, self._volume.box.shape
+        region = Box.of_shape(box)
+        count = len(self._header["features"]) if isinstance(model, PaperModel) else 1
 
-    def _write_features_apart(self, keys: int) -> None:
-        """Write the bits of each feature, if the numbers of the coded occupancy tell them apart."""
-        model = self._volume._model
-        assert isinstance(model, PaperModel), "other profiles merge features"
-        count = len(self._header["features"])
-        if feature_bits(1) in self._arrays or count < 2 or not model.features_apart:
-            return
-        self._total += keys * count
-        region = Box.of_shape(self._volume.box.shape)
-
-        def read(numbers: tuple[int, ...], key: int) -> npt.NDArray[np.bool_]:
-            return model.occupied_by(numbers, key, key, region)
-
-        for number in range(count):
-            self._write_bits(feature_bits(number + 1), keys, partial(read, (number,)))
-
-    def _write_bits(
-        self, name: str, keys: int, occupied: Callable[[int], npt.NDArray[np.bool_]]
-    ) -> None:
-        """Write an array of bits. occupied: key frame -> vertices (z, y, x) of the box."""
-
-        def chunks() -> Iterator[npt.NDArray[Any]]:
-            for key in range(keys):
-                yield pack(occupied(key))[np.newaxis]
+        def row(feature: int, key: int) -> npt.NDArray[np.uint8]:
+            if isinstance(model, PaperModel):
+                occupied = model.occupied_by((feature,), key, key, region)
+            else:
+                occupied = model.occupied(key, key, region)
+            if feature + 1 == count:
                 self._tick("occupancy")
+            return pack(occupied)
 
-        size = packed_bytes(self._volume.box.shape)
-        self._writer.add_array(
-            name,
-            shape=(keys, size),
-            dtype=np.uint8,
-            chunk_shape=(1, size),
-            chunks=chunks(),
-        )
+        write_bits(self._writer, BITS_ARRAY, (count, keys, packed_bytes(box)), row)
 
     def _write_corrections(self, array: StoredArray, head: NeighbourHead | None) -> None:
         """Write what takes the output of the head to the decoded values, if that is anything."""

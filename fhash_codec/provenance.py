@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_formats.container import SOURCE, Container, describe_metadata, read_metadata
-from fhash_formats.container.defaults import CONFIG_DEFAULTS
+from fhash_formats.container.header import CONFIG_DEFAULTS
 from fhash_formats.series import AXES, Coordinate, Series
 from fhash_formats.source_metadata import SourceMetadata, with_history
 

@@ -14,7 +14,6 @@ from fhash_codec.card import Card
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.header import OUTSIDE as OUTSIDE_IS_MISSING
 from fhash_codec.header import describe_file, read_missing
 from fhash_codec.indexing import checked_region, coarse_vertices, shared_part
 from fhash_codec.measure.value_range import ValueRange
@@ -24,6 +23,7 @@ from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
+from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 from fhash_formats.support.number_types import exact_number
@@ -105,7 +105,8 @@ class Volume(Card, ArrayLike):
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = exact_number(header["background"])
-        self._outside_is_missing = header.get("missing") == OUTSIDE_IS_MISSING
+        every_step = header["model"]["levels"][0][0] == self.shape[0]
+        self._outside_is_missing = every_step and EVERYTHING in header["features"]
         self._model = open_model(container)
         self.chunks = self._model.chunks
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from fhash_codec.appending.figures import Figures
 from fhash_codec.appending.layers import CodedLayer, LayerCoder
-from fhash_codec.header import begin_variable
+from fhash_codec.header import write_coordinates
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import StoredArray, describe_coordinates
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
 from fhash_formats.container.header import NOT_STORED, TABLE
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
+from fhash_formats.series import AXES, MAX_SPANS, Coordinate, NotStored
 
 __all__ = ["GrowingFile"]
 
@@ -140,19 +140,12 @@ class GrowingFile:
         self._container.describe(self._array, self.steps)
         coords = {**self._coords, "t": self._time()}
         described = describe_coordinates(coords, names)
-        for axis, stored in AXIS_NAMES.items():
-            if stored not in described:
-                coordinate = coords[axis]
-                self._container.add_whole(
-                    f"coords/{stored}",
-                    coordinate.values,
-                    attributes={**coordinate.attributes, "name": coordinate.name},
-                )
+        write_coordinates(self._container, coords, described)
         self._container.publish(self._full_header(described), mark)
 
     def _name(self, frame: Sequence[int]) -> list[str]:
         """Name the arrays; the names of the axes, which stay the same for any number of steps."""
-        begin_variable(self._container, self._header["variable"])
+        self._container.begin(self._header["variable"])
         coordinates = [self._coords[axis].name for axis in AXES]
         return self._container.name_axes(coordinates, (self.steps, *frame))
 

@@ -18,7 +18,7 @@ from fhash_codec.appending.parts import COLUMNS, COUNTS, ERRORS, PART, WHOLE, co
 from fhash_codec.compact.tiles_to_promise import all_tiles
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
-from fhash_codec.header import begin_variable, brief_quality, write_series
+from fhash_codec.header import brief_quality, write_series
 from fhash_codec.measure.metrics import Comparer
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -257,8 +257,15 @@ def _read(part: _Piece, place: tuple[int, ...]) -> bytes:
 class _Positions(Series):
     """The labels of the whole series; its values are in the parts."""
 
-    def __init__(self, shape: tuple[int, int, int, int], coords: Mapping[str, Coordinate]) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, int, int, int],
+        coords: Mapping[str, Coordinate],
+        variable: Mapping[str, Any],
+    ) -> None:
         self.source, self.shape, self.coords = "parts", shape, coords
+        self.name, self.units = variable["name"], variable["units"]
+        self.attributes, self.dtype = variable["attributes"], np.dtype(variable["dtype"])
 
     def read(self, step: int) -> npt.NDArray[Any]:
         raise InputError("a series of parts has labels alone")
@@ -285,19 +292,11 @@ class _Whole:
         scan = Scan(
             value_range=ValueRange(low, high), mean=low, finite_count=0, missing=self._missing()
         )
-        series = _Positions(self.shape, self._coords())
-        begin_variable(writer, header["variable"])
+        series = _Positions(self.shape, self._coords(), header["variable"])
+        described = write_series(writer, series, scan, range(self.shape[0]))
         for name, array in first.container.arrays.items():
             if name.startswith(WHOLE):
                 writer.add_whole(name.removeprefix(WHOLE), array.read())
-        described = write_series(
-            writer,
-            series,
-            scan,
-            range(self.shape[0]),
-            variable=header["variable"],
-            brief=True,
-        )
         table = TableParts(
             shape=(self.shape[0], *first.table.shape[1:]),
             dtype=first.table.dtype,

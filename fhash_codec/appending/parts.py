@@ -27,15 +27,12 @@ from fhash_codec.comparison import measure, ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.container_name import check_name
 from fhash_codec.coreset.extent import Extent, packed_masks
-from fhash_codec.coreset.features import Everything, resolve_features
+from fhash_codec.coreset.features import resolve_features
 from fhash_codec.coreset.scan import Scan, scan_steps
 from fhash_codec.coreset.selection import Source, mask_files, open_source
 from fhash_codec.header import (
-    OUTSIDE,
-    begin_variable,
     brief_quality,
     describe_source,
-    describe_variable,
     write_series,
 )
 from fhash_codec.measure.metrics import Comparison
@@ -47,7 +44,7 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import SOURCE, ContainerWriter
-from fhash_formats.container.header import NOT_STORED
+from fhash_formats.container.header import EVERYTHING, NOT_STORED
 from fhash_formats.container.table_parts import TableParts
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series, StepsSeries
@@ -256,10 +253,6 @@ class _Job:
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""
         plan, steps = self.plan, StepsSeries(self.series, self.steps)
-        everything = str(Everything()) in plan.features
-        variable = describe_variable(self.series)
-        begin_variable(writer, variable)
-        source = self._write_source(writer)
         value_range = plan.value_range
         scanned = Scan(
             value_range=value_range,
@@ -272,12 +265,9 @@ class _Job:
             steps,
             scanned,
             range(len(self.steps)),
-            variable=variable,
-            brief=True,
-            everything=everything,
+            everything=EVERYTHING in plan.features,
         )
-        if everything and plan.has_missing:
-            described["missing"] = OUTSIDE
+        source = self._write_source(writer)
         parts = TableParts(
             shape=(len(self.steps), *blocks.shape[1:]),
             dtype=blocks.source_dtype,

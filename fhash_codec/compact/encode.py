@@ -71,8 +71,6 @@ def encode_compact(
             series,
             selection.scanned,
             selection.extent.key_frames,
-            variable=source["variable"],
-            brief=True,
             everything=any(isinstance(feature, Everything) for feature in selection.features),
         )
     mark = writer.mark()

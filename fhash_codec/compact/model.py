@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fhash_codec.compact.parts import CompactTable, head_mlp, level_count, read_coarse
 from fhash_codec.compact.plain import PlainArray
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import unpack
+from fhash_codec.coreset.occupancy import read_occupancy
 from fhash_codec.model_parts import Mlp, Table
 from fhash_formats.container import Container
 from fhash_formats.container.header import PLAIN_FEATURE
@@ -31,6 +31,7 @@ class CompactModel:
     """
 
     def __init__(self, container: Container) -> None:
+        self._container = container
         self._arrays = container.arrays
         self._table = self._arrays["tables/level_1"]
         self._plain: PlainArray | None = None
@@ -68,10 +69,7 @@ class CompactModel:
         steps, space = slice(first, end), region.slices()
         if self._plain is None:
             return self._table.read_mask((steps, *space))
-        stored = self._arrays["occupancy/bits"]
-        z, y, x = self._array.shape[1:]
-        rows = stored.read((steps, slice(0, stored.shape[1])))
-        return np.stack([unpack(bits, (z, y, x))[space] for bits in rows])
+        return read_occupancy(self._container, first, end)[:, *space]
 
     def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         """Return the values (z, y, x) of a region of the box at a step.

@@ -72,6 +72,11 @@ class Coreset:
     fringe: npt.NDArray[np.bool_] | None = None
 
     @property
+    def grids(self) -> tuple[tuple[npt.NDArray[np.uint8], ...], ...]:
+        """Grids of each feature at each key frame, as `occupancy` has those of all together."""
+        return self.apart or (self.occupancy,)
+
+    @property
     def counts(self) -> npt.NDArray[np.int64]:
         """Samples of each brick without those of the fringe, int64 (n,)."""
         if self.fringe is None:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.scan import finite_values
 from fhash_codec.measure.value_range import ValueRange, pieces
 from fhash_codec.progress import Progress
+from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 from fhash_formats.support.number_types import exact_number, is_wide_integer
@@ -65,7 +66,7 @@ class Everything(Feature):
         return np.isfinite(frame)
 
     def __str__(self) -> str:
-        return "all"
+        return EVERYTHING
 
 
 @dataclass(frozen=True)

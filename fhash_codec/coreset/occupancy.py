@@ -9,10 +9,17 @@ Source: the paper, Feature Dilation and Rendering.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
+
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY
+
+CHUNK_BYTES = 1 << 20
+"""Bytes of one chunk of an array of bits. A member for each row would cost 130 bytes."""
 
 Shape = tuple[int, int, int]
 """Vertices per axis, (z, y, x)."""
@@ -86,6 +93,64 @@ def unpack(bits: Bits, shape: Shape) -> npt.NDArray[np.bool_]:
         vertices = mask[z :: steps[0], y :: steps[1], x :: steps[2]]
         vertices[...] = (blocks[_corner(vertices)] >> (7 - place)) & 1
     return mask.view(np.bool_)
+
+
+def write_bits(
+    writer: ContainerWriter, name: str, shape: Sequence[int], row: Callable[..., Bits]
+) -> None:
+    """Write an array (..., rows, bytes) of bits, several rows to a chunk.
+
+    row: gives the bytes of a row by its indices.
+    """
+    *outer, rows, size = shape
+    together = max(1, min(rows, CHUNK_BYTES // size))
+
+    def chunks() -> Iterator[Bits]:
+        for index in np.ndindex(*outer):
+            for start in range(0, rows, together):
+                numbers = range(start, min(start + together, rows))
+                chunk = np.stack([row(*index, number) for number in numbers])
+                yield chunk.reshape((1,) * len(outer) + chunk.shape)
+
+    writer.add_array(
+        name,
+        shape=shape,
+        dtype=np.uint8,
+        chunk_shape=(*(1 for _ in outer), together, size),
+        chunks=chunks(),
+    )
+
+
+def read_bits(
+    container: Container, first: int, end: int, features: Sequence[int] | None = None
+) -> npt.NDArray[np.uint8]:
+    """Grids (key frames, bytes) of `occupancy/bits` from a key frame to before another.
+
+    features: numbers of the features, counted from 0, whose union is taken; None for all.
+    """
+    stored = container.arrays[BITS_ARRAY]
+    count, _, size = stored.shape
+    numbers = range(count) if features is None else features
+    rows = (stored.read((slice(n, n + 1), slice(first, end), slice(0, size)))[0] for n in numbers)
+    return cast("npt.NDArray[np.uint8]", np.bitwise_or.reduce(list(rows)))
+
+
+def read_occupancy(
+    container: Container, first: int, end: int, features: Sequence[int] | None = None
+) -> npt.NDArray[np.bool_]:
+    """Mask (key frames, z, y, x) of the box from a key frame to before another.
+
+    The file has `occupancy/bits` or `occupancy/mask`. Arguments are those of `read_bits`.
+    """
+    z, y, x = container.header["model"]["levels"][0][1:]
+    if MASK_ARRAY not in container.arrays:
+        return np.stack(
+            [unpack(bits, (z, y, x)) for bits in read_bits(container, first, end, features)]
+        )
+    space = (slice(0, z), slice(0, y), slice(0, x))
+    numbers = container.arrays[MASK_ARRAY].read((slice(first, end), *space))
+    chosen = range(len(container.header["features"])) if features is None else features
+    return np.asarray(numbers & np.uint8(sum(1 << number for number in set(chosen))) != 0)
 
 
 def _shape(mask: npt.NDArray[np.bool_]) -> Shape:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.header import brief_history, describe_source, describe_variable, write_series
+from fhash_codec.header import brief_history, describe_source, write_series
 from fhash_codec.paper.levels import parameter_count
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
@@ -19,7 +19,7 @@ from fhash_codec.paper.training.rounds import Goal
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.sparse import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
+from fhash_formats.container.header import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
 from fhash_formats.series import Series
 
 SPARSE_BELOW = 0.5
@@ -62,13 +62,7 @@ def encode_paper(
     goal = _goal(selection, series, config)
     trained = train_model(coreset, architecture, config, path, progress, goal)
     with stage("writing", "coordinates, masks, tables, network and header"):
-        write_series(
-            writer,
-            series,
-            selection.scanned,
-            coreset.key_frames,
-            variable=describe_variable(series),
-        )
+        described = write_series(writer, series, selection.scanned, coreset.key_frames)
     loss, vertices = None, parameter_count(architecture.levels, 1)
     if config.tables == "transform":
         with stage("tables", "--tables transform: coded at a loss that the promise allows"):
@@ -85,7 +79,7 @@ def encode_paper(
                 sparse=sparse_tables(coreset, config),
             )
             write_model(writer, coreset, trained.layers)
-    header = _header(series, selection, trained, config, vertices)
+    header = _header(series, selection, trained, config, vertices) | described
     if sparse_tables(coreset, config):
         header["required_features"] = [SPARSE_FEATURE]
     if loss is not None:

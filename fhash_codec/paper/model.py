@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.occupancy import read_occupancy
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.model_parts import CORNERS, Mlp, Table
 from fhash_codec.paper.network import Network
 from fhash_codec.paper.points import sample_points
 from fhash_codec.paper.regions import decode_region
-from fhash_codec.paper.storage import features_apart, load_network, read_occupancy
+from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError
 
@@ -36,7 +37,7 @@ class PaperModel:
         self._range = ValueRange(*header["value_range"])
         self._box = Box.of(header["feature_bounding_box"])
         self.chunks: tuple[int, ...] = (1, *header["domain"]["shape"][1:])
-        self._occupancy = lru_cache(maxsize=4)(partial(read_occupancy, container))
+        self._occupancy = lru_cache(maxsize=4)(partial(_merged, container))
 
     @cached_property
     def network(self) -> Network:
@@ -60,18 +61,13 @@ class PaperModel:
         """Return which vertices (z, y, x) of a region are in the coreset at either key frame."""
         return self._occupancy(first, last)[region.slices()]
 
-    @property
-    def features_apart(self) -> bool:
-        """Whether the file has the occupancy of each of its features."""
-        return features_apart(self._container)
-
     def occupied_by(
         self, features: tuple[int, ...], first: int, last: int, region: Box
     ) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset for some features.
 
         Args:
-            features: their numbers, counted from 0; those of a file with `features_apart`.
+            features: their numbers, counted from 0.
             first, last: neighbouring key frames, or the same key frame twice.
             region: the region.
         """
@@ -105,3 +101,14 @@ class PaperModel:
         return self._range.from_unit(unit), slopes.astype(np.float64) * (
             self._range.high - self._range.low
         )
+
+
+def _merged(
+    container: Container, first: int, last: int, features: tuple[int, ...] | None = None
+) -> npt.NDArray[np.bool_]:
+    """Return which vertices (z, y, x) of the box are in the coreset at either of two key frames.
+
+    `features` are the numbers of those whose coresets are taken, or None for all.
+    """
+    frames = read_occupancy(container, first, last + 1, features)
+    return np.asarray(frames[0] | frames[-1])

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.coreset.occupancy import Bits, read_bits, write_bits
 from fhash_codec.model_parts import TABLE_AXES
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.fringe import fringe_step, round_fringe
@@ -26,90 +26,30 @@ from fhash_codec.paper.number_type import NumberType
 from fhash_codec.paper.tables.needed import Needed, needed_by
 from fhash_codec.paper.tables.sparse_table import SparseTable, write_sparse
 from fhash_formats.container import Container, ContainerWriter, StoredArray
-from fhash_formats.container.header import MASK_ARRAY
-from fhash_formats.container.sparse import COUNTS, FRINGE
+from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE
 from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20
 """Bytes of the largest chunk of a table. Each chunk has a fixed cost; reads decode whole chunks."""
 GRIDS = 16
 """Key frames whose packed occupancy stays in memory while needed vertices are looked up."""
-BITS = "occupancy/bits"
-"""Array of the occupancy as bits."""
-MASK_BITS = 8
-"""Largest number of features that the numbers of the coded occupancy tell apart."""
-MASK_FEATURE_BITS = "feature_bits"
-"""Attribute of the coded occupancy that is true where its numbers have a bit for each feature."""
 
 
 def write_model(
     writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Floats, Floats]]
 ) -> None:
-    """Write the occupancy of a coreset and of its features, and the layers (weight, bias)."""
+    """Write the occupancy of the features of a coreset, and the layers (weight, bias)."""
     for number, (weight, bias) in enumerate(layers, start=1):
         writer.add_whole(f"mlp/weight_{number}", weight)
         writer.add_whole(f"mlp/bias_{number}", bias)
-    _write_bits(writer, BITS, coreset.occupancy)
-    write_features_apart(writer, coreset)
+    write_occupancy(writer, coreset)
 
 
-def write_features_apart(writer: ContainerWriter, coreset: Coreset) -> None:
-    """Write the occupancy of each feature as bits, if there are several features."""
-    for number, grids in enumerate(coreset.apart, start=1):
-        _write_bits(writer, feature_bits(number), grids)
-
-
-def _write_bits(writer: ContainerWriter, name: str, grids: Sequence[npt.NDArray[np.uint8]]) -> None:
-    bits = np.stack(grids)
-    writer.add_whole(name, bits, chunk_shape=(1, bits.shape[1]))
-
-
-def feature_bits(number: int) -> str:
-    """Return the name of the array of a feature's occupancy; features count from 1."""
-    return f"occupancy/feature_{number}"
-
-
-def features_apart(container: Container) -> bool:
-    """Return whether a file of the profile paper has the occupancy of each of its features."""
-    arrays = container.arrays
-    numbers = range(1, len(container.header["features"]) + 1)
-    return _has_feature_bits(container) or all(feature_bits(number) in arrays for number in numbers)
-
-
-def read_occupancy(
-    container: Container, first: int, last: int, features: Sequence[int] | None = None
-) -> npt.NDArray[np.bool_]:
-    """Return which vertices (z, y, x) of the box are in the coreset at either of two key frames.
-
-    Args:
-        container: a file of the profile paper.
-        first, last: neighbouring key frames, or the same key frame twice.
-        features: numbers of features, counted from 0, whose coresets are taken; all if left out.
-            Others need a file with `features_apart`.
-    """
-    arrays = container.arrays
-    box = Box.of(container.header["feature_bounding_box"]).shape
-    if MASK_ARRAY in arrays and (features is None or _has_feature_bits(container)):
-        space = tuple(slice(0, length) for length in box)
-        mask = arrays[MASK_ARRAY].read((slice(first, last + 1), *space))
-        bits = 0xFF if features is None else sum(1 << number for number in features)
-        return np.asarray(((mask[0] | mask[-1]) & np.uint8(bits)) != 0)
-    names = [BITS] if features is None else [feature_bits(number + 1) for number in features]
-    merged = np.zeros(arrays[names[0]].shape[1], np.uint8)
-    for name in names:
-        stored = arrays[name].read((slice(first, last + 1), slice(0, len(merged))))
-        merged |= occupancy.between(stored[0], stored[-1])
-    return occupancy.unpack(merged, box)
-
-
-def _has_feature_bits(container: Container) -> bool:
-    """Return whether the numbers of the coded occupancy have a bit for each feature."""
-    mask = container.arrays.get(MASK_ARRAY)
-    return (
-        mask is not None
-        and mask.attributes.get(MASK_FEATURE_BITS) is True
-        and len(container.header["features"]) <= MASK_BITS
-    )
+def write_occupancy(writer: ContainerWriter, coreset: Coreset) -> None:
+    """Write the occupancy of each feature of a coreset as bits."""
+    grids = coreset.grids
+    shape = (len(grids), len(coreset.occupancy), len(coreset.occupancy[0]))
+    write_bits(writer, BITS_ARRAY, shape, lambda feature, key: grids[feature][key])
 
 
 def write_tables(
@@ -326,10 +266,9 @@ def _needed(container: Container) -> Needed:
     model = container.header["model"]
 
     @lru_cache(maxsize=GRIDS)
-    def grid(key: int) -> occupancy.Bits:
-        bits = container.arrays[BITS]
-        row: occupancy.Bits = bits.read((slice(key, key + 1), slice(0, bits.shape[1])))[0]
-        return row
+    def grid(key: int) -> Bits:
+        bits: Bits = read_bits(container, key, key + 1)[0]
+        return bits
 
     levels = [tuple(level) for level in model["levels"]]
     return Needed(levels, grid, fringe=model.get("sparse") == FRINGE)

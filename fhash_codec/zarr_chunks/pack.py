@@ -19,9 +19,7 @@ from fhash_codec.container_name import check_name
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.dataset_encoding import encodable
 from fhash_codec.header import (
-    OUTSIDE,
     describe_source,
-    describe_variable,
     write_missing,
     write_series,
 )
@@ -116,16 +114,12 @@ def _write_several(
     writer: ContainerWriter, job: _Job, names: Sequence[str], figures: dict[str, Any]
 ) -> int:
     """Write several variables, and add the figures of each; the bytes of the file."""
-    labels = {}
     for name in names:
         # Every variable is opened once, so that one that cannot be taken is refused at once.
         with job.opened(name) as (series, _):
-            units = {"units": str(series.units)} if series.units else {}
-            labels[name] = {**series.attributes, **units}
             metadata = series.metadata
     writer.attributes = {} if metadata is None else json_attributes(metadata.attributes)
     for number, name in enumerate(names, start=1):
-        writer.begin(name, labels[name])
         with job.opened(name) as (series, array):
             note = f"{name}, {number} of {len(names)}"
             header, figures[name] = job.write(writer, series, array, note)
@@ -160,8 +154,6 @@ class _Job:
             series,
             nothing,
             range(series.shape[0]),
-            variable=describe_variable(series),
-            brief=True,
         )
         tiles = Tiles(array, series.source, fill_absent=self.absent == "fill")
         total = len(tiles)
@@ -231,13 +223,11 @@ def _header(
     if settings is not None and settings.head is not None:
         weights = settings.head.size
         head = {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
-    masked = facts.occupied < prod(array.shape)
     bound = {name: array.quality[name] for name in ("max_error",) if name in array.quality}
     encoder = {**source["encoder"], "command": PACKED}
     return {
         **source,
         **described,
-        **({"missing": OUTSIDE} if masked else {}),
         "required_features": ["transform"],
         "encoder": {**encoder, **({"codec": array.quality} if array.quality else {})},
         "background": exact_number(_in_type(scan.mean, array.dtype)),

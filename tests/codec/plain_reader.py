@@ -89,6 +89,6 @@ def values(path, key):
             base = base if np.dtype(model["values"]).kind == "f" else np.rint(base)
             more = parts["0.corrections"][at] if "0.corrections" in parts else 0 * base
             frame[tuple(space)] = (base + more)[key - t.start]
-    bits = parts["0.occupancy.bits"][key]
+    bits = np.bitwise_or.reduce(parts["0.occupancy.bits"][:, key])
     root.store.close()
     return np.where(occupied(bits, lengths[1:]), frame, np.nan)

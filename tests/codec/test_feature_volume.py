@@ -79,26 +79,9 @@ def test_features_that_a_file_lacks_or_has_merged_are_refused(run, tmp_path) -> 
         only_features(volume, [LOW])
 
 
-def test_the_reason_why_a_file_has_its_features_merged_is_the_true_one(tmp_path) -> None:
-    compact, older = tmp_path / "compact.fhz", tmp_path / "older.fhz"
-    fhash_codec.encode(ramp(), compact, EncodeConfig(features=(LOW, HIGH), effort=1))
-    config = EncodeConfig(
-        profile="paper", features=(LOW, HIGH), epochs=1, width=4, tables="transform"
-    )
-    with pytest.MonkeyPatch.context() as patch:  # as versions before wrote it
-        patch.setattr("fhash_codec.paper.tables.small_parts.MASK_BITS", 1)
-        patch.setattr("fhash_codec.paper.tables.small_parts.write_features_apart", lambda *_: None)
-        fhash_codec.encode(ramp(), older, config)
-    for path, reason in ((compact, "encode with --profile paper"), (older, "encode it again")):
-        with fhash_codec.open(path) as volume, pytest.raises(InputError, match=reason):
-            only_features(volume, [LOW])
-    with fhash_codec.open(older) as volume:
-        assert volume.describe()["occupancy"]["apart"] == []
-
-
 @pytest.mark.parametrize("count", [8, 9])
 def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
-    """The numbers of the mask have 8 bits; more features have arrays of their own."""
+    """The numbers of the mask have 8 bits; more features have bits."""
     features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(count))
     config = EncodeConfig(
         profile="paper", features=features, epochs=1, width=4, dilation=0, tables="transform"
@@ -108,9 +91,9 @@ def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
     fhash_codec.export_plain(path, plain)
     for name in (path, plain):
         with fhash_codec.open(name) as volume:
-            own = "occupancy/feature_9" in volume.container.arrays
-            assert own == (count == 9)
-            assert ("occupancy/feature_1" in volume.container.arrays) == (own or name == plain)
+            masked = "occupancy/mask" in volume.container.arrays
+            assert masked == (count == 8 and name == path)
+            assert masked != ("occupancy/bits" in volume.container.arrays)
             source = ramp()[2]
             for feature in (features[0], features[-1]):
                 low, high = (np.float32(end) for end in feature.split(":")[1:])

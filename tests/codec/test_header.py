@@ -13,7 +13,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.header import brief_history, brief_quality, full_header, history_points
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.defaults import CONFIG_DEFAULTS
+from fhash_formats.container.header import CONFIG_DEFAULTS
 
 NOTHING: dict[str, object] = {"per_step": [], "ssim_window": {}}
 WRITER = ContainerWriter("unused.fhz")

@@ -265,7 +265,7 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch) -> Non
         )
         volume.read(2)
         assert {node for name, node in read if name == "parts/0.tables.level_1"} == {1}
-        assert {node for name, node in read if name == "parts/0.occupancy.bits"} == {1}
+        assert len([name for name, _ in read if name == "parts/0.occupancy.bits"]) == 1
 
 
 def test_info_is_json_and_says_what_is_in_the_file(encoded, volume) -> None:

@@ -6,9 +6,16 @@ import zlib
 from collections.abc import Iterable
 
 from fhash_formats.container.coding import crc32c
-from fhash_formats.container.layout import END, Member, comment, ending, local_header
 from fhash_formats.container.source import Source
-from fhash_formats.container.zip_checked import read_member, read_members
+from fhash_formats.container.zip_file import (
+    END,
+    Member,
+    comment,
+    ending,
+    local_header,
+    read_member,
+    read_members,
+)
 
 Parts = list[tuple[str, bytes]]
 """Name and inflated data of each member, in the order of the file."""

@@ -104,10 +104,15 @@ def _lengths(chance: random.Random, parts: Parts) -> Parts:
 def _rule(chance: random.Random) -> dict[str, Any]:
     numbers = (0, 1, -1, 1e308, -1e308, 1e-308, 5e-324, 1e-12, 3.5e5, 3.4e38, -0.0, 2**53, 1e16)
     rule: dict[str, Any] = {
-        key: chance.choice(numbers) for key in ("start", "step", "last") if chance.random() < 0.5
+        key: chance.choice(numbers) for key in ("start", "step") if chance.random() < 0.5
     }
     if chance.random() < 0.4:
         rule["dtype"] = chance.choice(("float32", "float32", "float64", "float16"))
+    if chance.random() < 0.3:
+        farthest = 2**52 - 1
+        rule["ulps"] = chance.choices(
+            (0, 1, -1, farthest, -farthest, 2**53), k=chance.choice((1, 2))
+        )
     return rule
 
 

@@ -221,7 +221,7 @@ def _integers(chance: random.Random, parts: Parts) -> Parts:
     elif turn == 4:
         document["fill_value"] = chance.choice((*FILLS, *OTHERS))
     else:
-        header["missing"] = chance.choice(("outside", "inside", "", None, 0))
+        header["features"] = chance.choice((["all"], ["isosurface:0"], [], None, 0))
         header["coreset_fraction"] = chance.choice((0, 0.5, 1, 1.5, -1, 1e300))
         header["background"] = chance.choice((*FLOATS, 127, 128, 1e30))
         if chance.random() < 0.5:

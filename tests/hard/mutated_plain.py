@@ -164,7 +164,7 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     new: list[tuple[str, list[int], str]] = [
         ("tables/level_1", [*shape, 1], header["model"]["tables"]),
         ("key_frames", shape[:1], "int64"),
-        ("occupancy/bits", [shape[0], bits], "uint8"),
+        ("occupancy/bits", [1, shape[0], bits], "uint8"),
         *(
             (f"coords/{axis}", [n], "float64")
             for axis, n in zip(("time", "z", "y", "x"), shape, strict=True)

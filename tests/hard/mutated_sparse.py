@@ -95,7 +95,7 @@ def _giant_sparse(chance: random.Random, parts: Parts) -> Parts:
         ("mlp/weight_1", [1, 1], "float32"),
         ("mlp/bias_1", [1], "float32"),
         ("key_frames", [1], "int64"),
-        ("occupancy/bits", [1, bits], "uint8"),
+        ("occupancy/bits", [len(header["features"]), 1, bits], "uint8"),
         *(
             (f"coords/{axis}", [n], "float64")
             for axis, n in zip(("time", "z", "y", "x"), shape, strict=True)

@@ -12,7 +12,7 @@ from math import prod
 from containers import Parts, directory_of, pack, pack_members, resealed, with_crc
 from numcodecs.zstd import compress
 
-from fhash_formats.container.layout import ENTRY, comment, deflated
+from fhash_formats.container.zip_file import ENTRY, comment, deflated
 
 NUMBERS = (
     0,

@@ -24,10 +24,10 @@ UNARY = 14
 """Magnitudes from this one on have an escape code."""
 MOST = 4095
 """Largest magnitude that contexts see."""
-SIZES = (LEVELS, KINDS * 64, 729, 12**3, 7**4, 12 * 12 * KINDS)
-"""Contexts of each of the six estimates of a magnitude, which has a slot for each decision."""
-SIGN_SIZES = tuple(KINDS * n for n in (27, 81, 27, 108, 27, 81, 54, 25))
-"""Contexts of each of the eight estimates of a sign."""
+SIZES = (LEVELS, 729, 12**3, 7**4)
+"""Contexts of each of the four estimates of a magnitude, which has a slot for each decision."""
+SIGN_SIZES = tuple(KINDS * n for n in (27, 108, 81, 25))
+"""Contexts of each of the four estimates of a sign."""
 
 
 def starts(sizes: Sequence[int], first: int = 0) -> list[int]:
@@ -37,13 +37,15 @@ def starts(sizes: Sequence[int], first: int = 0) -> list[int]:
 
 MAGNITUDE_STARTS = starts([size * DECISIONS for size in SIZES])
 SIGN_STARTS = starts(SIGN_SIZES, sum(SIZES) * DECISIONS)
-LANES = 12
+LANES = 8
 """Weights of a set for magnitudes."""
 BY_LEVEL = DECISIONS * KINDS * LANES
 """First weight of the sets chosen by the expected magnitude, after those chosen by the kind."""
 SIGN_SETS = BY_LEVEL + DECISIONS * 64 * LANES
-"""First weight of signs; a set has 24."""
-LINEAR = SIGN_SETS + KINDS * 24
+"""First weight of signs."""
+SIGN_SET = 16
+"""Weights of a set for signs: two of each estimate, then that of the linear logit."""
+LINEAR = SIGN_SETS + KINDS * SIGN_SET
 """First weight of the linear predictors of signs."""
 INPUTS = 96
 """Inputs of a linear predictor."""
@@ -221,7 +223,7 @@ class IntegerDecoder:
         return -magnitude if negative else magnitude
 
     def contexts(self, level: int, m: dict[Any, int], around: list[int]) -> None:
-        """Choose the contexts of the six estimates, and the sets of mixing weights."""
+        """Choose the contexts of the four estimates, and the sets of mixing weights."""
         left, left2, up = m[0, 0, 0, -1], m[0, 0, 0, -2], m[0, 0, -1, 0]
         up_left, up_right = m[0, 0, -1, -1], m[0, 0, -1, 1]
         near = 2 * up + up_left + up_right + m[0, 0, -2, 0] + 2 * left + left2
@@ -234,15 +236,12 @@ class IntegerDecoder:
         others = 0
         for total in around:
             others = others * 7 + min(size_class(total), 6)
-        both = size_class((near + before + below) // 2)
         self.coarse = coarse
         self.context = (
             level,
-            self.kind * 64 + coarse,
             beside,
             (size_class(near) * 12 + size_class(before)) * 12 + size_class(below),
             others,
-            (both * 12 + size_class(around[0])) * KINDS + self.kind,
         )
 
     def decision(self, k: int, one: int) -> int:
@@ -274,7 +273,7 @@ class IntegerDecoder:
     def sign(self, t: int, z: int, y: int, x: int, at: int) -> int:
         """Whether the integer at a vertex is negative."""
         inputs = self.sign_inputs(t, z, y, x, at)
-        return self.signs[self.kind].decode(inputs, t, y, x)
+        return self.signs[self.kind].decode(inputs, y, x)
 
     def sign_inputs(self, t: int, z: int, y: int, x: int, at: int) -> list[int]:
         """The 96 inputs of a linear predictor of a sign: logarithms with signs."""
@@ -336,31 +335,27 @@ class LinearSigns:
         """Rate of a weight whose gradient has this mean square."""
         return self.RATES[min(log16(max(square, 1)), 240)]
 
-    def decode(self, inputs: list[int], t: int, y: int, x: int) -> int:
-        """A sign, 1 for a negative one, of a vertex whose indices are t, y and x."""
+    def decode(self, inputs: list[int], y: int, x: int) -> int:
+        """A sign, 1 for a negative one, of a vertex whose indices are y and x."""
         dot = sum(w * i for w, i in zip(self.weights, inputs, strict=True))
         dot = (dot + (1 << 31)) % (1 << 32) - (1 << 31)  # the sum wraps at 32 bits
         logit = clamp(dot >> 14, -2047, 2047)
-        sets = (SIGN_SETS + self.kind * 24,)
-        slots = self.slots(inputs, logit, t, y, x)
+        sets = (SIGN_SETS + self.kind * SIGN_SET,)
+        slots = self.slots(inputs, logit, y, x)
         bit = self.adaptive.mixed(slots, sets, most_uses=255, more=[logit])
         self.learn(inputs, (65535 * bit - squashed(logit)) >> 1)
         return bit
 
-    def slots(self, inputs: list[int], logit: int, t: int, y: int, x: int) -> list[int]:
-        """The eight estimates of a sign."""
+    def slots(self, inputs: list[int], logit: int, y: int, x: int) -> list[int]:
+        """The four estimates of a sign."""
         sign = [sign_class(value) for value in inputs]
-        left, left2, up, up2, up_left, up_right = (sign[i] for i in (3, 2, 6, 33, 5, 7))
-        below, before, before2 = (sign[i] for i in (13, 25, 37))
-        parent, parent_t, parent_z, sibling = (sign[i] for i in (41, 49, 57, 65))
+        left, up, up_left, up_right = (sign[i] for i in (3, 6, 5, 7))
+        below, before = (sign[i] for i in (13, 25))
+        parent, parent_t, parent_z = (sign[i] for i in (41, 49, 57))
         contexts = (
-            in_threes(left, up, before),
-            in_threes(left, left2, up, up2),
             in_threes(before, below, left),
             in_threes(parent, parent_t, parent_z) * 4 + (x & 1) * 2 + (y & 1),
-            in_threes(sibling, left, up),
             in_threes(up_left, up_right, left, up),
-            in_threes(before, before2, parent_t) * 2 + (t & 1),
             clamp((logit + 12 * 85 + 42) // 85, 0, 24),
         )
         sizes = (size // KINDS for size in SIGN_SIZES)

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Layer
-from fhash_codec.paper.storage import MASK_BITS, MASK_FEATURE_BITS, write_features_apart
+from fhash_codec.paper.storage import write_occupancy
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.coding import transform_codecs
-from fhash_formats.container.header import MASK_ARRAY
+from fhash_formats.container.header import MASK_ARRAY, MASK_FEATURES
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -72,16 +72,16 @@ def write_layers(
 
 
 def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
-    """Write the occupancy of a coreset as `occupancy/mask`, coded as labels, its features apart.
+    """Write the occupancy of a coreset as `occupancy/mask`, coded as labels.
 
-    A number of several features has one bit for each of them. More than MASK_BITS features have
-    arrays of their own, as beside plain tables.
+    A number has one bit for each feature. More than MASK_FEATURES are written as bits.
     """
-    box = coreset.box.shape
+    box, grids = coreset.box.shape, coreset.grids
     keys = len(coreset.occupancy)
     steps = max(1, min(keys, MASK_VERTICES // prod(box)))
-    apart = coreset.apart if len(coreset.apart) <= MASK_BITS else ()
-    grids = apart or (coreset.occupancy,)
+    if len(grids) > MASK_FEATURES:
+        write_occupancy(writer, coreset)
+        return
 
     def numbers(key: int) -> npt.NDArray[np.uint8]:
         result = np.zeros(box, np.uint8)
@@ -99,7 +99,6 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
             for first in range(0, keys, steps)
         ),
         dimension_names=("t", "z", "y", "x"),
-        attributes={MASK_FEATURE_BITS: True} if apart else None,
         codecs=transform_codecs(
             TileSettings(
                 transform=_PLAIN,
@@ -111,8 +110,6 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
             )
         ),
     )
-    if not apart:
-        write_features_apart(writer, coreset)
 
 
 def _weight_settings(weight: Floats, share: float) -> TileSettings | None:

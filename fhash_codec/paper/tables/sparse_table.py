@@ -20,7 +20,7 @@ from fhash_codec.paper.number_type import NumberType
 from fhash_codec.paper.tables.needed import Mask
 from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.sparse import COUNTS
+from fhash_formats.container.header import COUNTS
 from fhash_formats.errors import DamagedFileError
 
 CHUNK_BYTES = 2 << 20

@@ -20,7 +20,7 @@ from fhash_codec.paper.network import Floats
 from fhash_codec.paper.storage import mix_components
 from fhash_codec.paper.tables.trained_tables import Mask, Region, TrainedTable
 from fhash_formats.container import shard_shape
-from fhash_formats.container.cache import ChunkCache
+from fhash_formats.container.stored import ChunkCache
 from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import Coding, encode_tile

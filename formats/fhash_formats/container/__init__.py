@@ -11,45 +11,36 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
-    ranges           ranges of bytes that are asked for together
-    source           bytes at offsets of a file
+    source           bytes at offsets of a file, and ranges of them that are asked for together
     remote           bytes of a file elsewhere, in few requests
     fsspec_file      requests to any file system of fsspec
-    location         paths, URLs and open files -> sources
-    layout           bytes of the ZIP
-    zip_checked      safe opening of the ZIP
+    zip_file         bytes of the ZIP, written and checked
     strict_json      metadata documents as JSON
     hierarchy        members of the ZIP -> header and arrays
     record           checked access to a JSON object
-    header           checks of the header
-    defaults         what a header leaves out
+    header           checks of the header, and what it leaves out
     expected_arrays  arrays that a header asks for
     coordinates      positions in the header
-    source_described what belongs to the variable in its source -> header and arrays
-    source_entry     and back, checked
-    typed_values     attributes and small arrays as JSON that keeps their type
+    source_entry     what belongs to the variable in its source <-> header and arrays
     array            metadata of one array
     coding           values of a chunk <-> bytes
-    chunks           arrays cut into chunks
     sharding         many chunks in one member
-    shard_places     where they lie in it
-    cache            decoded chunks
     stored           StoredArray: one array, read region by region
+    table_parts      tiles of a table -> array
     reader           Container: a file for reading
     writer           ContainerWriter: a file for writing
+    growing          GrowingContainer: a file that is complete after each layer
     variables        names and headers of the variables in a file
 """
 
 from fhash_formats.container.coordinates import describe_coordinates
 from fhash_formats.container.header import validate_header
-from fhash_formats.container.layout import FORMAT_VERSION
-from fhash_formats.container.location import Location, Place, StorageOptions
-from fhash_formats.container.reader import Container, is_container
+from fhash_formats.container.reader import Container, Location, Place, StorageOptions, is_container
 from fhash_formats.container.sharding import shard_order, shard_shape
-from fhash_formats.container.source_described import describe_metadata
-from fhash_formats.container.source_entry import SOURCE, read_metadata
+from fhash_formats.container.source_entry import SOURCE, describe_metadata, read_metadata
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
+from fhash_formats.container.zip_file import FORMAT_VERSION
 
 __all__ = [
     "FORMAT_VERSION",

@@ -1,10 +1,10 @@
 """Positions along an axis, described in the header: by a rule or as a short list.
 
 An array of their own would cost more bytes. The rule gives position i as start + i * step: one
-product and one sum in float64, each rounded, then rounded to `dtype`. `last`, where it is given,
-replaces the last position. Cell centres and other positions that were computed in another order
-differ from the rule by a few units in the last place, which `ulps` lists. A rule is used only where
-it gives every bit of the positions.
+product and one sum in float64, each rounded, then rounded to `dtype`. Cell centres and other
+positions that were computed in another order differ from the rule by a few units in the last place,
+which `ulps` lists, and a last position that follows no rule by many. A rule is used only where it
+gives every bit of the positions.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ MAX_LISTED = 1024
 An array of their own takes 400 to 500 bytes more than the list, until digits outweigh that.
 """
 MAX_ULPS = 99
-"""Units in the last place by which a position may differ from a rule that is written."""
-ULPS_LIMIT = 2**31 - 1
+"""Units in the last place by which a position but the last may differ from a written rule."""
+ULPS_LIMIT = 2**52 - 1
 """Largest such difference that a reader takes."""
 MAX_RULED = 1 << 20
 """Positions that a header describes; the limit keeps a few bytes from asking for much memory."""
@@ -86,14 +86,15 @@ def describe_positions(values: Floats) -> dict[str, Any] | None:
         return None
     with np.errstate(over="ignore"):
         narrow = np.array_equal(values, values.astype(np.float32))
-    for kind, exact_end in product(TYPES if narrow else TYPES[:1], (True, False)):
+    kinds = TYPES if narrow else TYPES[:1]
+    for kind, most in product(kinds, (0, 1)):
         for start, step in _candidates(values, kind):
-            rule = _rule(start, step, None if exact_end else _shortest(values[-1], kind), kind)
-            if _same(positions(rule, values.size), values):
+            rule = _moved_rule(values, start, step, kind)
+            if rule is not None and len(rule.get("ulps", ())) <= most:
                 return rule
     if values.size > MAX_LISTED:
         return None
-    nearly = _nearly_ruled(values, TYPES if narrow else TYPES[:1])
+    nearly = _nearly_ruled(values, kinds)
     if nearly is not None:
         return nearly
     short = (
@@ -103,7 +104,7 @@ def describe_positions(values: Floats) -> dict[str, Any] | None:
     )
     return (
         short
-        if narrow and _same(positions(short, values.size), values)
+        if narrow and positions(short, values.size).tobytes() == values.tobytes()
         else {"values": values.tolist()}
     )
 
@@ -120,17 +121,16 @@ def positions(description: Mapping[str, Any], length: int) -> Floats:
         else:
             values = np.arange(length, dtype=np.float64) * float(description.get("step", 1))
             values += float(description.get("start", 0))
-            if "last" in description:
-                values[-1] = float(description["last"])
         rounded = values.astype(description.get("dtype", "float64"))
         if "ulps" in description:
-            rounded = _moved(rounded, np.array(description["ulps"], dtype=np.int64))
+            ulps = np.array(description["ulps"], dtype=np.int64)
+            rounded[-ulps.size :] = _moved(rounded[-ulps.size :], ulps)
         return rounded.astype(np.float64)
 
 
 def check_positions(record: Record, length: int) -> None:
     """Raise DamagedFileError, naming the key, unless `record` describes `length` positions."""
-    for key in ("start", "step", "last"):
+    for key in ("start", "step"):
         if record.has(key):
             record.number(key)
     if record.has("dtype"):
@@ -138,7 +138,10 @@ def check_positions(record: Record, length: int) -> None:
     if record.has("values"):
         record.numbers("values", length)
     if record.has("ulps"):
-        record.integers("ulps", length, -ULPS_LIMIT, ULPS_LIMIT)
+        ulps = record.get("ulps")
+        count = len(ulps) if isinstance(ulps, list) else 0
+        record.need(1 <= count <= length, "ulps", f"1 to {length} whole numbers")
+        record.integers("ulps", count, -ULPS_LIMIT, ULPS_LIMIT)
         record.need(not record.has("values"), "ulps", "a rule, and no values")
     if record.has("name"):
         record.text("name")
@@ -153,28 +156,39 @@ def _nearly_ruled(values: Floats, kinds: Sequence[str]) -> dict[str, Any] | None
     """
     if values.size < 3:
         return None
-    best: tuple[int, dict[str, Any]] | None = None
+    best: dict[str, Any] | None = None
     for kind in kinds:
         first, last = _shortest(values[0], kind), _shortest(values[-1], kind)
         with np.errstate(over="ignore", invalid="ignore"):
             step = (last - first) / (values.size - 1)
             steps = [float(f"{step:.{digits - 1}e}") for digits in _DIGITS if np.isfinite(step)]
         for guess in dict.fromkeys([*steps, step]):
-            if not np.isfinite(guess):
-                continue
-            rule = _rule(first, guess, None, kind)
-            ulps = _ordered(values.astype(kind)) - _ordered(
-                positions(rule, values.size).astype(kind)
-            )
-            if np.abs(ulps).max() > MAX_ULPS:
-                continue
-            described = {**rule, "ulps": ulps.tolist()}
-            differing = int(np.count_nonzero(ulps))
-            if best is None or differing < best[0]:
-                best = differing, described
-    if best is None or not _same(positions(best[1], values.size), values):
+            rule = _moved_rule(values, first, guess, kind) if np.isfinite(guess) else None
+            if rule is not None and (best is None or _differing(rule) < _differing(best)):
+                best = rule
+    return best
+
+
+def _moved_rule(values: Floats, start: float, step: float, kind: str) -> dict[str, Any] | None:
+    """A rule and how far positions are from it, in units in the last place; None if too far."""
+    rule: dict[str, Any] = {}
+    if start != 0 or np.signbit(start):
+        rule["start"] = _plain(start)
+    if step != 1:
+        rule["step"] = _plain(step)
+    if kind != TYPES[0]:
+        rule["dtype"] = kind
+    ulps = _ordered(values.astype(kind)) - _ordered(positions(rule, values.size).astype(kind))
+    if np.abs(ulps[:-1]).max(initial=0) > MAX_ULPS or abs(ulps[-1]) > ULPS_LIMIT:
         return None
-    return best[1]
+    if ulps.any():
+        rule["ulps"] = ulps[np.flatnonzero(ulps)[0] :].tolist()
+    return rule if positions(rule, values.size).tobytes() == values.tobytes() else None
+
+
+def _differing(rule: Mapping[str, Any]) -> int:
+    """Number of positions that differ from a rule."""
+    return int(np.count_nonzero(rule.get("ulps", ())))
 
 
 def _ordered(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -194,23 +208,6 @@ def _moved(values: npt.NDArray[Any], ulps: npt.NDArray[np.int64]) -> npt.NDArray
     there = np.clip(_ordered(values) + ulps, -end, end)
     bits = np.where(there < 0, int(np.iinfo(whole).min) - there, there).astype(whole)
     return np.where(ulps == 0, values, bits.view(values.dtype))
-
-
-def _same(a: Floats, b: Floats) -> bool:
-    """Whether all bits are equal; -0 and 0 differ."""
-    return a.tobytes() == b.tobytes()
-
-
-def _rule(start: float, step: float, last: float | None, kind: str) -> dict[str, Any]:
-    """A rule as the header holds it: values equal to their defaults are left out."""
-    rule: dict[str, Any] = {}
-    if start != 0 or np.signbit(start):
-        rule["start"] = _plain(start)
-    if step != 1:
-        rule["step"] = _plain(step)
-    if last is not None:
-        rule["last"] = _plain(last)
-    return rule if kind == "float64" else {**rule, "dtype": kind}
 
 
 def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:

@@ -17,17 +17,22 @@ import numpy.typing as npt
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.container.header import (
+    BITS_ARRAY,
     CODED,
     COMPACT,
+    COUNTS,
     HEAD_CROSS,
     HEAD_INPUTS,
     LOWEST,
     MASK_ARRAY,
+    MASK_FEATURES,
     MAX_LEVEL,
+    MISSING_ARRAY,
     PAPER,
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
+    SPARSE,
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
@@ -35,7 +40,6 @@ from fhash_formats.container.header import (
 )
 from fhash_formats.container.record import Record
 from fhash_formats.container.source_entry import check_source
-from fhash_formats.container.sparse import SPARSE, sparse_shape
 from fhash_formats.errors import DamagedFileError
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
@@ -47,13 +51,18 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
 
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
-    paper = header["model"]["profile"] == PAPER
+    masked = MASK_ARRAY in arrays and header["model"]["profile"] == PAPER
     if SPARSE in header["model"] and MASK_ARRAY in arrays:
         raise DamagedFileError(
-            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs occupancy/bits"
+            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs {BITS_ARRAY}"
+        )
+    if masked and len(header["features"]) > MASK_FEATURES:
+        raise DamagedFileError(
+            f"array {MASK_ARRAY} is there in a file of {len(header['features'])} features; "
+            f"more than {MASK_FEATURES} need {BITS_ARRAY}"
         )
     for name, shape, dtypes in _required_arrays(header, arrays):
-        if name == "occupancy/bits" and MASK_ARRAY in arrays and paper:
+        if name == BITS_ARRAY and masked:
             continue
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
@@ -122,15 +131,14 @@ def _required_arrays(
     """
     model = header["model"]
     compact = model["profile"] == COMPACT
-    described = header.get("coordinates", {}) if compact else {}
+    described = header.get("coordinates", {})
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         if axis not in described:
             yield f"coords/{axis}", (length,), ("float64",)
     key_frames = model["levels"][0][0]
-    coded = compact and PLAIN_FEATURE not in header["required_features"]
-    if not coded or key_frames < header["domain"]["shape"][0]:
+    if key_frames < header["domain"]["shape"][0]:
         yield "key_frames", (key_frames,), ("int64",)
-    if coded:
+    if compact and PLAIN_FEATURE not in header["required_features"]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
     for number, level in enumerate(model["levels"], start=1):
@@ -140,16 +148,35 @@ def _required_arrays(
             continue
         name, size = f"tables/level_{number}", model["embedding_size"]
         sparse = SPARSE in model
-        shape = sparse_shape(name, level, size, arrays) if sparse else (*level, size)
+        shape = _sparse_shape(name, level, size, arrays) if sparse else (*level, size)
         yield name, shape, (model["tables"],)
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)
-    yield (
-        "occupancy/bits",
-        (key_frames, occupancy_bytes(header["feature_bounding_box"])),
-        ("uint8",),
-    )
+    # The profile compact merges its features.
+    features = 1 if compact else len(header["features"])
+    size = occupancy_bytes(header["feature_bounding_box"])
+    yield BITS_ARRAY, (features, key_frames, size), ("uint8",)
+
+
+def _sparse_shape(
+    name: str, level: Sequence[int], embedding_size: int, arrays: Mapping[str, ArrayMetadata]
+) -> tuple[int, ...]:
+    """The shape that the array of a sparse table must have, by its counts.
+
+    Args:
+        name: of the array.
+        level: vertices (t, z, y, x) of the level.
+        embedding_size: numbers at each vertex.
+        arrays: all arrays of the file.
+
+    Raises DamagedFileError where the counts do not fit the level.
+    """
+    if name not in arrays:
+        raise DamagedFileError(f"array {name} is missing")
+    attributes = Record(arrays[name].attributes, f"array {name} attribute ")
+    counts = attributes.integers(COUNTS, level[0], 0, prod(level[1:]))
+    return sum(counts), embedding_size
 
 
 def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
@@ -157,18 +184,13 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     model, steps = header["model"], header["domain"]["shape"][0]
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         yield f"coords/{axis}", (length,), ("float64",)
+    yield "key_frames", (model["levels"][0][0],), ("int64",)
     if model["profile"] == COMPACT:
-        key_frames, *box = model["levels"][0]
-        yield "key_frames", (key_frames,), ("int64",)
-        yield "corrections", (key_frames, *box), PLAIN_TABLE_TYPES
+        yield "corrections", tuple(model["levels"][0]), PLAIN_TABLE_TYPES
     else:
-        # One of each feature, where there are several.
-        bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
-        for number in range(1, len(header["features"]) + 1):
-            yield f"occupancy/feature_{number}", bits, ("uint8",)
         yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
     yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)
-    yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
+    yield MISSING_ARRAY, (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
 def _check_array(

@@ -25,9 +25,9 @@ import numpy as np
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import Codec
-from fhash_formats.container.layout import Member
 from fhash_formats.container.sharding import pack_index, sharding_codecs
 from fhash_formats.container.writer import ContainerWriter, Mark
+from fhash_formats.container.zip_file import Member
 from fhash_formats.errors import FhashError, OutputError
 from fhash_formats.support import leftovers
 from fhash_formats.support.atomic import check_output, explained, replacing, sync_folder

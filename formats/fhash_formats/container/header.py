@@ -1,20 +1,24 @@
-"""Checks of the header: the attribute "fhash" of a container's root.
+"""Checks of the header of a variable, and the values that it leaves out.
 
 FORMAT.md describes the header in its section "Header". Unknown keys are kept and ignored, because
 a minor version may add some; what a reader must understand is named in `required_features`.
+
+Values that follow from FORMAT.md or from the rest are left out: in a small file the header costs as
+much as the coefficients. The defaults belong to the format: a default of the encoder that changes
+is from then on written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
 from fhash_formats.container.coordinates import MAX_RULED, check_positions
-from fhash_formats.container.layout import check_major
 from fhash_formats.container.record import MAX_LENGTH, Record
-from fhash_formats.container.sparse import SPARSE_FEATURE, check_sparse
+from fhash_formats.container.zip_file import check_major
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.support.number_types import DTYPES
 
@@ -22,6 +26,16 @@ FORMAT = "fhash"
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
 """Feature of a file of the profile compact whose tables are plain numbers."""
+SPARSE = "sparse"
+"""Key of the header's `model` that says whose needed vertices the tables have."""
+SPARSE_FEATURE = "sparse-tables"
+"""Feature of files whose tables have needed vertices alone."""
+CORESET = "coreset"
+"""Value of the key: the vertices that the coreset needs."""
+FRINGE = "fringe"
+"""Value of the key: the vertices that the coreset and its fringe need."""
+COUNTS = "counts"
+"""Attribute of a table: number of its vertices at each time node."""
 KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
@@ -29,8 +43,14 @@ COMPACT = "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 TABLE = "tables/level_1"
 """Name of the array of the finest table."""
+BITS_ARRAY = "occupancy/bits"
+"""Name of the array of the occupancy as bits."""
 MASK_ARRAY = "occupancy/mask"
 """Name of the array of an occupancy that is coded, in place of bits."""
+MASK_FEATURES = 8
+"""Largest number of features whose occupancy the numbers of a mask tell."""
+MISSING_ARRAY = "missing/bits"
+"""Name of the array of the bits of vertices without a value."""
 STEPS = "steps/figures"
 """Name of the array of the figures of single steps, where they are not in the header."""
 STEP_FIGURES = ("rmse", "max_abs_error")
@@ -51,8 +71,8 @@ QUALITY = (
     "max_abs_error_domain",
 )
 """Figures in `quality`, each a number or null."""
-MISSING = ("outside",)
-"""Values of `missing`: the vertices outside the coreset are those without a value."""
+EVERYTHING = "all"
+"""Name of the feature that every vertex with a value belongs to."""
 NOT_STORED = "not_stored"
 """Key of `variable`: what nobody wrote of the values."""
 HISTORY = ("seconds", "epoch", "psnr")
@@ -80,6 +100,55 @@ MAX_HIDDEN_LAYERS = 64
 MAX_WIDTH = 1 << 16
 """Outputs of a hidden layer."""
 MAX_PARAMETERS = 1 << 62
+Change = Callable[[Mapping[str, Any], Mapping[str, Any]], dict[str, Any]]
+"""An object and its defaults to the object with or without them."""
+
+CONFIG_DEFAULTS: dict[str, Any] = {
+    "access": "balanced",
+    "batch": 0,
+    "brick": "auto",
+    "device": "auto",
+    "dilation": 1,
+    "effort": 5,
+    "embedding_size": 0,
+    "engine": "auto",
+    "epochs": 0,
+    "features": ["all"],
+    "fold": 0,
+    "fringe": "trained",
+    "hidden_layers": 2,
+    "key_frames": "all",
+    "learning_rate": 0.01,
+    "max_error": None,
+    "max_error_rel": None,
+    "profile": "compact",
+    "psnr": None,
+    "psnr_bulk": None,
+    "ratio": None,
+    "schedule": "cosine",
+    "seed": 0,
+    "tables": "float16",
+    "tile": "auto",
+    "timings": True,
+    "train_on_seconds": 3600,
+    "width": 0,
+    "without": [],
+}
+"""Values of the settings that a header leaves out."""
+DEFAULTS: dict[str, Any] = {
+    "features": ["all"],
+    "dilation": 1,
+    "coreset_fraction": 1.0,
+    "coordinates": {},
+    "config": CONFIG_DEFAULTS,
+    "training": {"seconds": None, "steps": 0, "epochs": 0, "device": "none"},
+    "history": {},
+}
+"""Values of keys that a header leaves out."""
+SSIM_WINDOW: dict[str, Any] = {"window": 11, "sigma": 1.5}
+"""Window and sigma of the SSIM, in vertices, where the quality was measured."""
+DOMAIN_FIGURES = ("psnr", "rmse", "max_abs_error")
+"""Figures over the coreset; those over the domain are the same where they are left out."""
 
 
 def validate_header(header: Mapping[str, Any]) -> None:
@@ -94,7 +163,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
     shape = top.record("domain").integers("shape", 4, 1, MAX_LENGTH)
     _check_values(top, dtype)
     box = _box(top, shape)
-    top.texts("features")
+    top.need(bool(top.texts("features")), "features", "at least one")
     top.integer("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
     plain = PLAIN_FEATURE in header["required_features"]
@@ -107,8 +176,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
         header["required_features"],
         allowed=profile == PAPER and header["model"]["tables"] != CODED,
     )
-    if profile == COMPACT:
-        _check_coordinates(top, shape)
+    _check_coordinates(top, shape)
     top.record("config")
     _check_training(top.record("training"))
     quality = top.record("quality")
@@ -173,8 +241,6 @@ def _check_source(top: Record) -> np.dtype[Any]:
         variable.number("fill")
     if variable.has(NOT_STORED):
         _check_not_stored(variable.record(NOT_STORED))
-    if top.has("missing"):
-        top.choice("missing", MISSING)
     return dtype
 
 
@@ -377,3 +443,69 @@ def _check_plain(model: Record) -> None:
         head.number(key)
     head.need(isinstance(head.get("cross"), bool), "cross", "true or false")
     head.need(not head.get("cross") or count == 2, "hidden", "2 widths of a head with a cross")
+
+
+def brief(header: Mapping[str, Any]) -> dict[str, Any]:
+    """A header without what `complete` puts back."""
+    return _changed(_without, header)
+
+
+def complete(header: Mapping[str, Any]) -> dict[str, Any]:
+    """A header with all that was left out; what is there stays, of whatever form it is."""
+    return _changed(_with, header)
+
+
+def _changed(change: Change, header: Mapping[str, Any]) -> dict[str, Any]:
+    """A header and its measured quality after `_without` or `_with`."""
+    result = change(header, DEFAULTS)
+    quality = result.get("quality")
+    if isinstance(quality, dict) and "psnr" in quality:
+        result["quality"] = change(quality, _of_quality(quality))
+    return result
+
+
+def _of_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
+    """The defaults of a measured quality, some of which follow from its figures."""
+    same = {f"{name}_domain": quality[name] for name in DOMAIN_FIGURES if name in quality}
+    return {**same, "ssim_window": SSIM_WINDOW}
+
+
+def _without(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of an object other than its defaults."""
+    result = {}
+    for key, value in values.items():
+        default = defaults.get(key, ...)
+        if isinstance(default, dict) and isinstance(value, dict):
+            value, default = _without(value, default), {}
+        if value != default:
+            result[key] = value
+    return result
+
+
+def _with(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """An object with its defaults in place of what it lacks."""
+    result = dict(values)
+    for key, default in defaults.items():
+        value = result.setdefault(key, {} if isinstance(default, dict) else deepcopy(default))
+        if isinstance(default, dict) and isinstance(value, dict):
+            result[key] = _with(value, default)
+    return result
+
+
+def check_sparse(model: Record, required_features: Sequence[str], *, allowed: bool) -> None:
+    """Check the key of the header's `model`, where it is there.
+
+    Args:
+        model: the object in the header.
+        required_features: names of the header.
+        allowed: whether the tables of the file are plain numbers of the profile paper.
+    """
+    if not model.has(SPARSE):
+        return
+    model.choice(SPARSE, (CORESET, FRINGE))
+    model.need(allowed, SPARSE, "tables of plain numbers in the profile paper")
+    model.need(
+        SPARSE_FEATURE in required_features,
+        SPARSE,
+        f"the feature {SPARSE_FEATURE} in required_features",
+    )

@@ -14,7 +14,6 @@ from typing import Any
 
 from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
-from fhash_formats.container.layout import Member
 from fhash_formats.container.source import Source
 from fhash_formats.container.variables import (
     CONSOLIDATED,
@@ -23,7 +22,7 @@ from fhash_formats.container.variables import (
     read_variables,
     variable_named,
 )
-from fhash_formats.container.zip_checked import DOCUMENT, read_member
+from fhash_formats.container.zip_file import DOCUMENT, Member, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}

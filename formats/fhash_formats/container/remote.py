@@ -16,8 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Protocol
 
-from fhash_formats.container.ranges import Range, Request, merged
-from fhash_formats.container.source import Source, check_range
+from fhash_formats.container.source import Range, Request, Source, check_range, merged
 from fhash_formats.errors import InputError
 
 __all__ = ["GAP", "TAIL_BYTES", "RemoteFile", "RemoteSource"]

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.coding import CRC32C, Codec, with_crc32c
-from fhash_formats.container.zip_checked import MAX_MEMBER
+from fhash_formats.container.zip_file import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.native import crc32c
 

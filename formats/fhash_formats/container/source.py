@@ -8,12 +8,65 @@ import stat
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from fhash_formats.container.ranges import Range
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 from fhash_formats.support.fork_lock import ForkLock
+
+Range = tuple[int, int]
+"""Offset and number of bytes, at least 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Bytes that are asked for at once.
+
+    Attributes:
+        start, stop: offsets of the first byte and of the one after the last.
+        ranges: those that the bytes were asked for, by offset.
+    """
+
+    start: int
+    stop: int
+    ranges: tuple[Range, ...]
+
+    @property
+    def place(self) -> Range:
+        """The range that all others lie in."""
+        return self.start, self.size
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return self.stop - self.start
+
+
+def merged(ranges: Iterable[Range], gap: int, most: int) -> list[Request]:
+    """Requests for all ranges, by offset; each range lies in one request.
+
+    Args:
+        ranges: in any order; they may repeat and overlap.
+        gap: bytes between two ranges up to which both are in one request.
+        most: bytes of a request of several ranges.
+    """
+    requests: list[Request] = []
+    start = stop = 0
+    group: list[Range] = []
+    for offset, size in sorted(set(ranges)):
+        end = max(stop, offset + size)
+        if group and (offset - stop > gap or end - start > most):
+            requests.append(Request(start=start, stop=stop, ranges=tuple(group)))
+            group = []
+        if not group:
+            start, end = offset, offset + size
+        stop = end
+        group.append((offset, size))
+    if group:
+        requests.append(Request(start=start, stop=stop, ranges=tuple(group)))
+    return requests
+
 
 CHANGED = "the file changed since it was opened; open it again"
 """Told of a file that another took the place of."""

@@ -1,26 +1,254 @@
-"""`StoredArray`: one array of an open container, read region by region."""
+"""`StoredArray`: one array of an open container, read region by region.
+
+A cache of decoded chunks, reads ahead along the first axis, and places of inner chunks in shards.
+"""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from itertools import product
+from itertools import islice, product
+from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.ahead import Ahead, chunks_after
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.cache import ChunkCache
-from fhash_formats.container.layout import Member
-from fhash_formats.container.shard_places import ShardPlaces
-from fhash_formats.container.source import Source, damage_named
-from fhash_formats.container.zip_checked import check_member, read_member
+from fhash_formats.container.sharding import (
+    ENTRY_BYTES,
+    Index,
+    Sharding,
+    parse_entry,
+    parse_index,
+)
+from fhash_formats.container.source import Range, Source, damage_named
+from fhash_formats.container.zip_file import Member, check_member, read_member
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, RegionError
+from fhash_formats.support.fork_lock import ForkLock
 from fhash_formats.support.slabs import common_part, region_bounds
-from fhash_formats.support.threads import in_threads
+from fhash_formats.support.threads import in_threads, usable_threads
+
+Key = tuple[str, tuple[int, ...], int]
+"""Name of the array, index of the chunk and level of detail."""
+
+
+class ChunkCache:
+    """The most recently used chunks, up to `limit` bytes together; safe for several threads.
+
+    The least recently used chunks are dropped first. A chunk larger than `limit` is not kept.
+
+    Attributes:
+        limit: most bytes.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self._bytes = 0
+        self._chunks: OrderedDict[Key, npt.NDArray[Any]] = OrderedDict()
+        self._lock = ForkLock()
+
+    def get(self, key: Key) -> npt.NDArray[Any] | None:
+        """The chunk, or None if it is not kept."""
+        with self._lock:
+            chunk = self._chunks.get(key)
+            if chunk is not None:
+                self._chunks.move_to_end(key)
+            return chunk
+
+    def put(self, key: Key, chunk: np.ndarray[Any, Any]) -> None:
+        """Keep a chunk, and drop others until the limit holds."""
+        if chunk.nbytes > self.limit:
+            return
+        with self._lock:
+            if key in self._chunks:
+                return
+            self._chunks[key] = chunk
+            self._bytes += chunk.nbytes
+            while self._bytes > self.limit:
+                _, dropped = self._chunks.popitem(last=False)
+                self._bytes -= dropped.nbytes
+
+    def clear(self) -> None:
+        """Drop all chunks."""
+        with self._lock:
+            self._chunks.clear()
+            self._bytes = 0
+
+
+class Ahead:
+    """The reads of an array so far, as far as they tell the next one. Safe for several threads."""
+
+    def __init__(self) -> None:
+        self._lock = ForkLock()
+        self._last: Sequence[range] | None = None
+        self._moves = 0
+
+    def layers(self, spans: Sequence[range]) -> int:
+        """Number of layers of chunks after those of a read that are worth decoding with them.
+
+        That is the number of times that reads in a row went on along the first axis, without a gap
+        and with the same chunks of the other axes; 0 for a read that does not go on.
+
+        spans: chunks of the read along each axis.
+        """
+        with self._lock:
+            last, self._last = self._last, spans
+            if last is None or spans[1:] != last[1:]:
+                self._moves = 0
+            elif spans[0].start <= last[0].stop < spans[0].stop:
+                self._moves += 1
+                return self._moves
+            elif spans[0] != last[0]:
+                self._moves = 0
+            return 0
+
+
+def chunks_after(
+    spans: Sequence[range],
+    grid: Sequence[int],
+    layers: int,
+    missing: int,
+    room: int,
+    cached: Callable[[Index], bool],
+) -> list[Index]:
+    """Chunks to decode beside those of a read, one for each thread that it leaves without work.
+
+    Args:
+        spans: chunks of the read along each axis.
+        grid: chunks of the array along each axis.
+        layers: how many layers after the read they may lie in.
+        missing: chunks of the read that are not in the cache. Nothing is decoded beside none.
+        room: chunks that the cache holds. Those of the read and these take half of it at most.
+        cached: whether a chunk is in the cache.
+    """
+    if not missing:
+        return []
+    first = spans[0].stop
+    after = product(range(first, min(first + layers, grid[0])), *spans[1:])
+    idle = min(usable_threads(), room // 2) - missing
+    return list(islice((index for index in after if not cached(index)), max(0, idle)))
+
+
+SPARSE_SHARE = 4
+"""Index entries are read one by one for fewer than one in SPARSE_SHARE inner chunks of a shard."""
+
+
+class ShardPlaces:
+    """Indices of an array's shards, each read once; safe for several threads."""
+
+    def __init__(
+        self,
+        sharding: Sharding,
+        shape: Sequence[int],
+        members: Mapping[Index, Member],
+        source: Source,
+    ) -> None:
+        """Read nothing yet.
+
+        shape: of the array. members: of the file, by index of the shard.
+        """
+        self._sharding, self._shape, self._members, self._source = sharding, shape, members, source
+        self._indices: dict[Index, npt.NDArray[np.int64]] = {}
+        self._entries: dict[tuple[Index, int], tuple[int, int]] = {}
+        self._lock = ForkLock()
+
+    def read(self, spans: Sequence[range]) -> None:
+        """Read what the inner chunks of `spans` need of each shard's index: all of it, or entries.
+
+        Raises DamagedFileError that names the member.
+        """
+        parts = list(self._sharding.parts(spans))
+        if self._source.gap:
+            self._source.prefetch(self._unread(parts))
+        for shard, in_shard in parts:
+            if self._wholly(in_shard):
+                self._index(shard)
+            else:
+                for index in product(*in_shard):
+                    self._entry(*self._sharding.place(index))
+
+    def place(self, index: Index) -> tuple[Index, int, int, int]:
+        """The shard of an inner chunk, its number there, and its offset in the member and bytes.
+
+        Raises DamagedFileError that names the member.
+        """
+        shard, number = self._sharding.place(index)
+        return shard, number, *self._entry(shard, number)
+
+    def _wholly(self, in_shard: Sequence[range]) -> bool:
+        """Whether the whole index is read for some inner chunks of a shard."""
+        if self._sharding.index_bytes <= self._source.gap:
+            return True
+        return SPARSE_SHARE * prod(map(len, in_shard)) >= prod(self._sharding.counts)
+
+    def _unread(self, parts: Sequence[tuple[Index, list[range]]]) -> Iterator[Range]:
+        """The ranges of the file that `read` will read."""
+        for shard, in_shard in parts:
+            with self._lock:
+                if shard in self._indices:
+                    continue
+            member = self._members[shard]
+            start = member.data_offset + member.size - self._sharding.index_bytes
+            if start < member.data_offset:
+                continue  # damage, which `_index_place` tells
+            if self._wholly(in_shard):
+                yield start, self._sharding.index_bytes
+            else:
+                for index in product(*in_shard):
+                    number = self._sharding.place(index)[1]
+                    yield start + number * ENTRY_BYTES, ENTRY_BYTES
+
+    def _entry(self, shard: Index, number: int) -> tuple[int, int]:
+        """(offset in the member, bytes) of one inner chunk of a shard.
+
+        They come from the shard's index if that was read, else from the entry alone, read once.
+        """
+        with self._lock:
+            index = self._indices.get(shard)
+            if index is not None:
+                return int(index[number, 0]), int(index[number, 1])
+            entry = self._entries.get((shard, number))
+            if entry is None:
+                with self._index_place(shard) as (start, data_bytes):
+                    entry = parse_entry(
+                        self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes
+                    )
+                self._entries[shard, number] = entry
+        return entry
+
+    def _index(self, shard: Index) -> None:
+        """Read (offset in the member, bytes) of each inner chunk of a shard, (chunks, 2), once."""
+        with self._lock:
+            if shard in self._indices:
+                return
+            with self._index_place(shard) as (start, data_bytes):
+                self._indices[shard] = parse_index(
+                    self._source.read(start, self._sharding.index_bytes),
+                    self._sharding.present(shard, self._shape),
+                    data_bytes,
+                )
+
+    @contextmanager
+    def _index_place(self, shard: Index) -> Iterator[tuple[int, int]]:
+        """A block that reads a shard's index; its errors name the member.
+
+        Yields the offset of the index in the file, and the number of bytes in the shard before it.
+        """
+        member = self._members[shard]
+        data_bytes = member.size - self._sharding.index_bytes
+        try:
+            if data_bytes < 0:
+                raise DamagedFileError(
+                    f"{member.size} bytes are too few for the index of a shard, "
+                    f"{self._sharding.index_bytes}"
+                )
+            yield member.data_offset + data_bytes, data_bytes
+        except DamagedFileError as error:
+            raise type(error)(f"member {member.name}: {error}") from error
+
 
 MASK = ":mask"
 """Suffix of an array's name for its masks in the cache."""
@@ -29,7 +257,6 @@ TABLE = ":table"
 UNCORRECTED = ":uncorrected"
 """Suffix of an array's name for its chunks of which only a part was corrected so far."""
 
-ChunkIndex = tuple[int, ...]
 Part = tuple[slice, ...]
 
 
@@ -56,7 +283,7 @@ class StoredArray:
         path: object,
         name: str,
         metadata: ArrayMetadata,
-        chunks: Mapping[ChunkIndex, Member],
+        chunks: Mapping[Index, Member],
         source: Source,
         cache: ChunkCache,
     ) -> None:
@@ -122,7 +349,7 @@ class StoredArray:
             if 0 in lengths:
                 return np.empty(lengths, dtype=dtype)
 
-            def fill(index: ChunkIndex) -> None:
+            def fill(index: Index) -> None:
                 in_region, in_chunk = common_part(index, self.chunk_shape, bounds)
                 values[in_region] = read(index, in_chunk, keep=region is not None)
 
@@ -204,11 +431,11 @@ class StoredArray:
         for _ in self._for_chunks(self._decode_and_drop, [range(n) for n in self.grid]):
             done()
 
-    def _decode_and_drop(self, index: ChunkIndex) -> None:
+    def _decode_and_drop(self, index: Index) -> None:
         self._decode(index)
 
     def _for_chunks(
-        self, work: Callable[[ChunkIndex], None], spans: Sequence[range], ahead: bool = False
+        self, work: Callable[[Index], None], spans: Sequence[range], ahead: bool = False
     ) -> Iterator[None]:
         """Do `work` for each chunk whose index lies in `spans`, as the result is iterated.
 
@@ -219,7 +446,7 @@ class StoredArray:
             first axis will want next.
         """
 
-        def cached(index: ChunkIndex) -> bool:
+        def cached(index: Index) -> bool:
             return self._cache.get((self.name, index, 0)) is not None
 
         if self._shards is None:
@@ -229,7 +456,7 @@ class StoredArray:
         self._read_places(spans)
         indices = list(product(*spans))
         missing = sum(not cached(index) for index in indices)
-        after: list[ChunkIndex] = []
+        after: list[Index] = []
         if ahead and (layers := self._ahead.layers(spans)):
             room = self._cache.limit // self._metadata.chunk_bytes
             after = chunks_after(spans, self.grid, layers, missing, room, cached)
@@ -237,7 +464,7 @@ class StoredArray:
         if missing + len(after) < 2:
             return map(work, indices)
 
-        def decode(index: ChunkIndex) -> None:
+        def decode(index: Index) -> None:
             # What fails now fails again once it is wanted.
             with suppress(FhashError, MemoryError):
                 self._decoded(index, 0, keep=True)
@@ -260,9 +487,7 @@ class StoredArray:
         if self._shards is not None:
             self._shards.read(spans)
 
-    def _announce(
-        self, indices: Iterable[ChunkIndex], names: Sequence[str] = (), lod: int = 0
-    ) -> None:
+    def _announce(self, indices: Iterable[Index], names: Sequence[str] = (), lod: int = 0) -> None:
         """Let a source elsewhere fetch chunks that are not in the cache.
 
         names: of the cache, under which they may be there.
@@ -275,7 +500,7 @@ class StoredArray:
                 if all(self._cache.get((name, index, lod)) is None for name in names)
             )
 
-    def _place(self, index: ChunkIndex) -> tuple[int, int]:
+    def _place(self, index: Index) -> tuple[int, int]:
         """Offset in the file and bytes of what `_stored_chunk` reads of an inner chunk."""
         if self._shards is None:
             member = self.chunks[index]
@@ -283,12 +508,12 @@ class StoredArray:
         shard, _, offset, size = self._shards.place(index)
         return self.chunks[shard].data_offset + offset, size
 
-    def _chunk(self, index: ChunkIndex, lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
+    def _chunk(self, index: Index, lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
         """The values of a chunk, from the cache or decoded; `keep` puts them into the cache."""
         cached = self._cache.get((self.name, index, lod))
         return self._decoded(index, lod, keep)[0] if cached is None else cached
 
-    def _part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+    def _part(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
         """A part of a chunk; of one that was not read before, where it can, without the rest."""
         coder = self._metadata.coder
         places = (self.name, index, 0), (self.name + UNCORRECTED, index, 0)
@@ -303,11 +528,11 @@ class StoredArray:
         self._cache.put(places[table is not None], kept)
         return values[part] if table is None else values
 
-    def _mask_part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+    def _mask_part(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
         """A part of the mask of a chunk."""
         return self._mask(index, keep=keep)[part]
 
-    def _mask(self, index: ChunkIndex, *, keep: bool) -> npt.NDArray[Any]:
+    def _mask(self, index: Index, *, keep: bool) -> npt.NDArray[Any]:
         """The mask of a chunk's occupied values, from the cache or decoded."""
         cached = self._cache.get((self.name + MASK, index, 0))
         mask = self._decoded(index, 0, keep)[1] if cached is None else cached
@@ -315,7 +540,7 @@ class StoredArray:
         return mask
 
     def _decoded(
-        self, index: ChunkIndex, lod: int, keep: bool
+        self, index: Index, lod: int, keep: bool
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk and its mask, decoded and read-only; `keep` puts both into the cache."""
         table = self._cache.get((self.name + UNCORRECTED, index, lod))
@@ -332,7 +557,7 @@ class StoredArray:
         return values, mask
 
     def _decode(
-        self, index: ChunkIndex, lod: int = 0, *, table: bool = False
+        self, index: Index, lod: int = 0, *, table: bool = False
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk straight from the file, and its mask where chunks have one.
 
@@ -346,18 +571,18 @@ class StoredArray:
                 return coder.decode_masked(data)
             return coder.decode(data, lod), None
 
-    def coded(self, index: ChunkIndex) -> memoryview:
+    def coded(self, index: Index) -> memoryview:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""
         with self._stored_chunk(index) as data:
             self._metadata.coder.check(data)
             return data
 
-    def coded_bytes(self, index: ChunkIndex) -> int:
+    def coded_bytes(self, index: Index) -> int:
         """The number of bytes that `coded` returns, without reading them."""
         return self.chunks[index].size if self._shards is None else self._place(index)[1]
 
     @contextmanager
-    def _stored_chunk(self, index: ChunkIndex) -> Iterator[memoryview]:
+    def _stored_chunk(self, index: Index) -> Iterator[memoryview]:
         """The bytes of an inner chunk, for a block whose errors name where it lies."""
         shards = self._shards
         if shards is None:

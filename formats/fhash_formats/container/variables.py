@@ -14,14 +14,13 @@ from typing import Any
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import TRANSFORM
-from fhash_formats.container.defaults import complete
-from fhash_formats.container.header import POSITIONS, TABLE, check_format, validate_header
+from fhash_formats.container.header import POSITIONS, TABLE, check_format, complete, validate_header
 from fhash_formats.container.record import Record
+from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.errors import DamagedFileError
 
 __all__ = [
     "ARRAY",
-    "AUXILIARY",
     "CONSOLIDATED",
     "COORDINATES",
     "DIMENSIONS",
@@ -49,8 +48,6 @@ SHARES = "shares"
 """Key of a variable's header: arrays beside the data that lie with another variable."""
 PARTS = "parts"
 """Group of all arrays but tables that show values, and coordinates."""
-AUXILIARY = "auxiliary/"
-"""Beginning of the names of arrays beside the data."""
 COORDINATES = "coords/"
 """Beginning of the names of coordinates."""
 CONSOLIDATED = "consolidated_metadata"

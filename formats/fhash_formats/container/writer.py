@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import product
+from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -18,24 +19,15 @@ import numpy.typing as npt
 
 from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.chunks import Coded, coded_chunk, cut, expect_end, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
-from fhash_formats.container.defaults import brief
-from fhash_formats.container.header import FORMAT, POSITIONS, TABLE
+from fhash_formats.container.header import FORMAT, POSITIONS, TABLE, brief
 from fhash_formats.container.hierarchy import GROUP
-from fhash_formats.container.layout import (
-    FORMAT_VERSION,
-    Member,
-    document_member,
-    ending,
-    local_header,
-)
 from fhash_formats.container.reader import Container
-from fhash_formats.container.sharding import sharding_codecs
+from fhash_formats.container.sharding import Sharding, pack_index, sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
+from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.variables import (
     ARRAY,
-    AUXILIARY,
     CONSOLIDATED,
     COORDINATES,
     DIMENSIONS,
@@ -47,11 +39,120 @@ from fhash_formats.container.variables import (
     part_place,
     shows_values,
 )
-from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
+from fhash_formats.container.zip_file import (
+    DOCUMENT,
+    FORMAT_VERSION,
+    MAX_MEMBER,
+    MAX_NAME,
+    NAME,
+    Member,
+    document_member,
+    ending,
+    local_header,
+)
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.atomic import replacing
 from fhash_formats.support.plain_json import plain_json
 from fhash_formats.support.slabs import slab_shape
+
+Coded = npt.NDArray[Any] | bytes
+"""A chunk to write: its values, or the bytes that the coder of its first codec made of them."""
+
+
+def cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDArray[Any]]:
+    """Yield the chunks of an array in memory, in C order; the last along an axis may be shorter."""
+    starts = (
+        range(0, n, max(1, chunk)) for n, chunk in zip(array.shape, chunk_shape, strict=False)
+    )
+    for corner in product(*starts):
+        yield array[
+            tuple(
+                slice(start, start + chunk)
+                for start, chunk in zip(corner, chunk_shape, strict=False)
+            )
+        ]
+
+
+def expect_end(name: str, metadata: ArrayMetadata, chunks: Iterator[Any]) -> None:
+    """Raise InputError if chunks are left that the grid of the array has no place for."""
+    if next(chunks, None) is not None:
+        grid = metadata.inner_grid
+        raise InputError(
+            f"array {name}: more chunks were given than the {prod(grid)} of the grid {grid}"
+        )
+
+
+def shard_parts(
+    name: str,
+    metadata: ArrayMetadata,
+    sharding: Sharding,
+    shard: tuple[int, ...],
+    chunks: Iterator[Coded | tuple[tuple[int, ...], Coded]],
+) -> list[bytes]:
+    """The parts of a shard, in the order of the file: its inner chunks in C order, and its index.
+
+    Args:
+        name: the array's, for messages.
+        metadata: the array's.
+        sharding: the array's.
+        shard: index of the shard.
+        chunks: takes the shard's inner chunks from here, each alone (then in C order) or with its
+            index in the array's grid of inner chunks (then in any order).
+
+    Raises:
+        InputError: if an inner chunk is missing, given twice, or does not fit.
+    """
+    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(
+        sharding.chunks_of(shard, metadata.shape)
+    )
+    for expected in list(coded):
+        item = next(chunks, None)
+        if item is None:
+            raise InputError(
+                f"array {name}: chunk {expected} was not given; the grid has {metadata.inner_grid}"
+            )
+        index, chunk = item if isinstance(item, tuple) else (expected, item)
+        if coded.get(index, b"") is not None:
+            raise InputError(
+                f"array {name}: chunk {index} is none of shard {shard}, or was given twice"
+            )
+        coded[index] = coded_chunk(name, metadata, index, chunk)
+    inner_chunks = [data for data in coded.values() if data is not None]
+    return [
+        *inner_chunks,
+        pack_index([len(data) for data in inner_chunks], sharding.present(shard, metadata.shape)),
+    ]
+
+
+def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
+    """The bytes of a chunk, from its values or as they are.
+
+    Raises InputError as `full_chunk` does.
+    """
+    if isinstance(chunk, bytes):
+        return chunk
+    return metadata.coder.encode(full_chunk(name, metadata, index, chunk))
+
+
+def full_chunk(
+    name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: npt.NDArray[Any]
+) -> npt.NDArray[Any]:
+    """A chunk padded with 0 to the full shape, as Zarr stores those at an end of the array.
+
+    Raises InputError for a chunk of another shape or number type than the array needs at `index`.
+    """
+    expected = tuple(span.stop - span.start for span in metadata.inner_region(index))
+    if chunk.shape != expected or chunk.dtype.newbyteorder("=") != metadata.dtype:
+        raise InputError(
+            f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; "
+            f"{metadata.dtype} {expected} is needed"
+        )
+    if expected == metadata.inner_shape:
+        return chunk
+    full = np.zeros(metadata.inner_shape, dtype=metadata.dtype)
+    full[tuple(slice(0, n) for n in expected)] = chunk
+    return full
+
 
 USUAL_CHUNK_BYTES = 2 << 20
 """Bytes of a decoded chunk that `add_whole` aims at."""
@@ -152,15 +253,17 @@ class ContainerWriter:
         self._coordinates: dict[str, tuple[Any, ...]] = {}
         self._auxiliary: dict[tuple[Any, ...], int] = {}
 
-    def begin(self, name: str, attributes: Mapping[str, Any]) -> None:
-        """Begin a variable, whose table has a name as near as possible to this one.
+    def begin(self, variable: Mapping[str, Any]) -> None:
+        """Begin a variable, whose table has a name as near as possible to that of the variable.
 
-        Args:
-            name: of the variable; among several, one of their names.
-            attributes: of the variable; its table gets those of SHOWN_ATTRIBUTES.
+        variable: `name`, `units` and `attributes`, as the header has them; the table gets its units
+            and those of SHOWN_ATTRIBUTES. Several variables have the names that were given for
+            them, in that order.
         """
+        attributes = {**variable["attributes"], "units": variable["units"]}
         shown = {key: attributes[key] for key in SHOWN_ATTRIBUTES if attributes.get(key)}
         if self.one_of_several:
+            name = list(self._nodes)[len(self._headers)]
             begun = self._position + len(self._tail()) if self._headers else 0
             self._variable = _Variable(
                 name=name,
@@ -170,13 +273,9 @@ class ContainerWriter:
                 begun=begun,
             )
             return
-        self._variable = _Variable(name=None, number=0, node=free_node(name, ()), attributes=shown)
-        self._names_taken = {self._variable.node}
-
-    @property
-    def begun(self) -> bool:
-        """Whether a variable has begun that is not finished."""
-        return self._variable is not None
+        node = free_node(variable["name"], ())
+        self._variable = _Variable(name=None, number=0, node=node, attributes=shown)
+        self._names_taken = {node}
 
     def name_axes(self, coordinates: Sequence[str], shape: Sequence[int]) -> list[str]:
         """Give the axes of the variable names before their coordinates are written, if at all.
@@ -231,7 +330,7 @@ class ContainerWriter:
             chunk_shape: shape of a full chunk.
             chunks: the chunks in C order of their grid; those at an end of the array reach as far
                 as the array does. A chunk may also be the bytes that the coder of its first codec
-                made of the full chunk, without CRC-32C.
+                made of the full chunk.
             dimension_names: names of the axes.
             attributes: JSON values.
             codecs: a list as in Zarr's metadata; by default `bytes`, `zstd`, `crc32c`.
@@ -279,7 +378,7 @@ class ContainerWriter:
             chunks: the chunks in the order of `shard_order`. Each may instead come as (index,
                 chunk) with its index in the grid of chunks: then shards come in C order, and the
                 chunks of a shard in any order. A chunk is an array as in `add_array`, or the bytes
-                that the coder of its first codec made of the full chunk, without CRC-32C.
+                that its coder made of the full chunk.
             dimension_names: names of the axes.
             attributes: JSON values.
             codecs: of the chunks, as in `add_array`.
@@ -435,7 +534,7 @@ class ContainerWriter:
         if self._variable is None:
             if self.one_of_several:
                 raise InputError(f"{self.path}: no variable has begun")
-            self.begin("values", {})
+            self.begin({"name": "values", "units": "", "attributes": {}})
         assert self._variable is not None
         return self._variable
 

@@ -193,16 +193,13 @@ template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t Coder<MODE, TRELLIS>::ru
             const int weight =
                 around.weight + sum_references(bands, band, row, lanes, nothing, sums);
             const int offset = 160 - log16(weight);
-            sum_neighbours<true>(around, kind, lanes, sums);
+            sum_neighbours<true>(around, lanes, sums);
             const int32_t* FHASH_RESTRICT const expected = sums.expected;
             const int32_t* FHASH_RESTRICT const plane = sums.plane;
-            const int32_t* FHASH_RESTRICT const both = sums.both;
             const int32_t* FHASH_RESTRICT const nearest = sums.nearest;
             const int32_t* FHASH_RESTRICT const sides = sums.sides;
             const int32_t* FHASH_RESTRICT const others = sums.others;
-            const int32_t* FHASH_RESTRICT const parent = sums.parent;
             const int32_t* FHASH_RESTRICT const nears = sums.near;
-            const int32_t* FHASH_RESTRICT const wide = sums.wide;
             int filled = 0, left = 0, left2 = 0;
 
             // Whether the integer at x is, or may be read as, 0 without a choice.
@@ -228,12 +225,10 @@ template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t Coder<MODE, TRELLIS>::ru
                 }
                 const int level = level_of(mu, offset), coarse = level / 2;
                 const int near = plane[x] + 2 * left + left2;
-                int context[CONTEXTS] = {level,    kind * 64 + coarse, nearest[x],
-                                         nears[x], others[x],          wide[x]};
+                int context[CONTEXTS] = {level, nearest[x], nears[x], others[x]};
                 if (left | left2) {
-                    context[2] += min(left, 2) * 243;
-                    context[3] = small(near) * 144 + sides[x];
-                    context[5] = small((near + both[x]) / 2) * (12 * KINDS) + parent[x];
+                    context[1] += min(left, 2) * 243;
+                    context[2] = small(near) * 144 + sides[x];
                 }
                 auto predict = [&](Prediction& to, int asked) FHASH_LAMBDA {
                     const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
@@ -273,8 +268,8 @@ template <Mode MODE, bool TRELLIS> FHASH_INLINE int64_t Coder<MODE, TRELLIS>::ru
                 p = predict(now, 1);
                 if (!filled) find_logs(bands, band, t, z, y, no_log, logs);
                 const int negative =
-                    referred ? task.signs->code<true>(range, logs, kind, t, y, x, value < 0)
-                             : task.signs->code<false>(range, logs, kind, t, y, x, value < 0);
+                    referred ? task.signs->code<true>(range, logs, kind, y, x, value < 0)
+                             : task.signs->code<false>(range, logs, kind, y, x, value < 0);
                 filled = 1;
 
                 // The magnitude.

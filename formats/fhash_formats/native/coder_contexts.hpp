@@ -13,8 +13,8 @@
 
 namespace {
 
-const int CONTEXTS = 6, SIGN_CONTEXTS = 8;  // estimates of a magnitude, and of a sign
-const int LANES = 12, SET = padded(LANES);  // weights of a set: of the caller, and as kept here
+const int CONTEXTS = 4, SIGN_CONTEXTS = 4;  // estimates of a magnitude, and of a sign
+const int LANES = 2 * CONTEXTS, SET = padded(LANES);  // weights of a set, and with its zeros
 const int DECISIONS = 16;                   // slots of a context
 const int UNARY = 14;                       // magnitudes from this one on have an escape code
 const int SHARED = 2;  // decisions from this one on are one for both quantisers; those of class 1
@@ -39,11 +39,9 @@ const int ABOVE = 184, DIAGONAL = 61, ABOVE2 = 41;  // above, each beside that, 
 const int BEFORE = 102, AROUND = 20, BEFORE2 = 31;  // before along t or z, around that, the second
 const int REFERENCE = 62;  // the vertex of a reference; the sum around it has weight AROUND
 
-const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
-const int64_t ALL_CONTEXTS =
-    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS);
-const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27, KINDS * 108,
-                                       KINDS * 27, KINDS * 81, KINDS * 54, KINDS * 25};
+const int SIZES[CONTEXTS] = {LEVELS, 729, 12 * 12 * 12, 7 * 7 * 7 * 7};
+const int64_t ALL_CONTEXTS = LEVELS + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7;
+const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 108, KINDS * 81, KINDS * 25};
 
 // Order of the state. Slots: by context, those of the decisions of a context together; then those
 // of the signs. Weights: sets by kind; from SECOND on by level; then those of coder_signs.hpp.
@@ -117,14 +115,14 @@ FHASH_INLINE int level_of(uint32_t mu, int offset) {
 struct Sums {
     std::vector<int32_t> room;
     int32_t *expected;                // weighted sum for the expected magnitude
-    int32_t *plane, *both;            // sums over the rows above; the step before and layer below
-    int32_t *nearest, *sides, *others, *parent;  // shares in the contexts
+    int32_t* plane;                   // sum over the rows above
+    int32_t *nearest, *sides, *others;  // shares in the contexts
     int32_t *share, *level;           // by vertex of a reference: share in `expected`, class
-    int32_t *near, *wide;             // contexts where both neighbours to the left are 0
-    explicit Sums(size_t width) : room(11 * width) {
+    int32_t* near;                    // context where both neighbours to the left are 0
+    explicit Sums(size_t width) : room(8 * width) {
         int32_t* at = room.data();
-        for (int32_t** array : {&expected, &plane, &both, &nearest, &sides,
-                                &others, &parent, &share, &level, &near, &wide}) {
+        for (int32_t** array :
+             {&expected, &plane, &nearest, &sides, &others, &share, &level, &near}) {
             *array = at;
             at += width;
         }
@@ -237,17 +235,15 @@ FHASH_INLINE Around rows_around(const Band& band, const Row& row, const uint16_t
 // Add the neighbours within the band, but those to the left, for `lanes` vertices: to the expected
 // magnitude, and with SHARES as shares in the contexts.
 template <bool SHARES>
-FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& sums) {
+FHASH_INLINE void sum_neighbours(const Around& rows, int lanes, Sums& sums) {
     const uint16_t *const a = rows.above, *const a2 = rows.above2;
     const uint16_t *const b = rows.before, *const b2 = rows.before2;
     const uint16_t *const bp = rows.before_near[0], *const bf = rows.before_near[1];
     const uint16_t *const bn = rows.before_near[2], *const bs = rows.before_near[3];
     const uint16_t *const d = rows.below, *const d2 = rows.below2;
     const uint16_t *const dn = rows.below_near[0], *const ds = rows.below_near[1];
-    int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const both = sums.both;
-    int32_t *FHASH_RESTRICT const plane = sums.plane, *FHASH_RESTRICT const parent = sums.parent;
-    int32_t *FHASH_RESTRICT const near = sums.near, *FHASH_RESTRICT const wide = sums.wide;
-    int32_t *FHASH_RESTRICT const sides = sums.sides;
+    int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const near = sums.near;
+    int32_t *FHASH_RESTRICT const plane = sums.plane, *FHASH_RESTRICT const sides = sums.sides;
     int32_t* FHASH_RESTRICT const nearest = sums.nearest;
     // The compiler makes vectors of inner loops only whose length is a constant, with -fwrapv.
     for (int64_t begin = 0; begin < lanes; begin += VECTOR) {
@@ -263,18 +259,14 @@ FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& 
             if (!SHARES) continue;
             const int in_plane = 2 * a[x] + a_sides + a2[x];
             const int before = 2 * b[x] + b_sides + b_near, below = 2 * d[x] + d_sides + d_near;
-            const int side = twelve(before) * 12 + twelve(below), sum = before + below;
+            const int side = twelve(before) * 12 + twelve(below);
             int digits = min<int>(a[x], 2) * 3 + min<int>(a[x - 1], 2);
             digits = digits * 3 + min<int>(a[x + 1], 2);
             digits = digits * 3 + min<int>(b[x], 2);
             nearest[x] = digits * 3 + min<int>(d[x], 2);
             plane[x] = in_plane;
             sides[x] = side;
-            both[x] = sum;
-            const int of_parent = parent[x] * KINDS + kind;
-            parent[x] = of_parent;
             near[x] = twelve(in_plane) * 144 + side;
-            wide[x] = twelve((in_plane + sum) >> 1) * (12 * KINDS) + of_parent;
         }
     }
 }
@@ -285,10 +277,9 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
                                 int lanes, const uint16_t* nothing, Sums& sums) {
     const int n3 = band.size[3];
     int32_t* FHASH_RESTRICT const expected = sums.expected;
-    int32_t *FHASH_RESTRICT const others = sums.others, *FHASH_RESTRICT const parent = sums.parent;
+    int32_t* FHASH_RESTRICT const others = sums.others;
     std::memset(sums.expected, 0, 4 * (size_t)lanes);
     std::memset(sums.others, 0, 4 * (size_t)lanes);
-    std::memset(sums.parent, 0, 4 * (size_t)lanes);
     int weight = 0;
     for (int k = 0; k < REFERENCE_COUNT; k++) {
         if (band.references[k].band >= 0) weight += REFERENCE + 2 * AROUND;
@@ -312,9 +303,6 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
                     expected[x] += REFERENCE * p[x] + AROUND * sum;
                     others[x] += seven(sum) * scale;
                 }
-                if (k) continue;
-                FHASH_INDEPENDENT
-                for (int i = 0; i < VECTOR; i++) parent[begin + i] = twelve(around(begin + i));
             }
             continue;
         }
@@ -326,7 +314,7 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
                 const int64_t i = begin + n;
                 const int sum = around(i);
                 share[i] = REFERENCE * p[i] + AROUND * sum;
-                level[i] = twelve(sum);
+                level[i] = seven(sum);
             }
         }
         int done = 0;
@@ -336,25 +324,18 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
                 FHASH_INDEPENDENT
                 for (int n = 0; n < VECTOR / 2; n++) {
                     const int64_t i = begin + n;
-                    const int digit = min(level[i], 6) * scale;
+                    const int digit = level[i] * scale;
                     expected[2 * i] += share[i];
                     expected[2 * i + 1] += share[i];
                     others[2 * i] += digit;
                     others[2 * i + 1] += digit;
-                }
-                if (k) continue;
-                FHASH_INDEPENDENT
-                for (int n = 0; n < VECTOR / 2; n++) {
-                    const int64_t i = begin + n;
-                    parent[2 * i] = parent[2 * i + 1] = level[i];
                 }
             }
         }
         for (int x = done; x < n3; x++) {
             const int i = min(x >> shift, last);
             expected[x] += share[i];
-            others[x] += min(level[i], 6) * scale;
-            if (k == 0) parent[x] = level[i];
+            others[x] += level[i] * scale;
         }
     }
     return weight;

@@ -24,7 +24,7 @@ const int GRADIENT_MAX = 181;  // largest gradient, in 1/128: the sums below sta
 const int PERIOD = 32;         // uses after which mean squares and rates are made anew
 const int RATE_CLASSES = 16 * 15 + 1;
 const int LOGIT_BIN = 85;      // a third, in 1/256: width of the classes of the logit
-const int SIGN_SET = 24;       // mixing weights of a sign: of SIGN_CONTEXTS estimates, of the logit
+const int SIGN_SET = 16;       // mixing weights of a sign: of SIGN_CONTEXTS estimates, of the logit
 
 // Order of the weights of signs, behind the sets of contexts. The caller's sets of these have LANES
 // weights each, those of signs have no gaps.
@@ -353,31 +353,26 @@ struct Signs {
             if (linear[kind]) linear[kind]->keep(numbers + 2 * SIGN_INPUTS * kind);
     }
 
-    // Code the sign at (t, y, x) of the row that `logs` lies around; 1 for a negative one.
+    // Code the sign at (y, x) of the row that `logs` lies around; 1 for a negative one.
     // REFERRED: whether bands have references.
     template <bool REFERRED, class Range>
-    FHASH_INLINE int code(Range& range, const Logs& logs, int kind, int t, int y, int x, int bit) {
+    FHASH_INLINE int code(Range& range, const Logs& logs, int kind, int y, int x, int bit) {
         if (!linear[kind]) linear[kind].reset(new Linear(numbers + 2 * SIGN_INPUTS * kind));
         Linear& predictor = *linear[kind];
         const uint32_t dot = gather_signs<REFERRED>(logs, x, y, predictor.weights, inputs);
         const int logit = min(max((int32_t)dot >> 14, -LINEAR_MAX), LINEAR_MAX);
-        const int left = sign_of(logs.own[x - 1]), left2 = sign_of(logs.own[x - 2]);
-        const int up = sign_of(logs.up[x]), up2 = sign_of(logs.up2[x]);
+        const int left = sign_of(logs.own[x - 1]), up = sign_of(logs.up[x]);
         const int up_left = sign_of(logs.up[x - 1]), up_right = sign_of(logs.up[x + 1]);
         const int below = sign_of(logs.below[1][x]);
-        const int before = sign_of(logs.before[1][x]), before2 = sign_of(logs.before2[x]);
-        int there[REFERENCE_COUNT];
-        for (int k = 0; k < REFERENCE_COUNT; k++)
+        const int before = sign_of(logs.before[1][x]);
+        int there[3];
+        for (int k = 0; k < 3; k++)
             there[k] = REFERRED ? sign_of(logs.references[k].at(x)) : sign_of(0);
         const int bin = min(max((logit + 12 * LOGIT_BIN + LOGIT_BIN / 2) / LOGIT_BIN, 0), 24);
         const int context[SIGN_CONTEXTS] = {
-            kind * 27 + (left * 3 + up) * 3 + before,
-            kind * 81 + ((left * 3 + left2) * 3 + up) * 3 + up2,
             kind * 27 + (before * 3 + below) * 3 + left,
             kind * 108 + ((there[0] * 3 + there[1]) * 3 + there[2]) * 4 + (x & 1) * 2 + (y & 1),
-            kind * 27 + (there[3] * 3 + left) * 3 + up,
             kind * 81 + ((up_left * 3 + up_right) * 3 + left) * 3 + up,
-            kind * 54 + ((before * 3 + before2) * 3 + there[1]) * 2 + (t & 1),
             kind * 25 + bin,
         };
         Mixed<SIGN_CONTEXTS> sign;

@@ -135,7 +135,7 @@ FHASH_INLINE void find_buckets(const int64_t* shape, const std::vector<Band>& ba
         const int lanes = (n + VECTOR - 1) / VECTOR * VECTOR;
         const Around around = rows_around(band, row, nothing);
         const int weight = around.weight + sum_references(bands, band, row, lanes, nothing, sums);
-        sum_neighbours<false>(around, 0, lanes, sums);
+        sum_neighbours<false>(around, lanes, sums);
         const float scale = 1.0f / (float)weight;
         const int32_t* FHASH_RESTRICT const expected = sums.expected;
         FHASH_INDEPENDENT

@@ -18,7 +18,7 @@ import pytest
 
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.expected_arrays import layer_shapes, occupancy_bytes
-from fhash_formats.container.layout import END, Member, comment, ending, local_header
+from fhash_formats.container.zip_file import END, Member, comment, ending, local_header
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -45,6 +45,7 @@ def make_header() -> dict[str, Any]:
         "features": ["all"],
         "dilation": 1,
         "coreset_fraction": 0.5,
+        "coordinates": {},
         "model": {
             "profile": "paper",
             "fold": 2,
@@ -80,7 +81,10 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
         arrays[f"mlp/weight_{number}"] = rng.standard_normal((outputs, inputs)).astype(np.float32)
         arrays[f"mlp/bias_{number}"] = rng.standard_normal(outputs).astype(np.float32)
     arrays["occupancy/bits"] = rng.integers(
-        0, 256, (key_frames, occupancy_bytes(header["feature_bounding_box"])), dtype=np.uint8
+        0,
+        256,
+        (len(header["features"]), key_frames, occupancy_bytes(header["feature_bounding_box"])),
+        dtype=np.uint8,
     )
     return arrays
 
@@ -101,7 +105,7 @@ def make_compact_header() -> dict[str, Any]:
         "time": {"values": [0, 0.5, 2, 2.25], "attributes": {"units": "h"}},
         "z": {},
         "y": {"start": -1.5, "step": 0.25},
-        "x": {"start": 0.1, "step": 0.3, "last": 1.6, "dtype": "float32", "name": "lon"},
+        "x": {"start": 0.1, "step": 0.3, "ulps": [1], "dtype": "float32", "name": "lon"},
     }
     return header
 

@@ -29,6 +29,10 @@ def compact_header(samples: Any) -> dict[str, Any]:
     return header
 
 
+PLAIN_VARIABLE = {"name": "v", "units": "", "attributes": {}}
+"""A variable as `begin` takes it."""
+
+
 def write_several(path: Path, samples: Any, *, paper: bool = True) -> Path:
     """A container of the variables u, group/v, w and, where it is asked for, one of the profile
     paper; its path.
@@ -38,14 +42,14 @@ def write_several(path: Path, samples: Any, *, paper: bool = True) -> Path:
         writer.attributes = {"title": "four winds"}
         for name in names[:3]:
             parts = table_parts(head=name != "w")
-            writer.begin(name, {"units": "m s-1", "flag": 1})
+            writer.begin({"name": "v", "units": "m s-1", "attributes": {"flag": 1}})
             add_coordinates(writer, shift=0.25 if name == "w" else 0)
             writer.add_whole("auxiliary/area", np.full((5, 6), float(name == "w")))
             parts.write(writer)
             writer.finish(compact_header(samples))
         if paper:
             header = samples.header()
-            writer.begin("paper", {})
+            writer.begin(PLAIN_VARIABLE)
             for array, values in samples.arrays(header).items():
                 writer.add_whole(array, values)
             writer.finish(header)

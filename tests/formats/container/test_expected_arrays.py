@@ -20,7 +20,7 @@ ARRAYS = {
     "mlp/weight_1": lambda a: np.ascontiguousarray(a.T),
     "mlp/bias_1": lambda a: a[:, None],
     "mlp/weight_2": lambda a: a.astype("float64"),
-    "occupancy/bits": lambda a: a[:, :-1],
+    "occupancy/bits": lambda a: a[..., :-1],
 }
 
 
@@ -66,6 +66,19 @@ def test_a_mask_may_stand_in_place_of_the_bits(tmp_path, samples) -> None:
     for other in (mask[1:], mask.astype(np.int16)):
         with pytest.raises(InputError, match=r"array occupancy/mask is .* the header asks for"):
             samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": other})
+    header["features"] = [f"isosurface:{n}" for n in range(9)]
+    with pytest.raises(InputError, match="of 9 features; more than 8 need occupancy/bits"):
+        samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": mask})
+
+
+def test_the_bits_have_a_grid_of_each_feature(tmp_path, samples) -> None:
+    header = samples.header()
+    header["features"] = ["isosurface:0", "isosurface:1"]
+    arrays = samples.arrays(header)
+    samples.write(tmp_path / "a.fhz", header, arrays)
+    arrays["occupancy/bits"] = arrays["occupancy/bits"][:1]
+    with pytest.raises(InputError, match=r"the header asks for uint8 \(2, 2, 16\)"):
+        samples.write(tmp_path / "b.fhz", header, arrays)
 
 
 def test_one_step_of_one_vertex(tmp_path, samples) -> None:
@@ -74,7 +87,7 @@ def test_one_step_of_one_vertex(tmp_path, samples) -> None:
     header["feature_bounding_box"] = [[0, 1]] * 3
     header["model"]["levels"] = [[1, 1, 1, 1]]
     arrays = samples.arrays(header)
-    assert arrays["occupancy/bits"].shape == (1, 1)
+    assert arrays["occupancy/bits"].shape == (1, 1, 1)
     samples.write(tmp_path / "a.fhz", header, arrays)
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.verify() == len(arrays)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from several_files import add_coordinates, compact_header, write_several
+from several_files import PLAIN_VARIABLE, add_coordinates, compact_header, write_several
 from table_files import table_parts, write_table
 
 from fhash_formats.container import Container, ContainerWriter
@@ -71,8 +71,8 @@ def test_arrays_show_the_axes_that_are_whole(tmp_path, samples) -> None:
 def test_sizes_of_variables_add_up_to_the_file(tmp_path, samples) -> None:
     parts, sizes = table_parts(), []
     with ContainerWriter(tmp_path / "a.fhz", variables=["u", "v"]) as writer:
-        for name in "uv":
-            writer.begin(name, {})
+        for _ in "uv":
+            writer.begin(PLAIN_VARIABLE)
             add_coordinates(writer)
             mark = writer.mark()
             for _ in range(2):  # once more after a rewinding
@@ -117,7 +117,7 @@ def test_names_must_differ(tmp_path, names) -> None:
 
 def test_a_variable_alone_is_not_committed(tmp_path) -> None:
     with ContainerWriter(tmp_path / "a.fhz", variables=["u"]) as writer:
-        writer.begin("u", {})
+        writer.begin(PLAIN_VARIABLE)
         with pytest.raises(InputError, match="finish each and commit them"):
             writer.commit({})
     assert not (tmp_path / "a.fhz").exists()
@@ -127,8 +127,8 @@ def test_a_coordinate_never_takes_the_place_of_a_variable(tmp_path, samples) -> 
     parts = table_parts()
     names = ["u", "z", "y_box", "parts"]
     with ContainerWriter(tmp_path / "a.fhz", variables=names) as writer:
-        for name in names:
-            writer.begin(name, {})
+        for _ in names:
+            writer.begin(PLAIN_VARIABLE)
             add_coordinates(writer)
             parts.write(writer)
             writer.finish(compact_header(samples))
@@ -145,7 +145,7 @@ def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, sa
     path, places = tmp_path / "a.fhz", np.arange(30.0).reshape(5, 6)
     with ContainerWriter(path, variables=["u", "v", "w"]) as writer:
         for name in "uvw":
-            writer.begin(name, {})
+            writer.begin(PLAIN_VARIABLE)
             add_coordinates(writer)
             writer.add_whole("auxiliary/lat", places + (name == "w"))
             table_parts().write(writer)

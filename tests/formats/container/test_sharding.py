@@ -21,7 +21,7 @@ from fhash_formats.container.sharding import (
     parse_index,
     sharding_codecs,
 )
-from fhash_formats.container.zip_checked import MAX_MEMBER
+from fhash_formats.container.zip_file import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 
 

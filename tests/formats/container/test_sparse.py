@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import Container, ContainerWriter, validate_header
-from fhash_formats.container.sparse import COUNTS, SPARSE_FEATURE
+from fhash_formats.container.header import COUNTS, SPARSE_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
 
 COUNTED = {"tables/level_1": [5, 7], "tables/level_2": [3, 0]}

@@ -14,7 +14,7 @@ from table_files import HEAD, PLAIN
 
 from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter
 from fhash_formats.container.coding import transform_codecs
-from fhash_formats.container.stored import StoredArray
+from fhash_formats.container.stored import Ahead, ChunkCache, StoredArray, chunks_after
 from fhash_formats.errors import DamagedFileError, RegionError
 from fhash_formats.support.number_types import DTYPES
 from fhash_formats.transform.head.head import NeighbourHead
@@ -275,3 +275,95 @@ def test_a_small_part_of_a_tile_comes_without_the_rest_and_the_rest_later(
         assert corrected == [(2, 4, 6, 4), shape]
         assert array.decode_chunk((0, 0, 0, 0)).tobytes() == whole.tobytes()
         assert array.read().tobytes() == whole.tobytes()
+
+
+def chunk(size: int = 100) -> np.ndarray:
+    return np.zeros(size, dtype=np.uint8)
+
+
+def test_the_least_recently_used_chunk_is_dropped_first() -> None:
+    cache, kept = ChunkCache(300), chunk()
+    cache.put(("a", (0,), 0), kept)
+    cache.put(("a", (1,), 0), chunk())
+    cache.put(("a", (0,), 1), chunk())
+    assert cache.get(("a", (0,), 0)) is kept
+    cache.put(("b", (0,), 0), chunk())
+    assert cache.get(("a", (1,), 0)) is None
+    assert cache.get(("a", (0,), 0)) is kept
+    cache.clear()
+    assert cache.get(("a", (0,), 0)) is None
+
+
+def test_a_chunk_beyond_the_limit_is_not_kept() -> None:
+    cache = ChunkCache(100)
+    cache.put(("a", (0,), 0), chunk(101))
+    assert cache.get(("a", (0,), 0)) is None
+
+
+def test_cache_holds_no_more_than_its_limit(sample) -> None:
+    with Container.open(sample, cache_bytes=200) as container:
+        table = container.arrays["tables/level_1"]
+        for _ in range(2):
+            table.read(tuple(slice(0, n) for n in table.shape))
+        assert 0 < container._cache._bytes <= 200
+        assert container._cache._bytes == sum(
+            chunk.nbytes for chunk in container._cache._chunks.values()
+        )
+    with Container.open(sample, cache_bytes=0) as container:
+        table = container.arrays["tables/level_1"]
+        table.read(tuple(slice(0, n) for n in table.shape))
+        assert container._cache._bytes == 0
+
+
+def read(ahead: Ahead, *spans: tuple[int, int]) -> int:
+    return ahead.layers([range(*span) for span in spans])
+
+
+def test_reads_that_go_on_along_the_first_axis_look_farther_each_time() -> None:
+    ahead = Ahead()
+    assert read(ahead, (0, 1), (0, 2)) == 0
+    assert read(ahead, (0, 1), (0, 2)) == 0
+    assert read(ahead, (1, 2), (0, 2)) == 1
+    assert read(ahead, (1, 2), (0, 2)) == 0
+    assert read(ahead, (1, 3), (0, 2)) == 2
+    assert read(ahead, (3, 4), (0, 2)) == 3
+
+
+@pytest.mark.parametrize("other", [((4, 5), (0, 2)), ((2, 3), (1, 2)), ((0, 1), (0, 2))], ids=str)
+def test_other_reads_begin_anew(other: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    ahead = Ahead()
+    read(ahead, (0, 1), (0, 2))
+    assert read(ahead, (1, 2), (0, 2)) == 1
+    assert read(ahead, *other) == 0
+    (_, stop), space = other
+    assert read(ahead, (stop, stop + 1), space) == 1
+
+
+@pytest.mark.parametrize(
+    ("threads", "missing", "room", "expected"),
+    [
+        (1, 1, 99, []),
+        (2, 1, 99, [(1, 0)]),
+        (2, 2, 99, []),
+        (3, 1, 99, [(1, 0), (2, 0)]),
+        (9, 1, 99, [(1, 0), (2, 0), (2, 1)]),
+        (9, 1, 4, [(1, 0)]),
+        (9, 1, 1, []),
+        (9, 0, 99, []),
+    ],
+)
+def test_each_thread_without_work_gets_a_chunk_that_is_not_cached(
+    threads: int,
+    missing: int,
+    room: int,
+    expected: list[tuple[int, int]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("FHASH_THREADS", str(threads))
+    spans, cached = [range(0, 1), range(0, 2)], {(1, 1)}.__contains__
+    assert chunks_after(spans, (3, 2), 2, missing, room, cached) == expected
+
+
+def test_nothing_lies_after_the_last_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_THREADS", "4")
+    assert chunks_after([range(2, 3)], (3,), 5, 1, 99, lambda _: False) == []

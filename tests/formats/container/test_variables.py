@@ -73,7 +73,7 @@ def test_a_table_is_hidden_where_its_codec_lacks_something() -> None:
 
 def test_one_variable_has_the_names_of_its_source(tmp_path, samples) -> None:
     with ContainerWriter(tmp_path / "a.fhz") as writer:
-        writer.begin("surface/rain rate", {"units": "K", "flag": 1})
+        writer.begin({"name": "surface/rain rate", "units": "K", "attributes": {"flag": 1}})
         assert writer.name_axes(["time", "z", "lat", "lat"], (4, 3, 5, 6)) == [
             *("time", "z", "lat", "lat_2")
         ]

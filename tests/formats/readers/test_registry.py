@@ -15,7 +15,7 @@ import pytest
 
 import fhash_formats
 from fhash_formats import RawLayout, open_series
-from fhash_formats.container.layout import ending
+from fhash_formats.container.zip_file import ending
 from fhash_formats.errors import FhashError, InputError, MissingInputError, RegionError
 from fhash_formats.readers import REGISTRY
 

@@ -21,17 +21,17 @@ __all__ = ["State", "blank_state", "prior_state", "unpack_state"]
 
 DECISIONS = 16
 """Decisions of a magnitude, each with estimates and weights of its own."""
-LANES = 12
+LANES = 8
 """Weights of a set: two per estimate."""
 KINDS = 64
 """Kinds of bands."""
 LEVELS = 128
 """Levels of the expected magnitude."""
-SIZES = (LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS)
-"""Contexts of a decision, for each of the six estimates that are mixed."""
-SIGN_SIZES = tuple(KINDS * size for size in (27, 81, 27, 108, 27, 81, 54, 25))
-"""Contexts of a sign, for each of the eight estimates that are mixed."""
-SIGN_SET = 24
+SIZES = (LEVELS, 729, 12 * 12 * 12, 7 * 7 * 7 * 7)
+"""Contexts of a decision, for each of the four estimates that are mixed."""
+SIGN_SIZES = tuple(KINDS * size for size in (27, 108, 81, 25))
+"""Contexts of a sign, for each of the four estimates that are mixed."""
+SIGN_SET = 16
 """Weights of a sign: two per estimate, then that of the linear logit."""
 SIGN_INPUTS = 96
 """Weights of a linear predictor of signs, each with a mean square of its gradient."""
@@ -98,7 +98,7 @@ class State:
 def blank_state() -> State:
     """A state that has learned nothing: even odds, and weights that believe the estimates."""
     weights = [(KINDS * DECISIONS * LANES, 4423), (64 * DECISIONS * LANES, 0)]
-    weights += [(16, 2048), (1, 8192), (SIGN_SET - 17, 0)] * KINDS
+    weights += [(8, 2048), (1, 8192), (SIGN_SET - 9, 0)] * KINDS
     weights += [(SIGN_INPUTS, 0), (SIGN_INPUTS, FIRST_SQUARE)] * KINDS
     slots = sum(SIZES) * DECISIONS + sum(SIGN_SIZES)
     return State.even(slots=slots, weights=weights, simples=SIMPLES)

@@ -211,7 +211,7 @@ def test_tables_differ_only_where_nothing_needs_them(files) -> None:
 def test_the_finest_level_has_the_samples_alone(files) -> None:
     with fhash_codec.open(files[1]) as volume:
         box = volume.info["model"]["levels"][0][1:]
-        bits = volume.container.arrays["occupancy/bits"].read()
+        (bits,) = volume.container.arrays["occupancy/bits"].read()
         masks = np.stack([occupancy.unpack(row, tuple(box)) for row in bits])
         samples = masks.copy()
         samples[1:] |= masks[:-1]
