@@ -49,9 +49,9 @@ runpy.run_path("setup.py")
 """
 """Runs setup.py for one library."""
 FAULTS = """
-zip-gap formats/fhash_formats/container/zip_checked.py
+zip-gap formats/fhash_formats/container/zip_file.py
 if member.offset != position or member.end => if member.end
-zip-crc formats/fhash_formats/container/zip_checked.py
+zip-crc formats/fhash_formats/container/zip_file.py
 zlib.crc32(data) != member.crc => False
 shard-present formats/fhash_formats/container/sharding.py
 np.arange(count) < -(-n // chunk) - s * count => np.arange(count) <= -(-n // chunk) - s * count
