@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from readable_paper import FHash
 
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.fhash import FHash
 from fhash_codec.paper.levels import parameter_count
 
 

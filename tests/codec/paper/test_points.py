@@ -9,10 +9,10 @@ from math import prod
 import numpy as np
 import pytest
 import torch
+from readable_paper import FHash
 
 from fhash_codec.paper import points
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.fhash import FHash
 from fhash_codec.paper.levels import level_resolutions
 from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.paper.points import input_slopes, sample_points

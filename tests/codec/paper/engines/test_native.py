@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 from engine_checks import assert_near
+from readable_paper import NaiveEngine
 
 from fhash_codec.native.network import PATHS, machine_paths
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines.naive import NaiveEngine
 from fhash_codec.paper.engines.native import NativeEngine, refusal
 from fhash_codec.paper.engines.native_task import BLOCK
 from fhash_codec.paper.engines.slab import SlabEngine
@@ -81,9 +81,7 @@ def oracle_of(model_of):
     def make(case):
         if case not in known:
             coreset, architecture = model_of(case)
-            oracle = NaiveEngine(
-                architecture, coreset, RATES, seed=7, device=CPU, dtype=torch.float64
-            )
+            oracle = NaiveEngine(architecture, coreset, RATES, seed=7)
             first = oracle.infer(np.arange(len(coreset.bricks))).numpy()
             random, bricks = np.random.default_rng(1), len(coreset.bricks)
             batches = [random.permutation(bricks)[: max(1, bricks // 3)] for _ in range(STEPS)]
@@ -120,7 +118,7 @@ def test_gradients_equal_those_of_autograd_in_float64(model_of, path) -> None:
     coreset, architecture = model_of("64 neurons twice")
     bricks = np.arange(len(coreset.bricks))
     engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
-    oracle = NaiveEngine(architecture, coreset, RATES, seed=7, device=CPU, dtype=torch.float64)
+    oracle = NaiveEngine(architecture, coreset, RATES, seed=7)
     used = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU).upsampling.used
     engine.train(bricks)
     oracle.train(bricks)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from engine_checks import assert_gradient_of_autograd, assert_near
+from readable_paper import NaiveEngine
 
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines.naive import NaiveEngine
 from fhash_codec.paper.engines.slab import SlabEngine
 
 CPU = torch.device("cpu")
@@ -42,7 +42,7 @@ def engines_of(noise_coreset):
         architecture = Architecture.for_box(coreset.box.shape, shape[0], width=16, **settings)
         rates = np.full(201, 0.01)
         slab = SlabEngine(architecture, coreset, rates, seed=7, device=CPU)
-        oracle = NaiveEngine(architecture, coreset, rates, seed=7, device=CPU, dtype=torch.float64)
+        oracle = NaiveEngine(architecture, coreset, rates, seed=7)
         return coreset, slab, oracle
 
     return make
