@@ -7,7 +7,7 @@ are left out, with the reason, where they are missing; wheels in a folder on PYT
 
 Parts: oracle (gradients and values of fused and slab against the naive engine in float64), speed
 (steps one after another, without waiting for each), points (places in a network by fused kernels
-and by torch: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
+and on the host: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
 against seconds of training), pictures (adaptive ray marching through the network), selftest.
 
 `--device cpu --quick` tries the script itself without a GPU; its figures mean nothing.

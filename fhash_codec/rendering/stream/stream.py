@@ -4,9 +4,8 @@ The model is evaluated for a whole pass at once. Plain streaming takes one sampl
 is alive in a pass. Adaptive ray marching takes more samples the fewer rays are left, N_s =
 clamp(N_r / N_alive, 1, 64) of each ray (paper, algorithm 1).
 
-Both make the same picture. With numpy it is the same bit for bit, since every number of a sample is
-computed without the other samples of the pass (inference.py). On a device a network's values differ
-by the rounding of matrix products, and the picture with them.
+Both make the same picture, with numpy bit for bit: every number of a sample is computed without the
+other samples of the pass (inference.py).
 
 A pass is computed where the field has its values: by numpy on the host, or by torch on a device.
 From a device only counts come back before the picture is finished. The host waits for a few of them

@@ -1,9 +1,10 @@
-"""Points by the native library: every path, against the 16-corner formula and against numpy."""
+"""Points by every path of the native library, and the parts of tables that it reads."""
 
 from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
+from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -12,10 +13,8 @@ import pytest
 from fhash_codec.native import network as native
 from fhash_codec.native.network import best_path
 from fhash_codec.paper import points
-from fhash_codec.paper.native_points import NativePoints
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.point_tables import PointTables
-from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.points import PointSampler, PointTables, corners_before, sample_points
 
 SHAPES = [
     # Box (z, y, x), key frames, fold, embedding size, hidden layers, width.
@@ -65,10 +64,11 @@ def test_every_path_gives_the_values_of_the_formula(library, networks, network) 
     for path in paths(library):
         values = np.empty(len(expected), np.float32)
         slopes = np.empty((len(expected), 4), np.float32)
-        NativePoints(library, tables, path).evaluate(places, values, slopes)
+        sampler = PointSampler(tables, path=path)
+        sampler.evaluate(places, values, slopes)
         np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-5)
         alone = np.empty_like(values)
-        NativePoints(library, tables, path).evaluate(places, alone, None)
+        sampler.evaluate(places, alone)
         np.testing.assert_array_equal(alone, values)
 
 
@@ -77,10 +77,9 @@ def test_tables_at_one_time_give_the_same_bits(library, networks, network) -> No
     places = [np.array([key_index]), *networks.points(network, 200)[1:]]
     tables = PointTables.of_box(network, key_index)
     for path in paths(library):
-        both = NativePoints(library, tables, path)
         values, once = np.empty(200, np.float32), np.empty(200, np.float32)
-        both.evaluate(places, values, None)
-        both.at(key_index).evaluate([np.zeros(1), *places[1:]], once, None)
+        PointSampler(tables, path=path).evaluate(places, values)
+        PointSampler(tables, key_index, path).evaluate([np.zeros(1), *places[1:]], once)
         np.testing.assert_array_equal(once, values)
 
 
@@ -89,8 +88,10 @@ def test_few_points_of_one_time_have_the_bits_of_many(networks, library, monkeyp
     places = [np.array([2.3]), *networks.points(network, 2000)[1:]]
     values = sample_points(network, *places)
     once = []
-    at = NativePoints.at
-    monkeypatch.setattr(NativePoints, "at", lambda self, key: once.append(key) or at(self, key))
+    at = PointTables.at
+    monkeypatch.setattr(
+        PointTables, "at", lambda self, key, path: once.append(key) or at(self, key, path)
+    )
     np.testing.assert_array_equal(sample_points(network, *places), values)
     few = [places[0], *(p[:5] for p in places[1:])]
     monkeypatch.setattr(points, "READ_PER_POINT", 0)
@@ -129,9 +130,9 @@ def test_strided_places_and_several_threads_change_nothing(networks, library) ->
 
 def test_a_path_that_is_not_there_is_refused(networks, library) -> None:
     network = networks.random((2, 3, 4), 1, 2, 2, 1)
-    points = NativePoints(library, PointTables.of_box(network, 0), 3)
+    sampler = PointSampler(PointTables.of_box(network, 0), path=3)
     with pytest.raises(MemoryError):
-        points.evaluate([np.zeros(1)] * 4, np.empty(1, np.float32), None)
+        sampler.evaluate([np.zeros(1)] * 4, np.empty(1, np.float32))
     assert best_path(library) == max(paths(library))
 
 
@@ -139,3 +140,44 @@ def test_layers_that_overflow_stay_so(networks, library) -> None:
     network = networks.random((2, 3, 4), 2, 2, 2, 2)
     huge = tuple((np.full_like(weight, 3e38), bias) for weight, bias in network.layers)
     assert not np.isfinite(sample_points(replace(network, layers=huge), 0.5, 1, 1, 1)).any()
+
+
+def test_a_part_holds_the_corners_of_all_points(networks, network) -> None:
+    recording = networks.recording(network)
+    points = np.array(networks.points(network, 7))
+    tables = PointTables.read(recording, points.min(axis=1).tolist(), points.max(axis=1).tolist())
+    for level, patch in zip(network.levels, tables.patches, strict=True):
+        before = np.array([corners_before(tables.sizes, level, point) for point in points.T])
+        last = np.minimum(before + 1, np.array(level) - 1)
+        assert (before.min(axis=0) == patch.first).all()
+        assert (last.max(axis=0) < np.add(patch.first, patch.values.shape[:4])).all()
+    assert all(len(table.regions) == 1 for table in recording.tables)
+
+
+def test_tables_at_one_time_are_those_between_its_nodes(networks) -> None:
+    network = networks.random((4, 5, 6), 5, 2, 2, 1, dtype=np.float16)
+    tables = PointTables.of_box(network, 1.7)
+    still = tables.at(1.7)
+    assert (still.still, tables.still) == (True, False)
+    assert still.at(0.0) is still
+    for level, patch, table in zip(network.levels, still.patches, network.tables, strict=True):
+        position = 1.7 * (level[0] - 1) / 4
+        node = int(position)
+        low, high = table.values[node].astype(float), table.values[node + 1].astype(float)
+        expected = low + (position - node) * (high - low)
+        np.testing.assert_allclose(patch.values[0], expected, rtol=1e-6, atol=1e-6)
+        assert patch.values.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("size", "resolution"), [(125, 63), (80, 41), (7, 3), (997, 499), (50, 2), (1, 1), (64, 64)]
+)
+def test_points_beside_a_border_lie_in_the_exact_cell(size: int, resolution: int) -> None:
+    """The native library finds cells without a quotient: it must find the same, which were read."""
+    borders = np.arange(1, resolution - 1) * (size - 1) / max(resolution - 1, 1)
+    places = np.concatenate([borders, *(np.nextafter(borders, end) for end in (0, size))])
+    places = np.append(places, [0.0, size - 1.0])
+    before = [corners_before((size,) * 4, (resolution,) * 4, [at] * 4)[0] for at in places]
+    scaled = [Fraction(float(place * (resolution - 1))) for place in places]
+    exact = [min(at // max(size - 1, 1), max(resolution - 2, 0)) for at in scaled]
+    assert before == exact

@@ -27,8 +27,7 @@ from fhash_codec.paper.engines.fused.source import (
 )
 from fhash_codec.paper.levels import Resolution
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.point_tables import Patch, PointTables, SparsePatch
-from fhash_codec.paper.points import PointSampler
+from fhash_codec.paper.points import Patch, PointSampler, PointTables, SparsePatch
 
 FILES = ("network.cuh", "points.cu")
 """The files of the kernels in the order in which they follow each other."""

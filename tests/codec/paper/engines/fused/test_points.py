@@ -20,8 +20,7 @@ from fhash_codec.paper.engines.fused.points import (
 )
 from fhash_codec.paper.engines.fused.source import KERNELS, Unavailable
 from fhash_codec.paper.network import ArrayTable
-from fhash_codec.paper.point_tables import PointTables
-from fhash_codec.paper.points import PointSampler
+from fhash_codec.paper.points import PointSampler, PointTables
 
 CPU = torch.device("cpu")
 ORDERS = (0, 1, 5)
