@@ -90,6 +90,7 @@ def march_native(
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
     every processor has. The pictures agree within rounding.
     """
+    assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
     task = task.marched
     given = MarchInput.of(frame, task, bricks)
     buffers = _Buffers.of(task)

@@ -33,7 +33,7 @@ class Leaping:
     side: float
 
     @classmethod
-    def of(cls, bricks: Bricks, task: Task, first: Array, stride: float, arrays: Arrays) -> Leaping:
+    def of(cls, bricks: Bricks, task: Task, first: Array, arrays: Arrays) -> Leaping:
         """Leaping for a task: over bricks without a visible value and without a surface.
 
         task: with the table that samples take.
@@ -45,7 +45,7 @@ class Leaping:
             distance=arrays.array(distance, "int64"),
             last=last,
             first=first,
-            side=SIDE * stride,
+            side=float(SIDE),
         )
 
     def matters(self, places: Array) -> Array:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 
-from fhash_codec.rendering.stream.fields import Field, FrameField, central_slopes
+from fhash_codec.rendering.stream.fields import Field, central_slopes
 from fhash_codec.rendering.task.arrays import Array, Arrays
-from fhash_codec.rendering.task.slopes import flatness, slope_scale, smoothing
+from fhash_codec.rendering.task.slopes import flatness, slope_scale
 from fhash_codec.rendering.task.task import LightGrid, Lighting, Task
 
 __all__ = ["LightAt", "Phong"]
@@ -23,8 +23,7 @@ class Phong:
             of the table's range per vertex spacing.
         floor: gradient at which the light from a direction has faded by half, so that the noise of
             rounding is not lit.
-        field: whose gradients are taken, those of smoothed values where the noise of coding is
-            large.
+        field: whose gradients are taken.
         central: whether by central differences.
     """
 
@@ -45,17 +44,14 @@ class Phong:
         least, most = field.bricks.value_range
         low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
         span, floor = flatness(low, high, least, most, task.noise)
-        deviation = smoothing(span, task.noise) if isinstance(field, FrameField) else 0.0
         return cls(
             arrays=arrays,
             lighting=lighting,
             lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
-            scale=arrays.array(field.stride * slope_scale(task.rays.grid, span, least, most)),
+            scale=arrays.array(slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
-            field=field.smoothed(deviation, task.error)
-            if deviation and isinstance(field, FrameField)
-            else field,
-            central=lighting.central or deviation > 0,
+            field=field,
+            central=lighting.central,
         )
 
     def slopes(self, places: Array) -> Array:

@@ -126,10 +126,10 @@ class _Marcher:
         self.field, self.task, self.beams, self.arrays = field, task, beams, arrays
         self.palette = None if task.table is None else Palette.of(task.table, arrays)
         self.canvas = Canvas(field, task, beams, self.palette)
-        self.leaping = Leaping.of(field.bricks, task, field.first, field.stride, arrays)
+        self.leaping = Leaping.of(field.bricks, task, field.first, arrays)
         # A step longer than a brick could pass through one in which a surface lies, on its way from
         # one in which nothing is visible to another.
-        short = task.step <= SIDE * field.stride * float(np.min(np.abs(task.rays.grid.spacing)))
+        short = task.step <= SIDE * float(np.min(np.abs(task.rays.grid.spacing)))
         self.skipping = task.skipping and (short or not task.surfaces)
         # Between two samples in cells without a surface there may be a cell with one: pictures with
         # surfaces look at whole bricks.
@@ -241,7 +241,7 @@ class _Marcher:
         """Whether places (n, 3) lie in visible cells."""
         assert self.cells is not None
         z, y, x = self.cells.shape
-        at = self.arrays.to_int64((places - self.field.first) / self.field.stride)
+        at = self.arrays.to_int64(places - self.field.first)
         i, j, k = (
             self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z))
         )

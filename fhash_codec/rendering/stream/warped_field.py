@@ -22,9 +22,8 @@ class WarpedField:
     """
 
     def __init__(self, field: Field, warp: Warp) -> None:
-        """Stand between a marcher and a field whose cells are one vertex wide."""
-        assert field.stride == 1
-        self._field, self.arrays, self.stride = field, field.arrays, field.stride
+        """Stand between a marcher and a field."""
+        self._field, self.arrays = field, field.arrays
         arrays = field.arrays
         counts = [
             own if places is None else len(places)

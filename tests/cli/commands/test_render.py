@@ -99,7 +99,7 @@ def test_explain_says_what_is_done_and_what_it_took(
     fhash: Fhash, run: Path, tmp_path: Path
 ) -> None:
     view = tmp_path / "v.png"
-    result = fhash("render", run, "-o", view, "--explain", "--size", "24", "--march", "arm")
+    result = fhash("render", run, "-o", view, "--explain", "--size", "24")
     assert result.exit_code == 0
     assert "none: no effect asks for it" in result.stdout
     assert "evaluations" in result.stdout

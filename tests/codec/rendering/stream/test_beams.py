@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from frame_field import FrameField
 
 from fhash_codec.rendering.stream.beams import Beams, shares, slab
-from fhash_codec.rendering.stream.fields import FrameField
 from fhash_codec.rendering.task.arrays import NUMPY
 from fhash_codec.rendering.task.task import Task
 

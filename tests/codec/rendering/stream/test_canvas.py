@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import FrameField
 
 from fhash_codec import Volume
 from fhash_codec.rendering.stream.beams import Beams
 from fhash_codec.rendering.stream.canvas import Canvas, Events
-from fhash_codec.rendering.stream.fields import Field, FrameField
+from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.stream.stream import stream
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 from fhash_codec.rendering.task.palette import Palette

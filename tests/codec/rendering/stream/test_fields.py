@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import FrameField
 
 import fhash_codec
 from fhash_codec import Volume
-from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField, central_slopes
+from fhash_codec.rendering.stream.fields import Field, NetworkField, central_slopes
 from fhash_codec.rendering.task.arrays import Arrays
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame, Task
+from fhash_codec.rendering.task.task import Task
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import InputError
 
@@ -61,23 +59,6 @@ def test_central_differences_reach_one_vertex_to_both_sides(frame_task: FrameTas
     found = central_slopes(field, np.array([[5.25, 3.0, 4.0]]))
     np.testing.assert_allclose(found[0, 0], values[4, 3, 6] - values[4, 3, 5], rtol=1e-6)
     np.testing.assert_allclose(found[0, 1:], [-2, 5.25], rtol=1e-6)
-
-
-def test_central_differences_are_per_vertex_at_every_stride() -> None:
-    x = np.broadcast_to(np.arange(0, 18, 2.0) ** 2, (5, 5, 9))
-    grid = Grid(counts=(17, 9, 9), origin=np.zeros(3), spacing=np.ones(3))
-    frame = Frame(values=x.astype(np.float32), first=(0, 0, 0), stride=2)
-    field = FrameField(frame, grid, Bricks.of(frame))
-    np.testing.assert_allclose(
-        central_slopes(field, np.array([[6.0, 4.0, 4.0]])), [[12.0, 0, 0]], rtol=1e-6
-    )
-    # Beyond the last vertex, up to the end of the domain, it is that of the last vertex.
-    wider = FrameField(frame, replace(grid, counts=(18, 9, 9)), Bricks.of(frame))
-    np.testing.assert_allclose(
-        central_slopes(wider, np.array([[16.0, 4.0, 4.0], [16.9, 4.0, 4.0]])),
-        [[15.0, 0, 0]] * 2,
-        rtol=1e-6,
-    )
 
 
 def test_a_field_that_does_not_fit_says_so(

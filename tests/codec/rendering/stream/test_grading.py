@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frame_field import FrameField
 
-from fhash_codec.rendering.stream.fields import FrameField
 from fhash_codec.rendering.stream.grading import Factors
 from fhash_codec.rendering.task.task import GRADES, Grading, Task
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frame_field import FrameField
 
 from fhash_codec.rendering.camera.grid import Grid
-from fhash_codec.rendering.stream.fields import FrameField
 from fhash_codec.rendering.stream.warped_field import WarpedField
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
-from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.palette import Palette
 from fhash_codec.rendering.task.task import Frame, Table
 from fhash_formats.series import Coordinate
@@ -28,7 +27,7 @@ def fields(arrays: Arrays = NUMPY) -> tuple[FrameField, WarpedField, Grid]:
     values[:, :, 5] = np.nan
     own = Grid(counts=(10, 9, 7), origin=np.zeros(3), spacing=np.ones(3))
     frame = Frame(values=values, first=(0, 0, 0))
-    inner = FrameField(frame, own, Bricks.of(frame), arrays)
+    inner = FrameField(frame, own, arrays)
     return inner, WarpedField(inner, grid.warp), grid
 
 
