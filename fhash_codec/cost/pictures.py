@@ -32,8 +32,7 @@ from fhash_codec.rendering.scene.scene import (
     Shading,
     Shadows,
 )
-from fhash_codec.rendering.task.counters import complete
-from fhash_codec.rendering.task.task import Frame
+from fhash_codec.rendering.task.task import Frame, complete
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume

@@ -34,7 +34,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.levels import Resolution
+from fhash_codec.paper.architecture import Resolution
 from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.errors import DamagedFileError, InputError
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.native import network as native
-from fhash_codec.paper.levels import Resolution
+from fhash_codec.paper.architecture import Resolution
 from fhash_codec.paper.network import Floats, Network
 from fhash_codec.paper.tables.ranked import RankedBits, SparseFrame, row_bits
 from fhash_formats.errors import InputError, RegionError

@@ -23,14 +23,12 @@ from fhash_codec.rendering.picture.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
-from fhash_codec.rendering.stream.fields import Field, NetworkField
+from fhash_codec.rendering.stream.fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.stream.warped_field import WarpedField
 from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Marched, Task
+from fhash_codec.rendering.task.task import Frame, Marched, Task, complete
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume

@@ -149,7 +149,7 @@ class Smoothed(FrameField):
 
 
 def streamed(frame: Frame, task: Task) -> Marched:
-    """What the native marcher gives, by the streamed one, without bricks of coarse frames."""
+    """The picture of the streamed marcher, which knows no bricks of coarse frames."""
     grid, task = task.rays.grid, replace(task, skipping=task.skipping and frame.stride == 1)
     field = FrameField(frame, grid)
     if task.lighting is not None:

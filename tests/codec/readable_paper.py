@@ -19,10 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.architecture import Architecture, Resolution
 from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.initial import Parameters, initial_parameters
-from fhash_codec.paper.levels import Resolution
 from fhash_codec.training.adam import BETA1, BETA2, EPSILON
 
 

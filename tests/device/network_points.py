@@ -26,7 +26,7 @@ def measured_points(
     import torch
 
     from fhash_codec.paper.engines.fused.start import start_points
-    from fhash_codec.rendering.stream.inference import HostInference
+    from fhash_codec.rendering.stream.fields import HostInference
     from fhash_codec.rendering.task.torch_arrays import TorchArrays
 
     there, results = torch.device(device), []

@@ -23,7 +23,6 @@ from fhash_codec.rendering.native.structure import (
     LIT,
     MAX_PLANES,
     MAX_SURFACES,
-    MAX_VALUES,
     MAXIMUM,
     MINIMUM,
     POWERS,
@@ -35,21 +34,21 @@ from fhash_codec.rendering.native.structure import (
     plane,
     surface,
 )
-from fhash_codec.rendering.task.bricks import SIDE, Bricks
-from fhash_codec.rendering.task.counters import complete
-from fhash_codec.rendering.task.smoothing import smoothed
+from fhash_codec.rendering.task.bricks import SIDE, Bricks, smoothed
 from fhash_codec.rendering.task.task import (
     GRADES,
+    MAX_VALUES,
     Frame,
     Lighting,
     Marched,
     Table,
     Task,
+    complete,
     extinctions_in,
 )
 from fhash_formats.support.threads import in_threads, usable_threads
 
-__all__ = ["MAX_SURFACES", "MAX_VALUES", "march_native"]
+__all__ = ["MAX_SURFACES", "march_native"]
 
 Single = npt.NDArray[np.float32]
 

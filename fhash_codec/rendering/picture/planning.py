@@ -19,7 +19,6 @@ from fhash_codec.rendering.camera.view import part_in_view, part_of_body, pixel_
 from fhash_codec.rendering.colour.colours import parse_colour
 from fhash_codec.rendering.colour.opacity import Histogram, about
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
-from fhash_codec.rendering.native.structure import MAX_VALUES
 from fhash_codec.rendering.picture.explain import reasons
 from fhash_codec.rendering.picture.layout import lay_out, quantity_of
 from fhash_codec.rendering.picture.lighting import (
@@ -36,8 +35,8 @@ from fhash_codec.rendering.scene.scene import (
 )
 from fhash_codec.rendering.task.arrays import NUMPY
 from fhash_codec.rendering.task.devices import arrays_on
-from fhash_codec.rendering.task.grading import grading_of
-from fhash_codec.rendering.task.task import Surface, Table, Task
+from fhash_codec.rendering.task.slopes import grading_of
+from fhash_codec.rendering.task.task import MAX_VALUES, Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError

@@ -13,7 +13,7 @@ from PIL import Image as Pictures
 
 import fhash_codec
 from fhash_codec.rendering.scene.scene import scene_in_png
-from fhash_codec.rendering.task.counters import COUNTERS
+from fhash_codec.rendering.task.task import COUNTERS
 
 Fhash = Callable[..., Result]
 

@@ -15,7 +15,7 @@ from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import renderer as module
 from fhash_codec.rendering.scene.scene import scene_in_png
-from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
+from fhash_codec.rendering.task.task import COUNTERS, complete, rows
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import DamagedFileError, InputError
 

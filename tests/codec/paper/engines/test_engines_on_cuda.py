@@ -128,7 +128,7 @@ def test_captured_steps_are_the_steps_kernel_by_kernel(
     batches = [few[number] for number in random.integers(0, 4, 16)]
     with pretended_cuda():
         captured = steps(coreset, batches)
-        monkeypatch.setattr("fhash_codec.paper.engines.graphs.MAX_GRAPHS", 0)
+        monkeypatch.setattr("fhash_codec.paper.engines.slab.MAX_GRAPHS", 0)
         plain = steps(coreset, batches)
     for name, array in plain.items():
         np.testing.assert_array_equal(captured[name], array, err_msg=name)

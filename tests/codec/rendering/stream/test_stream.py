@@ -16,7 +16,7 @@ from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.stream.beams import Beams
-from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.stream.stream import Projection, crossings, stream
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 from fhash_codec.rendering.task.task import Marched, Surface, Task
 
@@ -223,3 +223,66 @@ def test_nothing_is_seen_of_what_has_no_value(frame_task: FrameTask) -> None:
     found = stream(field, task, adaptive=False)
     assert not found.rgba.any()
     assert found.counters["samples"] == 0
+
+
+VALUES = np.array([[0.2, 0.9, np.nan, 0.4], [np.nan, 0.1, 0.6, 0.6], [np.nan] * 4])
+LENGTHS = np.array([[1.0, 1.0, 1.0, 0.5]] * 3)
+OPACITIES = np.where(np.isnan(VALUES), 0.0, 0.5 * np.nan_to_num(VALUES))
+
+
+@pytest.mark.parametrize("pace", [1, 3, 4])
+@pytest.mark.parametrize(
+    ("kind", "values", "at"),
+    [
+        ("maximum", [0.9, 0.6], [1, 2]),
+        ("minimum", [0.2, 0.1], [0, 1]),
+        ("average", [1.3 / 2.5, 1.0 / 2.5], [0, 1]),
+        ("attenuated", [0.9 * 0.9, 0.6 * 0.95], [1, 2]),
+    ],
+)
+def test_values_and_places(kind: str, values: list[float], at: list[int], pace: int) -> None:
+    projection = Projection(kind, (0.0, 1.0), 3, NUMPY)
+    alive = np.arange(3)
+    for first in range(0, 4, pace):
+        part = slice(first, min(first + pace, 4))
+        sample = np.broadcast_to(np.arange(4)[part], VALUES[:, part].shape)
+        projection.add(alive, sample, VALUES[:, part], LENGTHS[:, part], OPACITIES[:, part])
+    np.testing.assert_allclose(projection.values[:2], values, rtol=1e-14)
+    assert not np.isfinite(projection.values[2])
+    np.testing.assert_array_equal(projection.at[:2], at)
+
+
+def test_only_an_attenuated_maximum_can_be_finished_early() -> None:
+    for kind in ("maximum", "minimum", "average", "attenuated"):
+        projection = Projection(kind, (0.0, 1.0), 1, NUMPY)
+        projection.add(
+            np.array([0]), np.array([[0]]), np.array([[0.7]]), np.ones((1, 1)), np.full((1, 1), 0.5)
+        )
+        assert projection.finished(np.array([0]))[0] == (kind == "attenuated")
+
+
+def test_roots_are_exact() -> None:
+    sample = np.arange(6.0)[None]
+    found = crossings(
+        lambda row, at, counted: (at - 2.3) ** 3,
+        sample,
+        (sample - 2.3) ** 3,
+        (
+            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
+            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
+        ),
+    )
+    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
+    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
+    assert found.which[0, 1:3, 0].tolist() == [1, 0]
+
+
+def test_nothing_is_crossed_where_a_value_is_missing() -> None:
+    """Neither between samples of which one has no value, nor where the search meets none."""
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
+    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
+    assert not missing.opacity.any()
+    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
+    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
+    assert there.at[0, 2, 0] == 2.5
