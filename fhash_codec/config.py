@@ -18,7 +18,7 @@ from fhash_formats.support.suggestions import suggestion
 TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
 """Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
 
-ENGINES = ("fused", "native", "slab", "naive")
+ENGINES = ("fused", "native", "slab")
 """Training engines of the paper profile, the fastest first; `fused` is for CUDA alone."""
 
 FRINGES = ("trained", "untrained")

@@ -28,7 +28,7 @@ ALLOWED = {
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
 TORCH_FILES = re.compile(
-    r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/train/.+\.py"
+    r"paper/(training|engines)/.+\.py|training/.+\.py|bench/train/.+\.py"
     r"|rendering/task/torch_arrays\.py|bench/paper/(bench|between|training)\.py"
     r"|bench/paper/encodings/.+\.py"
 )

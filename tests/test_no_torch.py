@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fhash_codec
+
 BLOCK = "import sys\nsys.modules['torch'] = None\n"
 """Module that Python runs at its start: `import torch` then fails as if it were not installed."""
 SCRIPT = """
@@ -57,11 +59,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     t, z, y, x = np.meshgrid(*map(np.arange, (3, 6, 24, 24)), indexing="ij")
     front = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 26
     np.save(folder / "data.npy", (1 / (1 + np.exp(-2 * front))).astype(np.float32))
+    network = fhash_codec.EncodeConfig(profile="paper", epochs=1, width=4)
+    fhash_codec.encode(np.load(folder / "data.npy")[:2, :, :8, :8], folder / "network.fhz", network)
     commands = {
         "encode": "encode data.npy -o run.fhz --json",
         "decode": "decode run.fhz --t 1 -o step.npy",
         "render": "render run.fhz -o step.png --size 64x64",
-        "stream": "render run.fhz -o stream.png --size 64x64 --march stream",
+        "stream": "render network.fhz -o stream.png --size 16x16 --march stream",
         "info": "info run.fhz --json",
         "verify": "verify run.fhz",
         "diff": "diff data.npy run.fhz --min-psnr 50",
@@ -69,7 +73,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "bench render": "bench render run.fhz --part accelerations --turns 1 --size 16 --json",
         "selftest": "selftest --case constant-float32 --processes 1",
         "paper": "encode data.npy -o paper.fhz --profile paper",
-        "cuda": "render run.fhz -o cuda.png --march arm --device cuda",
+        "cuda": "render network.fhz -o cuda.png --march arm --device cuda",
         "bench train": "bench train data.npy",
         "compact on cuda": "encode data.npy -o cuda.fhz --device cuda",
     }
@@ -88,8 +92,6 @@ def test_ordinary_commands_need_no_torch(results: dict[str, Any], command: str) 
 
 
 def test_the_default_encode_trains_a_head(results: dict[str, Any]) -> None:
-    import fhash_codec
-
     with fhash_codec.open(results["folder"] / "run.fhz") as volume:
         assert volume.container.header["history"]["epoch"]
 

@@ -206,10 +206,12 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     click.option("--antialiasing", type=int, metavar="N", help="Rays along a pixel's side."),
     click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy."),
     click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy."),
-    click.option("--march", metavar="NAME", help="Way to march: auto, cache, arm or stream."),
     click.option(
-        "--device", metavar="NAME", help="Where arm and stream compute: auto, cpu or cuda."
+        "--march",
+        metavar="NAME",
+        help="Way to march: auto or cache, and through a network arm or stream.",
     ),
+    click.option("--device", metavar="NAME", help="Where a network is marched: auto, cpu or cuda."),
     click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings."),
     click.option(
         "--threshold", type=float, metavar="X", help="Share of the light at which a ray ends."

@@ -32,8 +32,7 @@ from fhash_codec.rendering.scene.scene import (
     Shading,
     Shadows,
 )
-from fhash_codec.rendering.task.counters import complete
-from fhash_codec.rendering.task.task import Frame
+from fhash_codec.rendering.task.task import Frame, complete
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
@@ -91,13 +90,14 @@ class PictureCosts:
             side = max(self._volume.box.shape)
             self._knob("level of detail", "lod", [n for n in LEVELS if side > 1 << n])
         self._encodings(series, files)
-        self._marches(self._renderer, self._volume.profile, MARCH_SIZE)
+        if self._volume.profile == "paper":
+            self._marches(self._renderer, MARCH_SIZE)
         self._knob("threshold", "threshold", THRESHOLDS)
         self._first_pictures()
         for file in files:
             if not self._allowance.interrupted and file.name.startswith("paper"):
                 with open_volume(file.path) as volume:
-                    self._marches(Renderer(volume), "paper", NETWORK_SIZE)
+                    self._marches(Renderer(volume), NETWORK_SIZE)
 
     def _group(
         self,
@@ -182,8 +182,8 @@ class PictureCosts:
         changed: dict[str, Any] = {knob: int(value) if knob == "lod" else value}
         return replace(self._scene, march=replace(self._scene.march, **changed))
 
-    def _marches(self, renderer: Renderer, profile: str, side: int) -> None:
-        """Compare the cache with rays through the model: sample by sample, and adaptive (ARM)."""
+    def _marches(self, renderer: Renderer, side: int) -> None:
+        """Compare the cache with rays through a network: sample by sample, and adaptive (ARM)."""
         scenes = {
             name: replace(
                 self._scene,
@@ -196,10 +196,7 @@ class PictureCosts:
                 ("ARM on", "arm"),
             )
         }
-        turns = 1 if profile == "paper" else TURNS
-        self._group(
-            f"march, {profile}, {side} px", scenes, best="cache", renderer=renderer, turns=turns
-        )
+        self._group(f"march, paper, {side} px", scenes, best="cache", renderer=renderer, turns=1)
 
     def _first_pictures(self) -> None:
         """Compare first pictures of a step by level of detail: nothing is decoded yet."""

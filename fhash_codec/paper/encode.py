@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.header import brief_history, describe_source, write_series
-from fhash_codec.paper.levels import parameter_count
+from fhash_codec.paper.architecture import parameter_count
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
 from fhash_codec.paper.training.fit import TrainedModel, train_model

@@ -18,8 +18,8 @@ promise, both by construction and on every machine:
   fixed places, and a block in products of exactly `COLUMNS` columns. So a vertex always lies in the
   same column of a product of the same shape. Where few vertices of a block are asked for, they move
   to fewer products (`run_some`), each within its column.
-* The native library (`native_points.py`), for samples at free positions (`points.py`, rendering),
-  which may come in any order. It adds without BLAS.
+* The native library (`points.py`), for samples at free positions, which may come in any order. It
+  adds without BLAS.
 
 The bits may differ between machines, because their BLAS libraries and their vectors do.
 """
@@ -34,7 +34,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.levels import Resolution
+from fhash_codec.paper.architecture import Resolution
 from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.errors import DamagedFileError, InputError
 
@@ -56,8 +56,6 @@ MIN_WEIGHTS = 2048
 
 Those of a smaller one are multiplied as fast as the inputs are gathered.
 """
-MAX_GRADIENT_SAMPLES = PRODUCTS * COLUMNS
-"""Largest number of samples for which `DenseLayers.gradient` can follow a run."""
 
 
 class TableSource(Protocol):
@@ -293,20 +291,3 @@ class DenseLayers:
                 current = out
             self.outputs[start : start + len(current)] = current[:, 0]
         return self.outputs[: len(inputs)].reshape(-1)
-
-    def gradient(self) -> Floats:
-        """Return the derivatives (network.inputs, samples) of the last run's outputs by its inputs.
-
-        The chain rule goes backwards through the layers. On a ReLU's kink the derivative is that of
-        its flat side. The run must have had at most MAX_GRADIENT_SAMPLES samples, since hidden
-        layers of earlier products are overwritten.
-        """
-        assert len(self.outputs) <= PRODUCTS, "only the last products' hidden layers are kept"
-        slope = np.broadcast_to(
-            self.matrices[-1][0, :, None], (len(self.outputs), self.matrices[-1].shape[1], COLUMNS)
-        )
-        # Hostile weights overflow here, too.
-        with np.errstate(over="ignore", invalid="ignore"):
-            for matrix, hidden in zip(self.matrices[-2::-1], self.hidden[-2::-1], strict=True):
-                slope = np.matmul(matrix.T, slope * (hidden > 0))
-        return slope.transpose(1, 0, 2).reshape(len(self.inputs), -1)[:-1]

@@ -1,27 +1,30 @@
-"""Decoding at points between vertices, with the analytic gradient.
+"""Values and derivatives of a network at points between vertices, by the native library.
 
-The native library evaluates the points (native_points.py).
+A point has the same bits whatever points are given with it, in whatever order
+(`fhash_codec/native/network/points.hpp`). The bits may differ between machines, since each uses the
+widest vectors that it has, and rounds with fused multiply-adds where it can.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Literal, overload
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.native import network as native
-from fhash_codec.paper.native_points import NativePoints
-from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
-from fhash_codec.paper.point_tables import Patch, PointTables, locate
+from fhash_codec.paper.architecture import Resolution
+from fhash_codec.paper.network import Floats, Network
+from fhash_codec.paper.tables.ranked import RankedBits, SparseFrame, row_bits
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
 AXES = ("key_index", "z", "y", "x")
 """Names of the coordinates of a point, in order."""
-CHUNK_POINTS = MAX_GRADIENT_SAMPLES
+CHUNK_POINTS = 4096
 """Points that one thread evaluates at a time."""
 SMALL_READ = 2**20
 """Vertices of the finest table that a group of points may always span."""
@@ -29,6 +32,200 @@ LARGE_READ = 2**25
 """Vertices of the finest table that a group of points may never exceed."""
 READ_PER_POINT = 16
 """Vertices of the finest table per point that a group may span between those two limits."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A part of one level's table in memory.
+
+    Attributes:
+        values: embeddings (t, z, y, x, E), float32, contiguous. There are at least two vertices
+            along x, since corners are read in pairs: a single one is there twice.
+        first: vertex (t, z, y, x) of the level at which the part begins.
+    """
+
+    values: Floats
+    first: tuple[int, ...]
+
+    @classmethod
+    def of(cls, values: npt.NDArray[Any], first: Sequence[int]) -> Patch:
+        """Return the part of embeddings (t, z, y, x, E) of a level."""
+        if values.shape[3] == 1:
+            values = np.repeat(values, 2, axis=3)
+        return cls(np.ascontiguousarray(values, np.float32), tuple(first))
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Vertices from one vertex to the next along t, z, y and x."""
+        _, z, y, x, _ = self.values.shape
+        return z * y * x, y * x, x, 1
+
+    def at_one_time(self, values: Floats) -> Patch:
+        """Return the same part with other values (1, z, y, x, E), those of one time."""
+        return replace(self, values=values, first=(0, *self.first[1:]))
+
+    def facts(self, resolution: Sequence[int]) -> list[int]:
+        """Return what the native functions need to know of a part of a level (points.cpp)."""
+        return [*self._axis_facts(resolution, self._number_strides()), 0, 0, 0, 0]
+
+    def _number_strides(self) -> list[int]:
+        """Return the numbers from one vertex to the next along t, z, y and x."""
+        return [stride // 4 for stride in self.values.strides[:4]]
+
+    def _axis_facts(self, resolution: Sequence[int], strides: Sequence[int]) -> list[int]:
+        facts = [self.values.ctypes.data, self.values.size]
+        for vertices, first, stride in zip(resolution, self.first, strides, strict=True):
+            # An axis of one vertex has no corner after it: both corners are the same.
+            facts += [vertices, first, stride if vertices > 1 else 0]
+        return facts
+
+
+@dataclass(frozen=True)
+class SparsePatch(Patch):
+    """A whole level in memory that holds some vertices only.
+
+    Attributes:
+        values: embeddings (t, 1, 1, held + 1, E) of the held vertices. The last of each time is 0.
+        bits: which vertices are held at any of these times. Numbers are those of its bits.
+        vertices: vertices (z, y, x) of the level.
+    """
+
+    bits: RankedBits
+    vertices: tuple[int, int, int]
+
+    @classmethod
+    def of_frames(cls, frames: Sequence[SparseFrame], node: int) -> SparsePatch:
+        """Return the part of one or two neighbouring time nodes, of which `node` is the first."""
+        bits = RankedBits.of_words(np.bitwise_or.reduce([frame.bits.words for frame in frames]))
+        held = bits.positions()
+        size = frames[0].values.shape[1]
+        values = np.zeros((len(frames), 1, 1, len(held) + 1, size), np.float32)
+        for number, frame in enumerate(frames):
+            values[number, 0, 0, :-1] = frame.values[frame.bits.lookup(held)]
+        return cls(values, (node, 0, 0, 0), bits, frames[0].shape)
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Bits from one vertex to the next; the tables must be those of one time."""
+        row = row_bits(self.vertices[2])
+        return 0, self.vertices[1] * row, row, 1
+
+    def facts(self, resolution: Sequence[int]) -> list[int]:
+        """Return what the native functions need to know of a part; of two times only to mix."""
+        if len(self.values) > 1:
+            return super().facts(resolution)
+        bits = self.bits
+        held = [array.ctypes.data for array in (bits.words, bits.blocks, bits.within)]
+        return [*self._axis_facts(resolution, self.strides), *held, bits.count]
+
+
+@dataclass(frozen=True)
+class PointTables:
+    """The parts of all levels that surround some points.
+
+    Attributes:
+        network: the network, whose layers are used.
+        sizes: key frames and vertices (t, z, y, x) that the points' positions count in.
+        levels: resolution (t, z, y, x) of each level, finest first.
+        patches: a part of each level's table.
+    """
+
+    network: Network
+    sizes: Resolution
+    levels: tuple[Resolution, ...]
+    patches: tuple[Patch, ...]
+
+    @classmethod
+    def read(cls, network: Network, low: Sequence[float], high: Sequence[float]) -> PointTables:
+        """Read the parts that surround all points between two positions (t, z, y, x)."""
+        sizes = (network.key_frames, *network.box_size)
+        patches = []
+        for level, resolution in enumerate(network.levels):
+            first, last = (corners_before(sizes, resolution, end) for end in (low, high))
+            region = tuple(
+                slice(start, min(stop + 2, length))
+                for start, stop, length in zip(first, last, resolution, strict=True)
+            )
+            patches.append(Patch.of(network.read(level, region), first))
+        return cls(network, sizes, network.levels, tuple(patches))
+
+    @classmethod
+    def of_box(cls, network: Network, key_index: float) -> PointTables:
+        """Read the time nodes of the whole box around one time, for `at` this time.
+
+        Levels that hold some vertices only stay so.
+        """
+        high = [size - 1 for size in network.box_size]
+        if not network.sparse:
+            return cls.read(network, (key_index, 0, 0, 0), (key_index, *high))
+        sizes = (network.key_frames, *network.box_size)
+        patches = []
+        for level, resolution in enumerate(network.levels):
+            node = corners_before(sizes, resolution, (key_index, 0, 0, 0))[0]
+            nodes = range(node, min(node + 2, resolution[0]))
+            frames = [network.sparse_frame(level, number) for number in nodes]
+            patches.append(
+                SparsePatch.of_frames([frame for frame in frames if frame is not None], node)
+            )
+        return cls(network, sizes, network.levels, tuple(patches))
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices of the finest level's part."""
+        return math.prod(self.patches[0].values.shape[:4])
+
+    @property
+    def still(self) -> bool:
+        """Whether the tables are those of one time."""
+        return self.sizes[0] == 1
+
+    def at(self, key_index: float, path: int | None = None) -> PointTables:
+        """Return the tables at one time, interpolated once. Time 0 is then the only one.
+
+        Points have the bits of those that are interpolated point by point.
+
+        Args:
+            key_index: the time.
+            path: the path of the machine; None for the best.
+        """
+        if self.still:
+            return self
+        library, sizes = native.library(), np.array(self.sizes, np.int64)
+        patches = []
+        for patch, level in zip(self.patches, self.levels, strict=True):
+            values = np.empty((1, *patch.values.shape[1:]), np.float32)
+            facts = np.array(patch.facts(level), np.int64)
+            status = library.fhash_network_still(
+                sizes.ctypes.data,
+                facts.ctypes.data,
+                float(key_index),
+                native.best_path(library) if path is None else path,
+                values.ctypes.data,
+            )
+            _check_status(status)
+            patches.append(patch.at_one_time(values))
+        return replace(
+            self,
+            sizes=(1, *self.sizes[1:]),
+            levels=tuple((1, *level[1:]) for level in self.levels),
+            patches=tuple(patches),
+        )
+
+
+def corners_before(
+    sizes: Sequence[int], resolution: Sequence[int], point: Sequence[float]
+) -> list[int]:
+    """Return the corner (t, z, y, x) of a level before a point.
+
+    Args:
+        sizes: key frames and vertices of the box (t, z, y, x).
+        resolution: vertices (t, z, y, x) of the level.
+        point: key index, z, y and x.
+    """
+    return [
+        min(int(at * (corners - 1) / max(size - 1, 1)), max(corners - 2, 0))
+        for at, corners, size in zip(point, resolution, sizes, strict=True)
+    ]
 
 
 @overload
@@ -78,8 +275,8 @@ def sample_points(
     * On a ReLU's kink they are those of its flat side.
 
     Points that lie close together share one read of a part of each table. A point has the same
-    bits whatever other points are given with it, in whatever order (native_points.py). Where all
-    points share one time, the tables are interpolated in time once.
+    bits whatever other points are given with it, in whatever order. Where all points share one
+    time, the tables are interpolated in time once.
 
     Args:
         network: the trained network.
@@ -116,18 +313,48 @@ def sample_points(
 
 
 class PointSampler:
-    """Tables in memory, ready to be sampled at points; for many calls on the same tables."""
+    """Tables and layers in memory as the native functions read them, for many calls.
 
-    def __init__(self, tables: PointTables, key_index: float | None = None) -> None:
+    Objects may be used by several threads at once.
+    """
+
+    def __init__(
+        self, tables: PointTables, key_index: float | None = None, path: int | None = None
+    ) -> None:
         """Take over tables.
 
         Args:
-            tables: parts of the tables around the points to come.
+            tables: parts of the tables around the points to come. Parts that hold some vertices
+                only must be those of one time, or `key_index` be given.
             key_index: the time of all points, at which the tables are interpolated once. The
                 points' own time is then 0, and their derivative by time.
+            path: the path of the machine; None for the best.
         """
-        points = NativePoints(native.library(), tables)
-        self._native = points if key_index is None else points.at(key_index)
+        if key_index is not None:
+            tables = tables.at(key_index, path)
+        assert not any(
+            isinstance(patch, SparsePatch) and len(patch.values) > 1 for patch in tables.patches
+        ), "some vertices are held at several times"
+        network = tables.network
+        self._library = native.library()
+        self._path = native.best_path(self._library) if path is None else path
+        self._tables, self._matrices = tables, network.matrices
+        counts = (len(tables.levels), len(self._matrices), network.embedding_size)
+        self._sizes = np.array([*tables.sizes, *counts, not tables.still], np.int64)
+        self._levels = np.array(
+            [
+                patch.facts(level)
+                for patch, level in zip(tables.patches, tables.levels, strict=True)
+            ],
+            np.int64,
+        )
+        self._layers = np.array(
+            [
+                (matrix.ctypes.data, matrix.shape[0] - 1, matrix.shape[1] - 1)
+                for matrix in self._matrices
+            ],
+            np.int64,
+        )
 
     def sample(
         self,
@@ -148,11 +375,44 @@ class PointSampler:
         def evaluate(chunks: Sequence[slice]) -> None:
             for chunk in chunks:
                 places = [column[chunk] if len(column) > 1 else column for column in columns]
-                some = None if slopes is None else slopes[chunk]
-                self._native.evaluate(places, values[chunk], some)
+                self.evaluate(places, values[chunk], None if slopes is None else slopes[chunk])
 
         starts = range(0, len(values), CHUNK_POINTS)
         share_out(evaluate, [slice(start, start + CHUNK_POINTS) for start in starts], threads)
+
+    def evaluate(
+        self,
+        columns: Sequence[npt.NDArray[np.float64]],
+        values: Floats,
+        slopes: Floats | None = None,
+        input_slopes: Floats | None = None,
+    ) -> None:
+        """Write the values, and the derivatives that are asked for, at points, in one thread.
+
+        Args:
+            columns, values, slopes: as in `sample`.
+            input_slopes: float32 (inputs, n), to be written: the derivatives by the inputs of the
+                network.
+        """
+        results = (values, slopes, input_slopes)
+        assert all(result is None or result.flags.c_contiguous for result in results)
+        places = np.array(
+            [
+                (column.ctypes.data, 0 if len(column) == 1 else column.strides[0] // 8)
+                for column in columns
+            ],
+            np.int64,
+        )
+        status = self._library.fhash_network_points(
+            self._sizes.ctypes.data,
+            self._levels.ctypes.data,
+            self._layers.ctypes.data,
+            places.ctypes.data,
+            len(values),
+            self._path,
+            *(None if result is None else result.ctypes.data for result in results),
+        )
+        _check_status(status)
 
 
 def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
@@ -166,56 +426,17 @@ def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
         network: the trained network.
         points: positions (4, n), key index, z, y and x, inside the box.
     """
-    tables = PointTables.read(network, points.min(axis=1), points.max(axis=1))
+    tables = PointTables.read(network, points.min(axis=1).tolist(), points.max(axis=1).tolist())
     slopes = np.empty((network.inputs, points.shape[1]), np.float32)
-    for start in range(0, points.shape[1], CHUNK_POINTS):
-        chunk = points[:, start : start + CHUNK_POINTS]
-        layers = DenseLayers(network, chunk.shape[1])
-        _encode(tables, chunk, layers.inputs)
-        layers.run()
-        slopes[:, start : start + chunk.shape[1]] = layers.gradient()[:, : chunk.shape[1]]
+    values = np.empty(points.shape[1], np.float32)
+    PointSampler(tables).evaluate(list(points), values, input_slopes=slopes)
     return slopes
 
 
-def interpolate(
-    corners: Floats, after_weights: Iterable[Floats], gradient: bool
-) -> tuple[Floats, list[Floats]]:
-    """Interpolate corners (2, 2, ..., E, n) to (E, n), linearly along the leading axes in turn.
-
-    The arrays may also be tensors of torch.
-
-    Args:
-        corners: embeddings of the corners of a cell, with one leading axis of length 2 for each
-            weight.
-        after_weights: for each leading axis, the weight of the corner after the point.
-        gradient: whether to return the changes.
-
-    Returns:
-        The embeddings and, with `gradient`, their changes across the cell along each of these axes.
-    """
-    changes: list[Floats] = []
-    for weight in after_weights:
-        changes = [_between(change, weight) for change in changes]
-        if gradient:
-            changes.append(corners[1] - corners[0])
-        corners = _between(corners, weight)
-    return corners, changes
-
-
-def _between(pair: Floats, after_weight: Floats) -> Floats:
-    """Interpolate linearly between the two items of a pair."""
-    result: Floats = pair[0] * (1 - after_weight) + pair[1] * after_weight
-    return result
-
-
-def _encode(tables: PointTables, points: npt.NDArray[np.float64], inputs: Floats) -> None:
-    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`."""
-    size, count = tables.network.embedding_size, points.shape[1]
-    for level, (patch, resolution) in enumerate(zip(tables.patches, tables.levels, strict=True)):
-        before, after_weights, _ = locate(tables.sizes, resolution, points)
-        corners = _corners(patch, before, resolution)
-        rows = slice(level * size, (level + 1) * size)
-        inputs[rows, :count] = interpolate(corners, after_weights, gradient=False)[0]
+def _check_status(status: int) -> None:
+    """Raise MemoryError where a native function had not enough memory."""
+    if status < 0:
+        raise MemoryError("not enough memory to evaluate points")
 
 
 def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float64]], int]:
@@ -283,22 +504,3 @@ def _groups(
     below = columns[axis][chosen] < np.floor((low[axis] + high[axis] + 1) / 2)
     yield from _groups(columns, chosen[below])
     yield from _groups(columns, chosen[~below])
-
-
-def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[int]) -> Floats:
-    """Return the 16 corners around each point, float32 (t 2, z 2, y 2, x 2, E, n)."""
-    strides = patch.strides
-    index: npt.NDArray[np.int64] = np.zeros(before.shape[1], np.int64)
-    for corner, first, stride in zip(before, patch.first, strides, strict=True):
-        index += (corner - first) * stride
-    # An axis of one vertex has no corner after it: both corners are the same.
-    t_offsets, z_offsets, y_offsets, x_offsets = [
-        (0, stride if length > 1 else 0) for stride, length in zip(strides, resolution, strict=True)
-    ]
-    offsets = np.array(
-        [t + z + y + x for t in t_offsets for z in z_offsets for y in y_offsets for x in x_offsets]
-    )
-    embeddings = patch.embeddings(offsets[:, None] + index)
-    return np.ascontiguousarray(np.moveaxis(embeddings, -1, 1), dtype=np.float32).reshape(
-        2, 2, 2, 2, patch.values.shape[4], -1
-    )

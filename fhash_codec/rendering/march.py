@@ -1,7 +1,4 @@
-"""Marching rays through a frame of values.
-
-Rays are marched natively in packets. Frames too large for that are streamed in numpy.
-"""
+"""Marching rays through a frame of values, natively in packets."""
 
 from __future__ import annotations
 
@@ -10,9 +7,7 @@ import dataclasses
 import numpy as np
 
 from fhash_codec import native
-from fhash_codec.rendering.native.march import MAX_SURFACES, MAX_VALUES, march_native
-from fhash_codec.rendering.stream.fields import FrameField
-from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.native.march import MAX_SURFACES, march_native
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.task import Frame, Marched, Task
 from fhash_formats.errors import InputError
@@ -51,18 +46,11 @@ def march(
     if task.projection and task.surfaces:
         surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
         projection = dataclasses.replace(task, surfaces=())
-        return _over(
-            _march(frame, surfaces, bricks, threads), _march(frame, projection, bricks, threads)
+        front, back = (
+            march_native(native.library(), frame, part, bricks, threads)
+            for part in (surfaces, projection)
         )
-    return _march(frame, task, bricks, threads)
-
-
-def _march(frame: Frame, task: Task, bricks: Bricks, threads: int | None) -> Marched:
-    """March natively, or streamed where the frame is too large."""
-    if bricks.values.size > MAX_VALUES:
-        streamed = stream(FrameField(frame, task.rays.grid, bricks), task, adaptive=True)
-        # Looking up a decoded frame is not an evaluation of the model.
-        return dataclasses.replace(streamed, counters={**streamed.counters, "evaluations": 0})
+        return _over(front, back)
     return march_native(native.library(), frame, task, bricks, threads)
 
 

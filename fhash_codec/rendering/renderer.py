@@ -23,14 +23,12 @@ from fhash_codec.rendering.picture.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
-from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField
+from fhash_codec.rendering.stream.fields import Field, NetworkField, WarpedField
 from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.stream.warped_field import WarpedField
 from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Marched, Task
+from fhash_codec.rendering.task.task import Frame, Marched, Task, complete
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
@@ -143,7 +141,7 @@ class Renderer:
             plan = self.plan(Scene() if scene is None else scene)
         self._choose(plan.scene.features)
         # Networks are evaluated where rays sample them; light needs a frame all the same.
-        frame_needed = plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
+        frame_needed = plan.mode == "cache" or plan.lights
         decoded = self._frame(plan, progress) if frame_needed else None
         if upcoming is not None:
             self._start_prefetch(upcoming)
@@ -182,13 +180,9 @@ class Renderer:
             progress("marching", 1, 1, "")
             return marched
         arrays = arrays_on(plan.scene.march.device)
-        field: Field
-        if decoded is not None and self.volume.profile == "compact":
-            field = FrameField(decoded.frame, task.rays.grid, decoded.bricks, arrays)
-        else:
-            field = NetworkField(self.volume, plan.step, plan.units, arrays)
-            if task.rays.grid.warp is not None:
-                field = WarpedField(field, task.rays.grid.warp)
+        field: Field = NetworkField(self.volume, plan.step, plan.units, arrays)
+        if task.rays.grid.warp is not None:
+            field = WarpedField(field, task.rays.grid.warp)
         return stream(
             field,
             task,

@@ -60,7 +60,7 @@ def test_without_a_command_help_goes_to_stderr(fhash: Fhash) -> None:
         (["info", "x", "y"], "unexpected extra argument"),
         (
             ["bench", "train", "x", "--engines", "slab,fast"],
-            "'fast' is no engine; allowed, separated by commas: fused, native, slab, naive",
+            "'fast' is no engine; allowed, separated by commas: fused, native, slab",
         ),
     ],
 )

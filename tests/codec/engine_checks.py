@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
+from readable_paper import NaiveEngine
 from torch import Tensor
 
 from fhash_codec.paper.engines.initial import Parameters
-from fhash_codec.paper.engines.naive import NaiveEngine
 
 RATE = 0.01
 """Learning rate of the trainings."""

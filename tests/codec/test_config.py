@@ -43,7 +43,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab, naive"),
+        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, fused, native, slab"),
         (
             {"profile": "paper", "max_error": 1.0},
             "max-error belongs to --profile compact; the profile is paper",
@@ -65,7 +65,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
                 "schedule": "constant",
                 "batch": 64,
                 "tables": "uint8",
-                "engine": "naive",
+                "engine": "slab",
             }.items()
         ),
         (

@@ -1,4 +1,4 @@
-"""Part `points` of run.py: places in a network by fused kernels and by torch."""
+"""Part `points` of run.py: places in a network by fused kernels and on the host."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def measured_points(
 ) -> list[dict[str, Any]]:
     """Measure places in networks, in the order of rays and at random.
 
-    Fused kernels, which CUDA must have, are compared with torch: all values and most slopes, since
-    near a ReLU's kink two roundings may take different sides.
+    Fused kernels, which CUDA must have, are compared with the host: all values and most slopes,
+    since near a ReLU's kink two roundings may take different sides.
 
     Args:
-        device: 'cuda', or 'cpu' for torch alone.
+        device: 'cuda', or 'cpu' for the host alone.
         shape: key frames and vertices (t, z, y, x) of the networks.
         side: places along each axis.
         seconds: seconds of each measurement.
@@ -26,7 +26,7 @@ def measured_points(
     import torch
 
     from fhash_codec.paper.engines.fused.start import start_points
-    from fhash_codec.rendering.stream.inference import DenseInference
+    from fhash_codec.rendering.stream.fields import HostInference
     from fhash_codec.rendering.task.torch_arrays import TorchArrays
 
     there, results = torch.device(device), []
@@ -49,7 +49,7 @@ def measured_points(
 
     for layers, held in ((1, "dense"), (2, "dense"), (2, "sparse")):
         network = random_network(shape, layers, held == "sparse")
-        found = {"torch": DenseInference(network, 0.5, TorchArrays(there))}
+        found = {"host": HostInference(network, 0.5, TorchArrays(there))}
         if fused := start_points(network, 0.5, there):
             found["fused"] = fused
         elif device == "cuda":
@@ -64,7 +64,7 @@ def measured_points(
                     given[name] = evaluate(places).cpu().numpy()
                     result[f"{name}_{kind}_mpoints_s"] = measured(evaluate, places)
                 if "fused" in given:
-                    apart = np.abs(given["fused"] - given["torch"]) / np.abs(given["torch"]).max()
+                    apart = np.abs(given["fused"] - given["host"]) / np.abs(given["host"]).max()
                     result[f"{kind}_median"] = float(np.median(apart))
                     result[f"{kind}_beyond_1e-4"] = float((apart > 1e-4).mean())
             results.append(result)
@@ -73,7 +73,7 @@ def measured_points(
         for r in results
         if r.get("values_beyond_1e-4", 0.0) > 0 or r.get("slopes_beyond_1e-4", 0.0) > 0.01
     ]:
-        raise AssertionError(f"fused kernels differ from torch: {wrong}")
+        raise AssertionError(f"fused kernels differ from the host: {wrong}")
     return results
 
 

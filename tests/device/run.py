@@ -7,7 +7,7 @@ are left out, with the reason, where they are missing; wheels in a folder on PYT
 
 Parts: oracle (gradients and values of fused and slab against the naive engine in float64), speed
 (steps one after another, without waiting for each), points (places in a network by fused kernels
-and by torch: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
+and on the host: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
 against seconds of training), pictures (adaptive ray marching through the network), selftest.
 
 `--device cpu --quick` tries the script itself without a GPU; its figures mean nothing.
@@ -34,6 +34,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "formats"), str(ROOT / "cli"), str(Path(__file__).parent)]
+sys.path.append(str(ROOT / "tests" / "codec"))  # the readable paper
 NEEDED = ("zarr", "numcodecs")
 """Packages without which no file can be written."""
 FHASH = "import sys; from fhash_cli.main import main; sys.argv[0] = 'fhash'; sys.exit(main())"
@@ -160,9 +161,9 @@ def oracle(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[st
     The mean of the gradients after the first step is a tenth of the gradient.
     """
     import torch
+    from readable_paper import NaiveEngine
 
     from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.engines.naive import NaiveEngine
     from fhash_formats.series import ArraySeries
 
     noise = ArraySeries(np.random.default_rng(3).random((3, 9, 20, 35), dtype=np.float32))
@@ -172,8 +173,7 @@ def oracle(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[st
             noise, "interval:0.3:1", width=width, hidden_layers=layers, dilation=0
         )
         every, rates = np.arange(len(coreset.bricks)), np.full(9, 0.01)
-        cpu = torch.device("cpu")
-        naive = NaiveEngine(architecture, coreset, rates, seed=1, device=cpu, dtype=torch.float64)
+        naive = NaiveEngine(architecture, coreset, rates, seed=1)
         naive.train(every)
         layer_gradients = [
             torch.column_stack([weight.grad, bias.grad]).flatten()
@@ -270,7 +270,7 @@ def bench(device: str, sizes: Sizes, folder: Path, left: float) -> Any:
     """Return what `fhash bench train` prints as JSON."""
     words = ["bench", "train", "--device", device, "--json", "-q"]
     words += ["--seconds", "0.2" if sizes.pixels < 100 else "6"]
-    words += ["--engines", ",".join((*engine_names(device), "naive"))]
+    words += ["--engines", ",".join(engine_names(device))]
     return json.loads(fhash(words, left))
 
 

@@ -36,7 +36,7 @@ def test_parts_that_need_no_files_run_without_zarr(tmp_path) -> None:
     assert models == ["64x1", "64x2"]
     assert all(result["train_msamples_s"] > 0 for result in figures["speed"]["figures"])
     assert len(figures["points"]["figures"]) == 6
-    assert all(result["torch_slopes_mpoints_s"] > 0 for result in figures["points"]["figures"])
+    assert all(result["host_slopes_mpoints_s"] > 0 for result in figures["points"]["figures"])
     for name in ("pictures", "selftest"):
         assert "zarr" in figures[name]["figures"]["left_out"]
 

@@ -194,8 +194,8 @@ def _engines(runs: list[dict[str, Any]]) -> str:
     """A row for each engine; seconds to a quality are those of processors."""
     goals = [goal["psnr"] for goal in runs[0]["seconds_to"]]
     header = (
-        *("engine", "threads", "train M/s", "per CPU s", "x naive", "of peak"),
-        *("infer per CPU s", "x naive", "of peak", "PSNR dB"),
+        *("engine", "threads", "train M/s", "per CPU s", "x slab", "of peak"),
+        *("infer per CPU s", "x slab", "of peak", "PSNR dB"),
         *(f"CPU s to {goal:g} dB" for goal in goals),
     )
     figures = (

@@ -142,7 +142,7 @@ def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list
 
 
 def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) -> str:
-    from fhash_codec.rendering.task.counters import rows
+    from fhash_codec.rendering.task.task import rows
 
     lines = [("written", path) for path in paths]
     if not explain:

@@ -20,14 +20,10 @@ import numpy.typing as npt
 from fhash_codec.bench.paper.encodings.encoding import Encoding
 from fhash_codec.bench.paper.pictures import view_of_feature
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.stream.fields import FrameField
+from fhash_codec.rendering.stream.fields import CoresetField
 from fhash_codec.rendering.stream.stream import stream
 from fhash_codec.rendering.task.arrays import Array, Arrays
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.palette import Palette
-from fhash_codec.rendering.task.task import Frame
 from fhash_codec.rendering.task.torch_arrays import TorchArrays
 from fhash_codec.training.devices import choose_device
 
@@ -44,21 +40,14 @@ MODES = {"stream": False, "arm": True}
 """Ways to march, and whether each is adaptive."""
 NEAR = 0.125
 """Distance in vertices over which a slope is the difference of two values."""
-MARGIN = np.float32(1)
-"""Distance beyond 0 and 1 of the least and the largest value that an encoding is taken to hold:
-what it holds is not known before it is evaluated."""
 
 
-class EncodingField:
+class EncodingField(CoresetField):
     """Values of an encoding at a key frame, evaluated at every place; a `Field` of `stream`.
-
-    A place has no value where a vertex of weight around it is outside the coreset.
 
     Attributes:
         evaluations: places at which the encoding was evaluated so far.
     """
-
-    stride = 1.0
 
     def __init__(
         self, encoding: Encoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
@@ -73,26 +62,9 @@ class EncodingField:
             occupancy: whether places outside the coreset are known before evaluation; else the
                 encoding is evaluated there in vain.
         """
-        self.arrays, self.evaluations = arrays, 0
+        super().__init__(mask, np.zeros(3), np.array(mask.shape[::-1]) == 1, (0.0, 1.0), arrays)
+        self.evaluations = 0
         self._encoding, self._key, self._occupancy = encoding, key, occupancy
-        z, y, x = mask.shape
-        frame = Frame(values=np.where(mask, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
-        grid = Grid(counts=(x, y, z), origin=np.zeros(3), spacing=np.ones(3))
-        bricks = Bricks.of(frame)
-        self._coreset = FrameField(frame, grid, bricks, arrays)
-        self.bounds, self.vertices = self._coreset.bounds, self._coreset.vertices
-        self.first = self._coreset.first
-        seen = bricks.low <= bricks.high
-        self.bricks = replace(
-            bricks,
-            low=np.where(seen, -MARGIN, np.float32(np.inf)),
-            high=np.where(seen, 1 + MARGIN, np.float32(-np.inf)),
-        )
-        self._cells = _cells(mask)
-
-    def visible(self, palette: Palette) -> Array:
-        """Cells with a vertex of the coreset, as the product's occupancy has them."""
-        return self.arrays.array(self._cells)
 
     def values(self, places: Array, wanted: Array | None = None) -> Array:
         result = self.arrays.full(len(places), np.nan)
@@ -101,7 +73,7 @@ class EncodingField:
             (asked,) = self.arrays.nonzero(wanted)
             result[asked] = self.values(places[asked])
             return result
-        inside = ~self.arrays.xp.isnan(self._coreset.values(places))
+        _, inside = self.inside(places)
         if self._occupancy:
             result[inside] = self._evaluated(places[inside])
         else:
@@ -201,12 +173,3 @@ def _summary(runs: dict[str, list[tuple[float, Any, int]]]) -> dict[str, float]:
         "arm_samples": mean("arm", "samples"),
         "evaluations": float(np.mean([count for _, _, count in runs["stream"]])),
     }
-
-
-def _cells(mask: Mask) -> Mask:
-    """Cells (z, y, x) with at least one vertex of a mask; an axis of one vertex has one cell."""
-    for axis in range(3):
-        if mask.shape[axis] > 1:
-            lines = np.moveaxis(mask, axis, 0)
-            mask = np.moveaxis(lines[:-1] | lines[1:], 0, axis)
-    return mask

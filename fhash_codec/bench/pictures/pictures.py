@@ -19,7 +19,14 @@ from fhash_codec.bench.pictures.break_even import break_even
 from fhash_codec.bench.pictures.likeness import picture_psnr
 from fhash_codec.bench.pictures.orbit import orbit
 from fhash_codec.bench.pictures.ospray_peer import find_ospray, load_ospray
-from fhash_codec.bench.pictures.results import PARTS, Quality, RenderBench, Stream, Switch
+from fhash_codec.bench.pictures.results import (
+    NETWORK_PARTS,
+    PARTS,
+    Quality,
+    RenderBench,
+    Stream,
+    Switch,
+)
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.renderer import Renderer
@@ -92,8 +99,8 @@ def bench_render(
         ospray: file, folder or Python module of an OSPRay library, for the part `shell`.
 
     Raises InputError for unknown parts, for a size or turns that are too small, and for an OSPRay
-    that cannot be used. Without VTK the
-    result lists its parts as refused.
+    that cannot be used. The result lists as refused the parts of VTK without VTK, and those of
+    NETWORK_PARTS of a file without a network.
     """
     scene = scene or Scene()
     for part in parts:
@@ -168,6 +175,9 @@ def _measure(
     results: dict[str, tuple[Any, ...]] = {}
     refused: dict[str, str] = {}
     for part in dict.fromkeys(parts):
+        if part in NETWORK_PARTS and bench.volume.profile != "paper":
+            refused[part] = "the file has no network to march through"
+            continue
         try:
             results[part] = measurements[part]()
         except MissingDependencyError as error:

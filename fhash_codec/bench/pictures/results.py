@@ -23,6 +23,8 @@ PARTS = (
     "curves",
 )
 """Names of the parts that can be measured."""
+NETWORK_PARTS = ("streams", "break-even")
+"""Names of the parts that march through a network, which a file of the profile paper alone has."""
 
 
 @dataclass(frozen=True, kw_only=True)

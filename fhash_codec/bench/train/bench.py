@@ -194,17 +194,17 @@ def _variants(
 
 
 def _compare(results: list[dict[str, Any]]) -> None:
-    """Add ratios over the naive engine in as many threads, and over one thread of the same engine.
+    """Add ratios over the slab engine in as many threads, and over one thread of the same engine.
 
-    Those over the naive engine are of seconds of processors; None without it.
+    Those over the slab engine are of seconds of processors; None without it.
     """
     for result in results:
-        naive = _first(results, engine="naive", threads=result["threads"]) or _first(
-            results, engine="naive"
+        slab = _first(results, engine="slab", threads=result["threads"]) or _first(
+            results, engine="slab"
         )
         for kind in ("train", "infer"):
             rate = f"{kind}_msamples_cpu_s"
-            result[f"{kind}_ratio"] = result[rate] / naive[rate] if naive else None
+            result[f"{kind}_ratio"] = result[rate] / slab[rate] if slab else None
         one = _first(results, engine=result["engine"], path=result["path"], threads=1)
         result["thread_ratio"] = (
             result["train_msamples_s"] / one["train_msamples_s"]

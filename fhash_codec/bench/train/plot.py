@@ -10,7 +10,7 @@ from fhash_codec.bench.train.curves import GOALS
 
 __all__ = ["plot"]
 
-COLOURS = {"native": "#d1604b", "slab": "#4a86c0", "naive": "#8a8f98"}
+COLOURS = {"native": "#d1604b", "slab": "#4a86c0"}
 """Colours by engine."""
 STYLES = ("-", "--", ":", "-.")
 """Line styles of an engine's variants."""

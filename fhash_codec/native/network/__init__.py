@@ -13,7 +13,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PATHS", "PROTOTYPES", "best_path", "library", "machine_paths"]
 
-ABI_VERSION = 3
+ABI_VERSION = 4
 """Number that `fhash_network_abi_version()` must return, and `FHASH_NETWORK_ABI` in network.cpp."""
 
 PROTOTYPES: Prototypes = {
@@ -22,7 +22,7 @@ PROTOTYPES: Prototypes = {
     "fhash_network_fma": (INTEGER, INTEGER),
     "fhash_network_copy": (ARRAY, ARRAY, INTEGER),
     # points.cpp
-    "fhash_network_points": (*(ARRAY,) * 4, INTEGER, INTEGER, ARRAY, ARRAY),
+    "fhash_network_points": (*(ARRAY,) * 4, INTEGER, INTEGER, *(ARRAY,) * 3),
     "fhash_network_still": (ARRAY, ARRAY, REAL, INTEGER, ARRAY),
     # train_bricks.cpp
     "fhash_bricks_work": (ARRAY,),

@@ -1,5 +1,5 @@
 // The task of the brick engine: a model in training on a coreset. Mirrored field by field in
-// fhash_codec/paper/engines/native_task.py, which also says what the arrays hold.
+// fhash_codec/paper/engines/native.py, which also says what the arrays hold.
 //
 // A brick is a box of vertices of one key frame. Its inputs of the MLP are rows over its samples:
 // first the finest embeddings, which are stored for the samples alone, then those of each coarse

@@ -11,8 +11,8 @@ constexpr std::int64_t LEVEL = 2 + 3 * AXES + 4;
 
 FHASH_PATHS(std::int64_t, points,
             (const Task& task, const Points& places, std::int64_t count, float* values,
-             float* slopes),
-            (task, places, count, values, slopes))
+             float* slopes, float* by_inputs),
+            (task, places, count, values, slopes, by_inputs))
 FHASH_PATHS(std::int64_t, still,
             (const Level& level, const std::int64_t* sizes, double time, std::int64_t count,
              float* numbers),
@@ -46,11 +46,12 @@ Level level_at(const int64_t* given) {
 // layers: for each layer the address of its matrix, its outputs and its inputs.
 // columns: for each coordinate its address, and its numbers from one point to the next.
 // slopes: null for values alone.
+// by_inputs: derivatives (inputs, count) by the inputs of the first layer; null for none.
 // Returns FHASH_NO_PATH for a path that this machine does not have.
 FHASH_EXPORT int64_t fhash_network_points(const int64_t* sizes, const int64_t* levels,
                                           const int64_t* layers, const int64_t* columns,
                                           int64_t count, int64_t path, float* values,
-                                          float* slopes) {
+                                          float* slopes, float* by_inputs) {
 #if defined(FHASH_VECTORS)
     if (!has_path(path)) return FHASH_NO_PATH;
     return guarded([&]() -> std::int64_t {
@@ -70,7 +71,7 @@ FHASH_EXPORT int64_t fhash_network_points(const int64_t* sizes, const int64_t* l
         }
         const Task task = {parts.data(), sizes[4],      matrices.data(), sizes[5], sizes,
                            sizes[6],     sizes[7] != 0, width,           matrices[0].inputs};
-        return points(path)(task, places, count, values, slopes);
+        return points(path)(task, places, count, values, slopes, by_inputs);
     });
 #else
     return FHASH_NO_PATH;

@@ -354,10 +354,11 @@ template <class P> FHASH_INLINE const float* back(const Task& task, Workspace& w
     return slope;
 }
 
-// Values of the points from `begin` on, and derivatives (n, 4) where `slopes` is not null.
+// Values of the points, derivatives (n, 4) where `slopes` is not null, and those by the inputs
+// (inputs, n) where `by_inputs` is not.
 template <class P>
 FHASH_INLINE std::int64_t points_kernel(const Task& task, const Points& points, std::int64_t count,
-                                        float* values, float* slopes) {
+                                        float* values, float* slopes, float* by_inputs) {
     Workspace work(task);
     double tile[AXES * TILE];
     float sums[AXES * TILE];
@@ -377,8 +378,12 @@ FHASH_INLINE std::int64_t points_kernel(const Task& task, const Points& points, 
         else
             encode<false, false>(task, tile, work);
         std::memcpy(values + begin, run_layers<P>(task, work), filled * sizeof(float));
-        if (!slopes) continue;
+        if (!slopes && !by_inputs) continue;
         const float* by_input = back<P>(task, work);
+        for (std::int64_t k = 0; by_inputs && k < task.inputs; ++k)
+            std::memcpy(by_inputs + k * count + begin, by_input + k * TILE,
+                        filled * sizeof(float));
+        if (!slopes) continue;
         for (int a = 0; a < AXES; ++a) {
             float* FHASH_RESTRICT sum = sums + a * TILE;
             for (int i = 0; i < TILE; ++i) sum[i] = 0;

@@ -75,7 +75,7 @@ def make_engine(
     """Return a new engine.
 
     Args:
-        name: fused, native, slab, naive, or auto for the fastest that can be had on the device and
+        name: fused, native, slab, or auto for the fastest that can be had on the device and
             takes the model.
         architecture: the sizes of the model.
         coreset: the training samples.
@@ -104,10 +104,6 @@ def make_engine(
         from fhash_codec.paper.engines.slab import SlabEngine
 
         return SlabEngine(architecture, coreset, rates, seed=seed, device=device)
-    if name == "naive":
-        from fhash_codec.paper.engines.naive import NaiveEngine
-
-        return NaiveEngine(architecture, coreset, rates, seed=seed, device=device)
     raise InputError(f"unknown engine '{name}'; known: auto, {', '.join(ENGINES)}")
 
 

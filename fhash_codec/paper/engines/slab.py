@@ -4,7 +4,7 @@ A training sample is a lattice vertex. Its embedding at the finest level is ther
 the table, and every coarser level is a separable linear upsampling of a small sub-lattice; no 16
 corners are looked up per sample. The unit of work is a brick of vertices of one key frame, and a
 batch is a random set of bricks. The same code runs on a CPU and on CUDA; there the host never waits
-for a step, sends it one message (sending.py), and launches it as one graph (graphs.py).
+for a step, sends it one message (`Sender`), and launches it as one graph (`StepGraphs`).
 
 The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the bricks
 of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on its
@@ -13,8 +13,12 @@ missing steps, whose gradient is zero, in closed form before it is used (`traini
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
 from math import prod
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,24 +28,233 @@ from torch import Tensor
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.columns import Columns, columns_of
-from fhash_codec.paper.engines.graphs import StepGraphs
 from fhash_codec.paper.engines.initial import (
     Parameters,
     check_state,
     initial_parameters,
     layer_matrices,
 )
-from fhash_codec.paper.engines.sending import Sender, Sent
 from fhash_codec.paper.engines.upsampling import Lattices, Upsampling
 from fhash_codec.training.adam import (
+    CatchUp,
     adam_step,
     adam_step_on_device,
     catch_up,
     catch_up_numbers,
     corrections,
 )
+from fhash_codec.training.devices import first_line
 from fhash_codec.training.positions import true_positions
+from fhash_formats.errors import FhashWarning
+
+
+class Columns(NamedTuple):
+    """The columns of a batch: all vertices of its bricks, or their samples alone.
+
+    Around a feature most vertices of many bricks are no samples.
+
+    Attributes:
+        bricks: number of the bricks.
+        ranks: place of each column among the samples of the coreset, int64 (columns,); of one that
+            is no sample the place behind them all.
+        vertices: number of its vertex among those of the bricks, int64 (columns,); None where all
+            vertices are columns.
+        in_coreset: which columns are samples, as 0 and 1 (columns,); None where all are.
+    """
+
+    bricks: int
+    ranks: Tensor
+    vertices: Tensor | None
+    in_coreset: Tensor | None
+
+
+def columns_of(in_coreset: Tensor, offsets: Tensor, none: int, alone: int | None) -> Columns:
+    """Return the columns of some bricks.
+
+    Args:
+        in_coreset: which vertices (bricks, vertices) are samples, as 0 and 1.
+        offsets: place of each brick's first sample (bricks,).
+        none: place that stands for vertices that are no samples.
+        alone: number of the samples, where they alone are columns; else None.
+    """
+    bricks = len(in_coreset)
+    ranks = in_coreset.cumsum(1, dtype=torch.int64).add_(offsets.unsqueeze(1) - 1).view(-1)
+    mask = in_coreset.reshape(-1)
+    if alone is None:
+        return Columns(bricks, ranks.masked_fill_(mask == 0, none), None, mask)
+    vertices = true_positions(mask, alone)
+    return Columns(bricks, ranks[vertices], vertices, None)
+
+
+WARM_UPS = 2
+"""Steps of a shape that run kernel by kernel before one is captured: libraries start up in them."""
+MAX_GRAPHS = 64
+"""Shapes that are captured, at most; each holds the memory of a step's results."""
+
+
+class StepGraphs:
+    """The captured steps by their shape.
+
+    A step must read whatever changes from one step to the next from the same memory at each call,
+    and write to the same memory, but for its result.
+    """
+
+    def __init__(self) -> None:
+        self._captured: dict[Hashable, tuple[Any, Tensor]] = {}
+        self._seen: Counter[Hashable] = Counter()
+        self._failed = False
+
+    def run(self, shape: Hashable, step: Callable[[], Tensor]) -> Tensor:
+        """Do a step and return its result, a tensor of its own.
+
+        The third step of a shape is captured. Where that fails, this and all later steps run kernel
+        by kernel, with one FhashWarning.
+        """
+        if shape not in self._captured:
+            self._seen[shape] += 1
+            early = self._seen[shape] <= WARM_UPS
+            if early or self._failed or len(self._captured) == MAX_GRAPHS:
+                return step()
+            try:
+                self._captured[shape] = self._capture(step)
+            except RuntimeError as error:
+                self._failed = True
+                warnings.warn(
+                    f"no CUDA graph of a training step ({first_line(error)}); training goes on "
+                    "kernel by kernel, which is slower",
+                    FhashWarning,
+                    stacklevel=3,
+                )
+                return step()
+        graph, result = self._captured[shape]
+        graph.replay()
+        return result.clone()
+
+    def _capture(self, step: Callable[[], Tensor]) -> tuple[Any, Tensor]:
+        """Return the graph of a step, and where its result lies after each replay."""
+        graph = torch.cuda.CUDAGraph()
+        # Graphs share their memory: one runs after the other, and each result is copied at once.
+        pool = next(iter(self._captured.values()))[0].pool() if self._captured else None
+        with torch.cuda.graph(graph, pool=pool):
+            result = step()
+        return graph, result
+
+
+SCALARS = 3
+"""Single numbers of a step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sent:
+    """A batch of bricks and the numbers of its step, on the device.
+
+    Attributes:
+        ids: numbers of the bricks, int64 (bricks,).
+        caught_up: the columns of `adam.CatchUp`, float32 (4, bricks).
+        correction: `adam.corrections`' factor of the root, float32 ().
+        pace: `adam.corrections`' pace, float32 ().
+        scale: factor of the gradients, float32 ().
+    """
+
+    ids: Tensor
+    caught_up: Tensor
+    correction: Tensor
+    pace: Tensor
+    scale: Tensor
+
+
+class Sender:
+    """Memory on a device for the numbers of steps, one piece for each number of bricks.
+
+    On CUDA the numbers go through pinned memory, so that the host does not wait, and always to the
+    same place for a batch of one size, so that a captured graph finds them there.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._memory: dict[int, Tensor] = {}
+
+    def send(
+        self,
+        chosen: npt.NDArray[np.int64],
+        columns: CatchUp,
+        scalars: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> Sent:
+        """Return a step's numbers on the device. The next call with as many bricks overwrites them.
+
+        Args:
+            chosen: numbers of the bricks, int64 (bricks,).
+            columns: effect of the steps that the bricks were passed over.
+            scalars: correction, pace and scale.
+        """
+        count = len(chosen)
+        # The int64 come first: so all numbers lie at multiples of their own size.
+        parts = (np.ascontiguousarray(chosen), *columns, np.array(scalars, dtype=np.float32))
+        received = self._received(np.concatenate([part.view(np.uint8) for part in parts]), count)
+        numbers = received[8 * count :].view(torch.float32)
+        correction, pace, scale = numbers[4 * count :].unbind()
+        return Sent(
+            ids=received[: 8 * count].view(torch.int64),
+            caught_up=numbers[: 4 * count].view(4, count),
+            correction=correction,
+            pace=pace,
+            scale=scale,
+        )
+
+    def _received(self, packed: npt.NDArray[np.uint8], count: int) -> Tensor:
+        """Return bytes on the device."""
+        if self._device.type == "cpu":
+            return torch.from_numpy(packed)
+        if count not in self._memory:
+            self._memory[count] = torch.empty(len(packed), dtype=torch.uint8, device=self._device)
+        # Fresh at each step: torch hands pinned memory out again only after its copy is done.
+        pinned = torch.empty(len(packed), dtype=torch.uint8, pin_memory=True)
+        pinned.numpy()[:] = packed
+        return self._memory[count].copy_(pinned, non_blocking=True)
+
+
+LIBRARIES = 1 << 28
+"""Bytes for the libraries of CUDA: their code and the workspaces of matrix products."""
+UNEVEN = 2
+"""Largest number of bricks of a batch, as a multiple of the mean: batches have as many samples."""
+TIMES = 2
+"""Copies of a step's memory: captured graphs hold theirs beside that of the first steps."""
+
+
+def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> int:
+    """Return about how many bytes a training takes, rather too many than too few.
+
+    Args:
+        architecture: the sizes of the model.
+        coreset: the training samples.
+        batches: batches of an epoch.
+    """
+    bricks, vertices = len(coreset.bricks), prod(coreset.brick_shape)
+    samples = len(coreset.values) + 1
+    size = architecture.embedding_size
+    coarse = size * sum(prod(level) for level in architecture.levels[1:])
+    network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
+    # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
+    held = 12 * size * samples + 4 * samples + coreset.mask_bits.nbytes
+    held += bricks * (8 + 4 * 8)
+    # Four vectors of the numbers in use, their places, rank, mask, and the initial tables.
+    held += coarse * (4 * 4 + 8 + 4 + 1 + 4) + 16 * network
+    batch = min(UNEVEN * -(-bricks // batches), bricks)
+    return LIBRARIES + held + TIMES * batch * vertices * _bytes_a_vertex(architecture)
+
+
+def _bytes_a_vertex(architecture: Architecture) -> int:
+    """Return the bytes that a training step holds for each vertex of its bricks."""
+    inputs = architecture.inputs
+    hidden = sum(outputs + 1 for outputs, _ in architecture.layer_shapes[:-1])
+    # Inputs and their gradients, each also for samples alone; activations and their gradients.
+    numbers = 4 * (inputs + 1) + 2 * hidden
+    # Rows of the finest level, what Adam makes of them and the effect of missed steps, products of
+    # the interpolation, target, residual and its square.
+    numbers += 7 * architecture.embedding_size + 4 + 3 * architecture.embedding_size + 4
+    # Mask, its bits and sums, ranks, places of the samples and their bricks.
+    return 4 * numbers + 2 + 5 * 8
+
 
 CHUNK = 1 << 13
 """Samples that go through the MLP at a time: their activations stay in a core's cache.

@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.levels import Resolution
+from fhash_codec.paper.architecture import Architecture, Resolution
 
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]

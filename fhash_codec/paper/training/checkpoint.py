@@ -30,8 +30,11 @@ MAX_NAME_BYTES = 250
 """Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
 PARTIAL_BYTES = 24
 """Bytes that a temporary name adds while the checkpoint is written."""
-UNRELATED = ("device", "psnr", "tables", "timings", "train_on_seconds", "without")
-"""Settings that do not change the course of a training, but at most its rounding and its end."""
+UNRELATED = ("device", "engine", "psnr", "tables", "timings", "train_on_seconds", "without")
+"""Settings that do not change the course of a training, but at most its rounding and its end.
+
+Engines go on from each other's state.
+"""
 
 
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:
@@ -44,8 +47,6 @@ def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Pat
         "fold": config.model_fold,
         "embedding_size": config.model_embedding_size,
         "width": config.model_width,
-        # The other engines go on from each other's state.
-        "engine": "naive" if config.engine == "naive" else "bricks",
     }
     digest = hashlib.sha256(
         json.dumps(

@@ -259,7 +259,7 @@ class _Fitting:
 
     def _choose_device(self) -> torch.device:
         """Return the device, by the plan without further rounds: the same at each continuation."""
-        from fhash_codec.paper.engines.memory import needed_bytes
+        from fhash_codec.paper.engines.slab import needed_bytes
         from fhash_codec.paper.training.train import usual_batches, usual_epochs
 
         samples, bricks = len(self._coreset.values), len(self._coreset.bricks)

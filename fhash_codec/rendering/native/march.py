@@ -23,7 +23,6 @@ from fhash_codec.rendering.native.structure import (
     LIT,
     MAX_PLANES,
     MAX_SURFACES,
-    MAX_VALUES,
     MAXIMUM,
     MINIMUM,
     POWERS,
@@ -35,21 +34,21 @@ from fhash_codec.rendering.native.structure import (
     plane,
     surface,
 )
-from fhash_codec.rendering.task.bricks import SIDE, Bricks
-from fhash_codec.rendering.task.counters import complete
-from fhash_codec.rendering.task.smoothing import smoothed
+from fhash_codec.rendering.task.bricks import SIDE, Bricks, smoothed
 from fhash_codec.rendering.task.task import (
     GRADES,
+    MAX_VALUES,
     Frame,
     Lighting,
     Marched,
     Table,
     Task,
+    complete,
     extinctions_in,
 )
 from fhash_formats.support.threads import in_threads, usable_threads
 
-__all__ = ["MAX_SURFACES", "MAX_VALUES", "march_native"]
+__all__ = ["MAX_SURFACES", "march_native"]
 
 Single = npt.NDArray[np.float32]
 
@@ -90,6 +89,7 @@ def march_native(
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
     every processor has. The pictures agree within rounding.
     """
+    assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
     task = task.marched
     given = MarchInput.of(frame, task, bricks)
     buffers = _Buffers.of(task)

@@ -17,7 +17,6 @@ __all__ = [
     "MAXIMUM",
     "MAX_PLANES",
     "MAX_SURFACES",
-    "MAX_VALUES",
     "MINIMUM",
     "POWERS",
     "SHADED",
@@ -31,8 +30,6 @@ __all__ = [
 
 MAX_SURFACES = 64
 """Surfaces of a picture, at most: FHASH_SURFACES."""
-MAX_VALUES = 2**31 - 1
-"""Values of a frame, at most: the vectors' indices have 32 bits."""
 MAX_PLANES = 6
 """Planes that clip a picture, at most: FHASH_PLANES."""
 POWERS = 1024

@@ -127,11 +127,7 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
             else ""
         )
         return f"cache: decode once, then march what was decoded{why}{lattice}"
-    through = (
-        "the network, which has values of its own between vertices (cache is linear there)"
-        if volume.profile == "paper"
-        else "the lattice, with the same values as cache"
-    )
+    through = "the network, which has values of its own between vertices (cache is linear there)"
     if plan.why_mode:
         through += f"; {plan.why_mode}"
     if plan.mode == "stream":

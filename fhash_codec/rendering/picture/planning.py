@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.feature_volume import feature_names
 from fhash_codec.indexing import MAX_LOD
 from fhash_codec.rendering.camera.camera import Grid, Rays
@@ -34,8 +35,8 @@ from fhash_codec.rendering.scene.scene import (
 )
 from fhash_codec.rendering.task.arrays import NUMPY
 from fhash_codec.rendering.task.devices import arrays_on
-from fhash_codec.rendering.task.grading import grading_of
-from fhash_codec.rendering.task.task import Surface, Table, Task
+from fhash_codec.rendering.task.slopes import grading_of
+from fhash_codec.rendering.task.task import MAX_VALUES, Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
@@ -94,6 +95,9 @@ def plan_picture(
     # Light comes from all of the volume, whether it is in view or not.
     domain = part_of_body(volume, task.body, grid.warp, margin)
     lit = shadows is not None or occlusion is not None
+    region = domain if lit else part_in_view(rays, volume, task.body, margin)
+    if mode == "cache" or lit:
+        _check_frame(region, lod)
     plan = Plan(
         scene=scene,
         layout=layout,
@@ -104,7 +108,7 @@ def plan_picture(
         why_mode=why_mode,
         lod=lod,
         why_lod=why_lod,
-        region=domain if lit else part_in_view(rays, volume, task.body, margin),
+        region=region,
         function=function,
         units=units,
         shadows=shadows,
@@ -340,6 +344,16 @@ def _check_ray_length(task: Task) -> None:
     warnings.warn(line, FhashWarning, stacklevel=3)
 
 
+def _check_frame(region: Box, lod: int) -> None:
+    """Raise InputError for a frame of more vertices than a marcher takes."""
+    vertices = math.prod(-(-(stop - first) // (1 << lod)) for first, stop in region)
+    if vertices > MAX_VALUES:
+        raise InputError(
+            f"a frame of {vertices:,} vertices is too large to march; allowed: {MAX_VALUES:,}; "
+            "choose a coarser level of detail by 'lod', or clip the volume"
+        )
+
+
 def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
     """Warn of isosurfaces whose values the series does not reach: nothing is drawn of them."""
     low, high = volume.value_range.low, volume.value_range.high
@@ -355,8 +369,16 @@ def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
 
 
 def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
-    """The way to march, and why 'auto' took it; InputError for one that the device cannot take."""
+    """The way to march, and why 'auto' took it; InputError for one that cannot be had."""
     march = scene.march
+    if volume.profile != "paper":
+        if march.mode in ("arm", "stream") or march.device == "cuda":
+            what = "device 'cuda'" if march.device == "cuda" else f"march '{march.mode}'"
+            raise InputError(
+                f"{what} is for a network, and {volume.path}, of the profile {volume.profile}, has "
+                "none: its decoded frames are marched on the CPU; leave it out"
+            )
+        return "cache", "" if march.mode == "cache" else "since the file has no network"
     if march.mode == "auto":
         if march.device == "cuda" or (
             march.device == "auto" and arrays_on(march.device) is not NUMPY

@@ -297,7 +297,12 @@ class Effects(Record):
 class Marching(Record):
     """Sampling of the rays: accuracy against time."""
 
-    mode: str = limits("auto", "way to march", choices=MARCHES)
+    mode: str = limits(
+        "auto",
+        "way to march: decoded frames from the cache, or a network adaptively (arm) or sample by "
+        "sample (stream)",
+        choices=MARCHES,
+    )
     step: float = limits(0.5, "length of a step in vertex spacings", low=1e-6, high=64)
     threshold: float = limits(
         1 / 1024, "share of the light behind a sample below which a ray ends", low=0, high=1
@@ -316,7 +321,7 @@ class Marching(Record):
     )
     device: str = limits(
         "auto",
-        "where arm and stream compute: on the first GPU if there is one, or as named",
+        "where a network is marched (arm, stream): on the first GPU if there is one, or as named",
         choices=DEVICES,
     )
     skipping: bool = limits(True, "whether bricks without anything visible are passed over")

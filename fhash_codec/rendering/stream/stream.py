@@ -4,9 +4,8 @@ The model is evaluated for a whole pass at once. Plain streaming takes one sampl
 is alive in a pass. Adaptive ray marching takes more samples the fewer rays are left, N_s =
 clamp(N_r / N_alive, 1, 64) of each ray (paper, algorithm 1).
 
-Both make the same picture. With numpy it is the same bit for bit, since every number of a sample is
-computed without the other samples of the pass (inference.py). On a device a network's values differ
-by the rounding of matrix products, and the picture with them.
+Both make the same picture, with numpy bit for bit: every number of a sample is computed without the
+other samples of the pass (fields.py).
 
 A pass is computed where the field has its values: by numpy on the host, or by torch on a device.
 From a device only counts come back before the picture is finished. The host waits for a few of them
@@ -15,26 +14,22 @@ in each pass: those that the size of further arrays depends on.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.stream.beams import Beams
-from fhash_codec.rendering.stream.canvas import Canvas, Events
-from fhash_codec.rendering.stream.crossings import Crossings, crossings
+from fhash_codec.rendering.stream.beams import Beams, Leaping
+from fhash_codec.rendering.stream.canvas import Canvas, Events, Factors
 from fhash_codec.rendering.stream.fields import Field
-from fhash_codec.rendering.stream.grading import Factors
-from fhash_codec.rendering.stream.leaping import Leaping
-from fhash_codec.rendering.stream.projection import Projection
-from fhash_codec.rendering.task.arrays import Array
+from fhash_codec.rendering.task.arrays import NUMPY, Array, Arrays
 from fhash_codec.rendering.task.bricks import SIDE
-from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.palette import Palette
-from fhash_codec.rendering.task.task import Marched, Task
+from fhash_codec.rendering.task.task import Marched, Surface, Task, complete
 
-__all__ = ["MAX_SAMPLES", "stream"]
+__all__ = ["MAX_SAMPLES", "Crossings", "Projection", "crossings", "stream"]
 
 MAX_SAMPLES = 64
 """Samples of a ray in a pass, at most, as in the paper."""
@@ -127,10 +122,10 @@ class _Marcher:
         self.field, self.task, self.beams, self.arrays = field, task, beams, arrays
         self.palette = None if task.table is None else Palette.of(task.table, arrays)
         self.canvas = Canvas(field, task, beams, self.palette)
-        self.leaping = Leaping.of(field.bricks, task, field.first, field.stride, arrays)
+        self.leaping = Leaping.of(field.bricks, task, field.first, arrays)
         # A step longer than a brick could pass through one in which a surface lies, on its way from
         # one in which nothing is visible to another.
-        short = task.step <= SIDE * field.stride * float(np.min(np.abs(task.rays.grid.spacing)))
+        short = task.step <= SIDE * float(np.min(np.abs(task.rays.grid.spacing)))
         self.skipping = task.skipping and (short or not task.surfaces)
         # Between two samples in cells without a surface there may be a cell with one: pictures with
         # surfaces look at whole bricks.
@@ -242,7 +237,7 @@ class _Marcher:
         """Whether places (n, 3) lie in visible cells."""
         assert self.cells is not None
         z, y, x = self.cells.shape
-        at = self.arrays.to_int64((places - self.field.first) / self.field.stride)
+        at = self.arrays.to_int64(places - self.field.first)
         i, j, k = (
             self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z))
         )
@@ -337,3 +332,198 @@ class _Marcher:
         opacity = arrays.full(flat.shape, 0.0)
         opacity[some] = -xp.expm1(-depth)
         return opacity.reshape(values.shape)
+
+
+class Projection:
+    """The projected values of rays as far as they are marched.
+
+    Attributes:
+        at: (n,), places of the values, in samples; of the first value for the mean.
+    """
+
+    def __init__(self, kind: str, ends: tuple[float, float], count: int, arrays: Arrays) -> None:
+        self._kind, self._ends, self._arrays = kind, ends, arrays
+        self.at = arrays.full(count, 0.0)
+        # The best rank so far: of a maximum the value, of a minimum the value times -1, of an
+        # attenuated maximum the share of the colours that is left; for the mean minus the place.
+        self._best = arrays.full(count, 0.0 if kind == "attenuated" else -np.inf)
+        # The light that is left, for the attenuated maximum; sum and length for the mean.
+        self._light = arrays.full(count, 1.0)
+        self._sum, self._length = arrays.full(count, 0.0), arrays.full(count, 0.0)
+
+    @classmethod
+    def of(cls, task: Task, count: int, arrays: Arrays) -> Projection | None:
+        """The projection of a task for `count` rays; None where it draws the volume."""
+        if not task.projection or task.table is None:
+            return None
+        return cls(task.projection, (task.table.low, task.table.high), count, arrays)
+
+    @property
+    def values(self) -> Array:
+        """Values (n,) that the rays show; not finite where a ray met none."""
+        xp, nothing = self._arrays.xp, self._arrays.full((), np.nan)
+        if self._kind == "minimum":
+            return -self._best
+        if self._kind == "average":
+            seen = self._length > 0
+            return xp.where(seen, self._sum / xp.where(seen, self._length, 1.0), nothing)
+        if self._kind == "attenuated":
+            low, high = self._ends
+            return xp.where(self._best > 0, low + self._best * (high - low), nothing)
+        return self._best
+
+    def finished(self, alive: Array) -> Array:
+        """Whether rays (n,) cannot meet a value any more that they would show."""
+        if self._kind == "attenuated":
+            return self._light[alive] <= self._best[alive]
+        return self._best[alive] == np.inf  # never
+
+    def add(
+        self, alive: Array, sample: Array, values: Array, length: Array, opacity: Array
+    ) -> None:
+        """Add the samples of a pass.
+
+        Args:
+            alive: numbers (rays,) of the rays.
+            sample: int64 (rays, samples), numbers of the samples.
+            values: (rays, samples), NaN where there is none.
+            length: (rays, samples), of the steps, in steps.
+            opacity: (rays, samples), 0 where there is no value.
+        """
+        arrays, xp = self._arrays, self._arrays.xp
+        known, place = ~xp.isnan(values), arrays.to_float64(sample)
+        if self._kind == "average":
+            weight = xp.where(known, length, 0.0)
+            for column in range(sample.shape[1]):  # so the sum does not depend on the passes
+                self._sum[alive] += weight[:, column] * xp.nan_to_num(values[:, column])
+                self._length[alive] += weight[:, column]
+            rank = xp.where(known, -place, -np.inf)
+        elif self._kind == "attenuated":
+            low, high = self._ends
+            share = xp.clip((xp.nan_to_num(values) - low) / (high - low), 0.0, 1.0)
+            left = xp.cumprod(
+                xp.concatenate([self._light[alive][:, None], 1 - opacity], axis=1), axis=1
+            )
+            self._light[alive] = left[:, -1]
+            rank = xp.where(known, share * left[:, :-1], 0.0)
+        else:
+            sign = -1.0 if self._kind == "minimum" else 1.0
+            rank = xp.where(known, sign * values, -np.inf)
+        best = xp.argmax(rank, axis=1)[:, None]
+        rank, place = (arrays.take_along(array, best, 1)[:, 0] for array in (rank, place))
+        best_before, at_before = self._best[alive], self.at[alive]
+        better = rank > best_before
+        self._best[alive] = xp.where(better, rank, best_before)
+        self.at[alive] = xp.where(better, place, at_before)
+
+
+CLOSE = 1e-8
+"""Distance, in samples. A root is found when the last turn moved it by no more, or when the
+interval that holds it is no wider.
+"""
+MAX_TURNS = 60
+"""Turns of the search for a root, at most."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Crossings:
+    """Crossings before each sample of a pass, the nearest first; as many places as surfaces.
+
+    Attributes:
+        at: (rays, samples, surfaces), places in samples of the ray.
+        opacity: (rays, samples, surfaces), 0 where there is no crossing.
+        which: int64 (rays, samples, surfaces), number of the surface.
+    """
+
+    at: Array
+    opacity: Array
+    which: Array
+
+
+def crossings(
+    values: Callable[[Array, Array, Array], Array],
+    at: Array,
+    steps: Array,
+    surfaces: Sequence[Surface],
+    arrays: Arrays = NUMPY,
+) -> Crossings:
+    """The crossings of a pass.
+
+    values: function of rows (n,) of the pass, places (n,) in samples, and which of them count, bool
+        (n,); values (n,) there.
+    at: (rays, 1 + samples), places of the samples and, first, of the one before the pass.
+    steps: (rays, 1 + samples), the values there, NaN where there is none.
+    """
+    xp = arrays.xp
+    shape = (len(at), at.shape[1] - 1, len(surfaces))
+    places, opacity = arrays.full(shape, np.inf), arrays.full(shape, 0.0)
+    before, after = steps[:, :-1], steps[:, 1:]
+    both = ~xp.isnan(before) & ~xp.isnan(after)
+    crossed = [both & ((before < each.value) != (after < each.value)) for each in surfaces]
+    row, column, number = arrays.nonzero(xp.stack(crossed, axis=2))
+    if len(row):
+        level, share = (arrays.full(len(row), 0.0) for _ in range(2))
+        for count, surface in enumerate(surfaces):
+            level = xp.where(number == count, surface.value, level)
+            share = xp.where(number == count, surface.opacity, share)
+
+        def above(chosen: Array, place: Array, counted: Array) -> Array:
+            return values(row[chosen], place, counted) - level[chosen]
+
+        ends = before[row, column] - level, after[row, column] - level
+        root = _roots(above, at[row, column], at[row, column + 1], *ends, arrays)
+        exists = xp.isfinite(root)
+        places[row, column, number] = xp.where(exists, root, np.inf)
+        opacity[row, column, number] = xp.where(exists, share, 0.0)
+    which = xp.argsort(places, axis=2, stable=True)
+    places, opacity = (arrays.take_along(array, which, 2) for array in (places, opacity))
+    return Crossings(at=xp.where(xp.isfinite(places), places, 0.0), opacity=opacity, which=which)
+
+
+def _roots(
+    function: Callable[[Array, Array, Array], Array],
+    near: Array,
+    far: Array,
+    at_near: Array,
+    at_far: Array,
+    arrays: Arrays,
+) -> Array:
+    """Roots of a function between places, where its values have two signs.
+
+    function: values (m,) for numbers (m,) of the roots searched for, places (m,), and which of them
+        are searched for still, bool (m,).
+    near, far: places (n,) around the roots. at_near, at_far: values (n,) there.
+    The result is NaN where the search met a place without a value.
+    """
+    xp = arrays.xp
+    near, far, at_near, at_far = (arrays.copy(array) for array in (near, far, at_near, at_far))
+    root = xp.where(at_far == 0, far, near)
+    (going,) = arrays.nonzero((at_near != 0) & (at_far != 0))
+    for _ in range(0, MAX_TURNS, arrays.turns):
+        if not len(going):
+            break
+        active = going >= 0
+        for _ in range(arrays.turns):
+            place = far[going] - at_far[going] * (far[going] - near[going]) / (
+                at_far[going] - at_near[going]
+            )
+            place = arrays.kept(active, place, far[going])
+            value = function(going, place, active)
+            root[going] = arrays.kept(active, xp.where(xp.isnan(value), np.nan, place), root[going])
+            same = (value < 0) == (at_far[going] < 0)
+            moved = xp.abs(place - far[going])
+            # The end that stays twice has its value halved, so that the other one moves, too.
+            halved = xp.where(same, at_near[going] / 2, at_far[going])
+            at_near[going] = arrays.kept(active, halved, at_near[going])
+            near[going] = arrays.kept(active, xp.where(same, near[going], far[going]), near[going])
+            far[going] = place
+            at_far[going] = arrays.kept(active, value, at_far[going])
+            active = (
+                active
+                & (moved > CLOSE)
+                & (xp.abs(far[going] - near[going]) > CLOSE)
+                & (value != 0)
+                & ~xp.isnan(value)
+            )
+        going = going[arrays.nonzero(active)]
+    return root

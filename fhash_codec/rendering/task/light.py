@@ -22,7 +22,7 @@ from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.grading import factors_at_vertices
+from fhash_codec.rendering.task.slopes import factors_at_vertices
 from fhash_codec.rendering.task.task import Frame, Grading, LightGrid, Table, extinctions_in
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,8 @@ from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.clip import Body
 
 __all__ = [
+    "COUNTERS",
+    "MAX_VALUES",
     "Frame",
     "Grading",
     "LightGrid",
@@ -31,7 +34,9 @@ __all__ = [
     "Surface",
     "Table",
     "Task",
+    "complete",
     "extinctions_in",
+    "rows",
 ]
 
 Floats = npt.NDArray[np.float64]
@@ -97,6 +102,8 @@ class Grading:
     top: float
 
 
+MAX_VALUES = 2**31 - 1
+"""Values of a frame, at most: the native marcher's indices have 32 bits."""
 GRADES = 1024
 """Intervals of the factors of a grading: FHASH_GRADES."""
 DENSEST = 1e30
@@ -248,10 +255,45 @@ class Marched:
         rgba: float32 (H, W, 4), the colour multiplied by the opacity.
         depth: float32 (H, W), as `Image` has it, or None.
         normal: float32 (H, W, 3), as `Image` has it, or None.
-        counters: amounts of work by the names of COUNTERS (counters.py).
+        counters: amounts of work by the names of COUNTERS (below).
     """
 
     rgba: Single
     depth: Single | None = None
     normal: Single | None = None
     counters: Mapping[str, int] = field(default_factory=dict)
+
+
+COUNTERS: Mapping[str, str] = MappingProxyType(
+    {
+        "rays": "that meet the volume",
+        "passes": "of samples; for packets, those of each packet",
+        "samples": "values looked up along rays",
+        "evaluations": "of the network itself",
+        "gradients": "at lit samples and surfaces",
+        "secondary_rays": "towards light and surroundings",
+        "skipped_bricks": "places where rays leapt over what cannot be seen",
+        "decoded_vertices": "of the decoded frame, kept ones included",
+    }
+)
+"""Names of the counters and what they count."""
+
+
+def complete(*parts: Mapping[str, int]) -> dict[str, int]:
+    """Sums of counters in the order of COUNTERS, 0 where none is given.
+
+    Raises KeyError for a name that is not among COUNTERS.
+    """
+    total = dict.fromkeys(COUNTERS, 0)
+    for part in parts:
+        for name, count in part.items():
+            total[name] += int(count)
+    return total
+
+
+def rows(counters: Mapping[str, int]) -> list[tuple[str, str, str]]:
+    """Rows (name, count, what it counts) for people to read."""
+    return [
+        (name.replace("_", " "), f"{counters.get(name, 0):,}", text)
+        for name, text in COUNTERS.items()
+    ]

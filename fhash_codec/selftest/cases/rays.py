@@ -193,12 +193,6 @@ CASES = (
                     transfer_function={"opacity": [[0.0, 1e-3]]},
                     march={"step": 1e-6},
                 ),
-                "step-1e-3-stream": scene(
-                    size=[2, 2],
-                    camera=FRONT,
-                    transfer_function={"opacity": [[0.0, 0.5]]},
-                    march={"step": 1e-3, "mode": "arm"},
-                ),
                 "step-64": scene(
                     size=[4, 4], transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 64.0}
                 ),

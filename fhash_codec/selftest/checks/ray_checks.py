@@ -1,10 +1,9 @@
-"""Checks of pictures of hard scenes: finite pixels, equal to the float64 picture, the same for
-every march, by blocks, and at key times."""
+"""Checks of pictures of hard scenes: finite pixels, equal to the float64 picture, the same by
+blocks, and at key times."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,18 +15,16 @@ from fhash_codec.rendering.picture.planning import plan_picture
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.task.task import Frame
+from fhash_codec.rendering.task.warping import warped
 from fhash_codec.selftest.case import Check, Finding, Run
 from fhash_codec.selftest.checks.ray_oracle import reference_picture
 
-__all__ = ["MODES", "blocks", "closed_form", "key_times", "scene", "scenes"]
+__all__ = ["blocks", "closed_form", "float64_picture", "key_times", "scene", "scenes"]
 
 Picture = npt.NDArray[Any]
 
 NEAR = 1e-3
-"""Allowed difference of a colour channel between two marches through the same values, and from the
-float64 picture."""
-MODES = ("cache", "stream", "arm")
-"""Modes of marching through the same values."""
+"""Allowed difference of a colour channel from the float64 picture."""
 
 
 def scene(**parts: Any) -> Scene:
@@ -52,21 +49,18 @@ def scene(**parts: Any) -> Scene:
     )
 
 
-def scenes(
-    scenes_by_name: Mapping[str, Scene], *, modes: tuple[str, ...] = MODES, oracle: bool = True
-) -> Check:
-    """A check that draws each scene: finite, within 0..1, and the same in each mode.
+def scenes(scenes_by_name: Mapping[str, Scene], *, oracle: bool = True) -> Check:
+    """A check that draws each scene: finite and within 0..1.
 
     Args:
         scenes_by_name: the scenes.
-        modes: the modes of marching; the first one is compared with the others.
         oracle: whether the picture is also compared with the float64 picture.
     """
 
     def check(run: Run) -> Iterator[Finding]:
         renderer = Renderer(run.volume)
         for name, scene_ in scenes_by_name.items():
-            yield from _pictures(run, renderer, name, scene_, modes, oracle)
+            yield from _pictures(run, renderer, name, scene_, oracle)
 
     return check
 
@@ -156,49 +150,38 @@ FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
 """A transfer function through which all of the volume is seen."""
 
 
+def float64_picture(run: Run, picture_scene: Scene) -> Finding:
+    """A picture of ambient light alone equals that of float64."""
+    renderer = Renderer(run.volume)
+    plan = renderer.plan(picture_scene)
+    return _off(renderer.render(picture_scene).rgba, _expected(run, plan))
+
+
 def _pictures(
-    run: Run,
-    renderer: Renderer,
-    name: str,
-    picture_scene: Scene,
-    modes: tuple[str, ...],
-    oracle: bool,
+    run: Run, renderer: Renderer, name: str, picture_scene: Scene, oracle: bool
 ) -> Iterator[Finding]:
-    by_mode = {
-        mode: renderer.render(
-            replace(picture_scene, march=replace(picture_scene.march, mode=mode))
-        ).rgba
-        for mode in modes
-    }
-    bad = sum(int(np.count_nonzero(~np.isfinite(picture))) for picture in by_mode.values())
-    yield Finding(name="finite pixels", worst=float(bad), limit=0.0, unit="channels", under=name)
-    beyond = max(
-        max(-float(picture.min()), float(picture.max()) - 1.0, 0.0) for picture in by_mode.values()
-    )
+    picture = renderer.render(picture_scene).rgba
+    bad = float(np.count_nonzero(~np.isfinite(picture)))
+    yield Finding(name="finite pixels", worst=bad, limit=0.0, unit="channels", under=name)
+    beyond = max(-float(picture.min()), float(picture.max()) - 1.0, 0.0)
     yield Finding(name="pixels in 0..1", worst=beyond, limit=1e-6, unit="of a channel", under=name)
-    first = by_mode[modes[0]]
-    for mode, picture in by_mode.items():
-        if mode != modes[0]:
-            yield Finding(
-                name=f"{mode} = {modes[0]}",
-                worst=_difference(picture, first),
-                limit=NEAR,
-                unit="of a channel",
-                under=name,
-            )
     if oracle:
-        plan = renderer.plan(picture_scene)
-        frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
-        expected = reference_picture(frame, plan.task)
-        yield Finding(
-            name="float64 picture",
-            worst=_difference(first, expected),
-            limit=NEAR,
-            unit="of a channel",
-            under=name,
-        )
+        expected = _expected(run, renderer.plan(picture_scene))
+        yield _off(picture, expected, name)
         if not name.startswith("nothing"):
             yield _not_empty(float(expected[..., 3].max()), name)
+
+
+def _expected(run: Run, plan: Plan) -> Picture:
+    """The float64 picture of a plan."""
+    frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
+    return reference_picture(warped(frame, plan.task.rays.grid.warp), plan.task)
+
+
+def _off(picture: Picture, expected: Picture, name: str = "") -> Finding:
+    """The largest difference of a picture from the one that is expected."""
+    worst = float(np.abs(picture.astype(np.float64) - expected).max())
+    return Finding(name="float64 picture", worst=worst, limit=NEAR, unit="of a channel", under=name)
 
 
 def _not_empty(max_opacity: float, name: str) -> Finding:
@@ -210,10 +193,6 @@ def _not_empty(max_opacity: float, name: str) -> Finding:
         unit="pictures",
         under=name,
     )
-
-
-def _difference(one: Picture, other: Picture) -> float:
-    return float(np.abs(one.astype(np.float64) - other).max())
 
 
 def _path(plan: Plan) -> npt.NDArray[np.float64]:

@@ -66,6 +66,9 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
 
     colour, left = np.zeros(3), 1.0
     values = value(at)
+    # A sample beyond the box is seen only where the ray leaves the box within the frame.
+    reached = np.minimum(at, leave)
+    values[(reached < entered - SNAP) | (reached > left_at + SNAP)] = np.nan
     ends = np.concatenate(
         [[entered], np.clip(at, entered, max(entered, left_at)), [max(entered, left_at)]]
     )

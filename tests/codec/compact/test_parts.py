@@ -10,7 +10,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.parts import MAX_LEVELS, head_mlp, level_count
-from fhash_codec.paper.levels import level_resolutions
+from fhash_codec.paper.architecture import level_resolutions
 
 
 @pytest.mark.parametrize("box", [(1, 1, 1), (2, 2, 2), (3, 1, 1), (25, 125, 125), (64, 64, 128)])

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.paper.levels import level_resolutions
+from fhash_codec.paper.architecture import level_resolutions
 from fhash_codec.paper.network import ArrayTable, Network
 
 Points = list[npt.NDArray[np.float64]]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_field import by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
@@ -26,9 +27,9 @@ def blobs() -> np.ndarray:
 
 @pytest.fixture(params=["native", "streamed"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Both ways to march a decoded frame: natively, and streamed as too large a frame is."""
+    """Both marchers through a decoded frame: the native one, and the streamed one of networks."""
     if request.param == "streamed":
-        monkeypatch.setattr("fhash_codec.rendering.march.MAX_VALUES", 0)
+        monkeypatch.setattr("fhash_codec.rendering.march.march_native", by_stream)
     return str(request.param)
 
 

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from frame_field import by_stream, streamed
 
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Camera, Shadows
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Surface, Table, Task
+from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
 from fhash_formats.errors import InputError
 
 Shape = tuple[int, ...]
@@ -348,20 +349,16 @@ def test_both_ways_make_one_picture(case: str, spacing: tuple[float, float, floa
     task = task_of(
         values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more
     )
-    here, there = march(frame_of(values), task), streamed(frame_of(values), task)
+    here = march(frame_of(values), task)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fhash_codec.rendering.march.march_native", by_stream)
+        there = march(frame_of(values), task)
     assert here.rgba[..., 3].max() > 0.2
     np.testing.assert_allclose(here.rgba, there.rgba, atol=2e-4)
     if task.depth:
         both = np.isfinite(here.depth) & np.isfinite(there.depth)
         assert np.mean(np.isfinite(here.depth) == np.isfinite(there.depth)) > 0.99
         assert np.mean(np.abs(here.depth[both] - there.depth[both]) < 1e-3 * unit) > 0.99
-
-
-def streamed(frame: Frame, task: Task) -> Marched:
-    """The picture of a frame that is too large to be marched natively."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fhash_codec.rendering.march.MAX_VALUES", 0)
-        return march(frame, task)
 
 
 def test_values_of_any_magnitude_make_the_same_picture(way: str) -> None:

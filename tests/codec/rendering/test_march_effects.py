@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import by_stream
 
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.clip import Body
@@ -268,7 +269,7 @@ def test_a_bounded_file_is_as_bright_as_its_source_and_without_grain(
     assert np.abs(drawn - exact)[inner].mean() < 0.5 * np.abs(grained - exact)[inner].mean()
 
 
-def test_the_opacity_by_gradient_of_a_bounded_file_is_that_of_its_values(way: str) -> None:
+def test_the_opacity_by_gradient_of_a_bounded_file_is_that_of_its_values() -> None:
     _, coded = bounded(noise=0.1)
     grading = Grading(factors=np.linspace(0.0, 1.0, 1025), top=0.1)
     task = task_of(coded.shape, camera=Camera(), size=(24, 24), fog=0.1, grading=grading)
@@ -278,7 +279,7 @@ def test_the_opacity_by_gradient_of_a_bounded_file_is_that_of_its_values(way: st
 
 
 @pytest.mark.parametrize("central", [False, True])
-@pytest.mark.parametrize("lit", ["volume", "surface", "graded"])
+@pytest.mark.parametrize("lit", ["volume", "surface"])
 def test_both_marchers_shade_bounded_files_alike(
     central: bool, lit: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,9 +295,8 @@ def test_both_marchers_shade_bounded_files_alike(
         ),
         shaded=lit != "surface",
         surfaces=(Surface(value=0.4, colour=WHITE, opacity=0.7),) * (lit == "surface"),
-        grading=Grading(factors=np.linspace(0.2, 1.0, 1025), top=0.1) if lit == "graded" else None,
         noise=0.05,
     )
     fast = marched(coded, task)
-    monkeypatch.setattr("fhash_codec.rendering.march.MAX_VALUES", 0)
+    monkeypatch.setattr("fhash_codec.rendering.march.march_native", by_stream)
     np.testing.assert_allclose(fast.rgba, marched(coded, task).rgba, atol=2e-3)

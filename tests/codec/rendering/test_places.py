@@ -63,23 +63,13 @@ def test_a_ball_on_uneven_axes_is_the_ball_on_even_ones(tmp_path: Path, descendi
         assert error < 0.2 * float(np.sqrt(np.mean((other - expected) ** 2)))
 
 
-def test_every_mode_and_level_draws_uneven_axes_alike(tmp_path: Path) -> None:
+def test_every_level_draws_uneven_axes_alike(tmp_path: Path) -> None:
     axis, even = UNEVEN[::2], EVEN[::2]
     values = ball(axis, even, even)[None]
     path = written(tmp_path / "u.fhz", values, FINE, z=axis, y=even, x=even)
     scene = {"size": [16, 16], "transfer_function": LINEAR}
-    cache, arm, stream, coarse = (
-        picture(path, **scene, march=march)
-        for march in (
-            {"lod": 0},
-            {"mode": "arm", "lod": 0},
-            {"mode": "stream", "lod": 0},
-            {"lod": 1},
-        )
-    )
-    np.testing.assert_allclose(arm, cache, atol=0.01)
-    np.testing.assert_allclose(stream, cache, atol=0.01)
-    assert np.abs(coarse - cache).mean() < 0.03
+    fine, coarse = (picture(path, **scene, march={"lod": lod}) for lod in (0, 1))
+    assert np.abs(coarse - fine).mean() < 0.03
 
 
 def test_a_network_is_sampled_where_uneven_axes_say(tmp_path: Path) -> None:
@@ -124,11 +114,7 @@ def test_a_plane_is_an_opaque_picture_of_its_values(tmp_path: Path, axis: int) -
     }
     path = written(tmp_path / "f.fhz", values, FINE, **coords)
     shown = {"size": [96, 72], "transfer_function": {"colours": "grey"}}
-    cache, arm, stream = (
-        picture(path, **shown, march={"mode": mode}) for mode in ("cache", "arm", "stream")
-    )
-    np.testing.assert_allclose(arm, cache, atol=0.01)
-    np.testing.assert_allclose(stream, cache, atol=0.01)
+    cache = picture(path, **shown)
     assert cache[40:68, 4:90, 3].min() > 0.99
     # Right and up in the picture are right and up of the axes; there the values are missing.
     assert cache[4:30, 56:92, 3].max() == 0

@@ -150,10 +150,10 @@ def test_a_given_transform_is_taken() -> None:
     assert data != encode_chunk(values, max_error=0.01)
 
 
-def test_more_effort_takes_fewer_bytes() -> None:
+def test_more_effort_takes_no_more_bytes() -> None:
     values = field((4, 16, 32, 48), 1, "f4")
     sizes = [len(check(values, 0.02, max_error=0.02, effort=effort)) for effort in (1, 2, 3)]
-    assert sizes[0] >= sizes[1] > sizes[2]
+    assert sizes[0] > sizes[1] >= sizes[2]
 
 
 @pytest.mark.parametrize("effort", [0, 10, 1.5, True, "2", None])

@@ -1,5 +1,5 @@
 // Points of the paper's network, of any size, at positions in the box. Python makes tables and
-// layers (fhash_codec/paper/native_points.py); the positions are a user's.
+// layers (fhash_codec/paper/points.py); the positions are a user's.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -147,9 +147,10 @@ std::vector<double> column_of(Reader& in, int64_t n, int64_t length) {
 using Columns = std::vector<std::vector<double>>;
 
 struct Found {
-    std::vector<float> values, slopes;
+    std::vector<float> values, slopes, by_inputs;  // the last point by point
     bool operator==(const Found& other) const {
-        return same(values, other.values) && same(slopes, other.slopes);
+        return same(values, other.values) && same(slopes, other.slopes) &&
+               same(by_inputs, other.by_inputs);
     }
 
 private:
@@ -171,11 +172,17 @@ Found evaluated(const Network& network, const std::vector<int64_t>& facts,
     }
     Found found;
     found.values.resize(static_cast<std::size_t>(count));
+    const std::size_t inputs = static_cast<std::size_t>(sizes[4] * sizes[6]);
+    std::vector<float> by_inputs(slopes ? inputs * found.values.size() : 0);
     if (slopes) found.slopes.resize(4 * found.values.size());
     require(fhash_network_points(sizes.data(), facts.data(), network.layers.data(), places.data(),
                                  count, path, found.values.data(),
-                                 slopes ? found.slopes.data() : nullptr) == 0,
+                                 slopes ? found.slopes.data() : nullptr,
+                                 slopes ? by_inputs.data() : nullptr) == 0,
             "points that are refused");
+    for (std::size_t i = 0; slopes && i < found.values.size(); i++)
+        for (std::size_t k = 0; k < inputs; k++)
+            found.by_inputs.push_back(by_inputs[k * found.values.size() + i]);
     for (const float value : found.values) require(std::isfinite(value), "a value of no size");
     return found;
 }
@@ -228,6 +235,9 @@ void points(Reader& in) {
     expected.values.erase(expected.values.begin(), expected.values.begin() + part);
     if (slopes)
         expected.slopes.erase(expected.slopes.begin(), expected.slopes.begin() + 4 * part);
+    const int64_t inputs = slopes ? network.sizes[4] * network.sizes[6] : 0;
+    expected.by_inputs.erase(expected.by_inputs.begin(),
+                             expected.by_inputs.begin() + inputs * part);
     require(rest == expected, "other bits beside other points");
     if (columns[0].size() == 1 && network.has_times())
         at_one_time(network, columns, count, path, all);

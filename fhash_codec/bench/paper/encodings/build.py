@@ -25,7 +25,7 @@ from fhash_codec.bench.paper.sets import (
 )
 from fhash_codec.coreset.boxes import Sizes
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.levels import ceil_log, level_resolutions
+from fhash_codec.paper.architecture import ceil_log, level_resolutions
 from fhash_codec.paper.training.train import TrainingPlan
 
 

@@ -15,8 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from fhash_codec.paper.levels import Resolution
-from fhash_codec.paper.tesseract import locate
+from fhash_codec.paper.architecture import Resolution
 
 PRIMES = (805459861, 2654435761, 1)
 """Factors of the corner's z, y and x in the spatial hash (Müller et al. 2022, equation 4)."""
@@ -61,14 +60,22 @@ class GridLevel:
     def size(self) -> int:
         return prod(self.resolution)
 
+    @property
+    def strides(self) -> list[int]:
+        """Buckets from one corner to the next along t, z, y and x."""
+        return [prod(self.resolution[axis + 1 :]) for axis in range(4)]
+
+    def buckets(self, corners: Tensor) -> Tensor:
+        """Buckets int64 (n,) of corners (n, 4): equation 9 of the paper, one to one."""
+        return (corners.long() * torch.tensor(self.strides, device=corners.device)).sum(1)
+
     def corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
         before, after_weight = locate(points, self.sizes, self.resolution)
-        strides = [prod(self.resolution[axis + 1 :]) for axis in range(4)]
         first = 0
         base = torch.zeros(len(points), 1, dtype=torch.int64, device=points.device)
         if self.apart:
-            first, base = 1, points[:, :1].round().long() * strides[0]
-        buckets, weights = _along(before, after_weight, self.resolution, first, strides)
+            first, base = 1, points[:, :1].round().long() * self.strides[0]
+        buckets, weights = _along(before, after_weight, self.resolution, first, self.strides)
         return _joined(buckets, weights, base, torch.add)
 
 
@@ -110,6 +117,31 @@ class HashLevel:
         corners = z[:, None, None] ^ y[:, None] ^ x
         counts = torch.bincount((corners % self.table).reshape(-1), minlength=self.table)
         return float(counts[counts > 1].sum()) / corners.numel()
+
+
+def locate(points: Tensor, sizes: Sequence[int], resolution: Resolution) -> tuple[Tensor, Tensor]:
+    """Find the cell of a level around each point (paper, section 3.2.4, steps 1 and 2).
+
+    Positions outside the lattice are clamped to it. A position on a corner lies in the cell that
+    begins there.
+
+    Args:
+        points: positions (n, 4), (t, z, y, x) in vertices of the lattice of samples.
+        sizes: vertices (t, z, y, x) of that lattice.
+        resolution: vertices (t, z, y, x) of the level.
+
+    Returns:
+        The corner before each point, int64 (n, 4), and the weight in [0, 1] of the corner after it
+        along each axis, (n, 4).
+    """
+    corners = torch.tensor(resolution, device=points.device)
+    span = torch.tensor(
+        [max(size - 1, 1) for size in sizes], dtype=points.dtype, device=points.device
+    )
+    # Multiply before dividing: a vertex that falls on a corner then gives a whole number exactly.
+    position = torch.minimum(points.clamp_min(0), span) * (corners - 1) / span
+    before = torch.minimum(position.floor().long(), (corners - 2).clamp_min(0))
+    return before, position - before
 
 
 def _along(

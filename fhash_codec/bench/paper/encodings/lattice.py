@@ -14,10 +14,8 @@ from fhash_codec.bench.paper.encodings.corners import GridLevel
 from fhash_codec.bench.paper.encodings.encoding import EMBEDDING_SIZE, HIDDEN_LAYERS, WIDTH
 from fhash_codec.bench.paper.encodings.places import sample_places
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.architecture import Architecture, parameter_count
 from fhash_codec.paper.engines.slab import SlabEngine
-from fhash_codec.paper.levels import parameter_count
-from fhash_codec.paper.tesseract import bucket_index
 
 CHUNK = 1 << 15
 """Points that are evaluated at a time."""
@@ -118,7 +116,6 @@ class LatticeModel:
         numbers = self.engine.parameters()
         tables, layers = numbers.dense(self.engine.architecture)
         finest = torch.zeros(self.levels[0].size, EMBEDDING_SIZE)
-        buckets = bucket_index(self.places.long(), self.levels[0].resolution)
-        finest[buckets] = numbers.fine.T
+        finest[self.levels[0].buckets(self.places)] = numbers.fine.T
         rest = [number for layer in layers for number in layer]
         return [number.numpy().copy() for number in (finest, *tables, *rest)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.architecture import Architecture, Resolution
 from fhash_codec.paper.engines.fused.engine import Device, Program
 from fhash_codec.paper.engines.fused.source import (
     DeviceLimits,
@@ -25,10 +25,8 @@ from fhash_codec.paper.engines.fused.source import (
     check_layers,
     with_files,
 )
-from fhash_codec.paper.levels import Resolution
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.point_tables import Patch, PointTables, SparsePatch
-from fhash_codec.paper.points import PointSampler
+from fhash_codec.paper.points import Patch, PointSampler, PointTables, SparsePatch
 
 FILES = ("network.cuh", "points.cu")
 """The files of the kernels in the order in which they follow each other."""

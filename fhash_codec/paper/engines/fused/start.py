@@ -78,7 +78,9 @@ def start_points(network: Network, key: float, device: torch.device) -> FusedPoi
         kernels = _point_kernels(CudaDevice, device)
         return FusedPoints(network, key, device=device, kernels=kernels)
     except Unavailable as error:
-        _warn_once(f"rays march by torch, since the faster kernels cannot be had: {error}")
+        _warn_once(
+            f"the network is evaluated on the CPU, since kernels for it cannot be had: {error}"
+        )
         return None
 
 

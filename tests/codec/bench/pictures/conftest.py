@@ -14,7 +14,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume
-from fhash_codec.bench.pictures import beside_vtk, orbit, pictures
+from fhash_codec.bench.pictures import beside_vtk, orbit
 from fhash_codec.bench.pictures.pictures import bench_render
 from fhash_codec.bench.pictures.results import RenderBench
 from fhash_codec.rendering.scene.scene import Scene
@@ -40,7 +40,6 @@ def result(volume: Volume) -> RenderBench:
     """Every part measured once, with small pictures where their size is fixed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(orbit, "SIDE", 40)
-        patch.setattr(pictures, "STREAM_SIZE", 32)
         patch.setattr(beside_vtk, "FINE_SIZE", 64)
         patch.setattr(beside_vtk, "EXPLAINED_SIZE", 48)
         return bench_render(volume, Scene(step=1.0), size=24, turns=1)

@@ -29,5 +29,4 @@ def quick(ticking: Callable[[Iterator[float]], None], monkeypatch: pytest.Monkey
     monkeypatch.setattr(bench, "INFER_SECONDS", 0.003)
     monkeypatch.setattr(peak, "FMA_ROUNDS", 100)
     monkeypatch.setattr(peak, "COPY_BYTES", 1 << 12)
-    monkeypatch.setattr(peak, "CPU_SIZE", 16)
     monkeypatch.setattr(points, "POINTS", 1 << 9)

@@ -36,14 +36,14 @@ def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
     assert entry["features"] == ["all"]
     engines = [run["engine"] for run in entry["engines"]]
     paths = machine_paths()
-    assert list(dict.fromkeys(engines)) == (["native"] if paths else []) + ["slab", "naive"]
+    assert list(dict.fromkeys(engines)) == (["native"] if paths else []) + ["slab"]
     assert {run["path"] for run in entry["engines"] if run["engine"] == "native"} == set(paths)
     measured = [words for words in calls if words[0] == "measuring"]
     assert len(measured) == TURNS * len(engines)
     assert [words[3] for words in measured[: len(engines)]] * TURNS == [w[3] for w in measured]
     assert all(later[1] == before[1] + 1 for before, later in pairwise(measured))
-    naive = next(run for run in entry["engines"] if run["engine"] == "naive")
-    assert (naive["train_ratio"], naive["infer_ratio"]) == (1.0, 1.0)
+    slab = next(run for run in entry["engines"] if run["engine"] == "slab")
+    assert (slab["train_ratio"], slab["infer_ratio"]) == (1.0, 1.0)
     for run in entry["engines"]:
         assert min(run["train_msamples_s"], run["train_msamples_cpu_s"]) > 0
         assert min(run["infer_msamples_s"], run["infer_msamples_cpu_s"]) > 0
@@ -80,12 +80,12 @@ def test_shares_are_of_the_peak_of_the_same_instructions(series: ArraySeries) ->
 def test_a_series_with_a_feature_is_measured_whole_too(series: ArraySeries) -> None:
     feature = f"interval:{np.median(series.values)}:{series.values.max()}"
     config = replace(CONFIG, features=(feature,), dilation=0)
-    report = bench_train(series, config, engines=("naive",), seconds=0.01)
+    report = bench_train(series, config, engines=("slab",), seconds=0.01)
     sparse, whole = report["series"]
     assert (sparse["features"], whole["features"]) == ([feature], ["all"])
     assert sparse["samples"] < whole["samples"] == series.values.size
     assert sparse["brick_fill"] < whole["brick_fill"]
-    report = bench_train(series, config, engines=("naive",), seconds=0.01, whole=False)
+    report = bench_train(series, config, engines=("slab",), seconds=0.01, whole=False)
     assert [entry["features"] for entry in report["series"]] == [[feature]]
 
 
@@ -109,8 +109,8 @@ def test_generated_series_are_measured(name: str | None, monkeypatch: pytest.Mon
     assert entries[-1]["samples"] == prod(shape)
 
 
-def test_there_is_no_ratio_without_the_naive_engine(series: ArraySeries) -> None:
-    (entry,) = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)["series"]
+def test_there_is_no_ratio_without_the_slab_engine(series: ArraySeries) -> None:
+    (entry,) = bench_train(series, CONFIG, engines=("native",), seconds=0.01)["series"]
     for run in entry["engines"]:
         assert (run["train_ratio"], run["infer_ratio"]) == (None, None)
 
@@ -119,14 +119,14 @@ def test_several_threads_are_beside_one(
     series: ArraySeries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench, "threads_for", lambda _: nullcontext_of(2))
-    (entry,) = bench_train(series, CONFIG, engines=("slab", "naive"), seconds=0.01)["series"]
-    slab, slab_2, naive, naive_2 = entry["engines"]
-    assert [run["threads"] for run in entry["engines"]] == [1, 2, 1, 2]
-    assert (slab["thread_ratio"], naive["thread_ratio"]) == (None, None)
+    (entry,) = bench_train(series, CONFIG, engines=("slab", "native"), seconds=0.01)["series"]
+    slab, slab_2, native, native_2 = entry["engines"][:4]
+    assert [run["threads"] for run in entry["engines"][:4]] == [1, 2, 1, 2]
+    assert (slab["thread_ratio"], native["thread_ratio"]) == (None, None)
     expected = slab_2["train_msamples_s"] / slab["train_msamples_s"]
     assert slab_2["thread_ratio"] == expected
-    expected = slab_2["train_msamples_cpu_s"] / naive_2["train_msamples_cpu_s"]
-    assert slab_2["train_ratio"] == expected
+    expected = native_2["train_msamples_cpu_s"] / slab_2["train_msamples_cpu_s"]
+    assert native_2["train_ratio"] == expected
     assert {point["threads"] for point in entry["points"]} == {1, 2}
 
 
@@ -143,7 +143,7 @@ def test_the_native_engine_is_left_out_where_it_does_not_take_the_model(
     with pytest.raises(InputError, match="native"):
         bench_train(series, config, engines=("native",), seconds=0.01)
     (entry,) = bench_train(series, config, seconds=0.01)["series"]
-    assert {run["engine"] for run in entry["engines"]} == {"slab", "naive"}
+    assert {run["engine"] for run in entry["engines"]} == {"slab"}
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_machine_that_stalls_at_the_first_steps_is_measured_all_the_same(
 
     ticking(times())
     monkeypatch.setattr(bench, "INFER_SECONDS", 1e-5)
-    report = bench_train(series, CONFIG, engines=("naive",), seconds=0.01)
+    report = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)
     run = report["series"][0]["engines"][0]
     assert run["train_msamples_s"] > 0
     assert run["train_ratio"] == 1.0

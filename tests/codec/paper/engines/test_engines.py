@@ -46,7 +46,7 @@ def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:
         )
 
 
-@pytest.mark.parametrize("name", ["auto", "slab", "naive"])
+@pytest.mark.parametrize("name", ["auto", "slab"])
 def test_restoring_a_state_goes_on_bit_for_bit(noise_coreset, name) -> None:
     coreset = noise_coreset((3, 9, 10, 20))
     architecture = Architecture.for_box(coreset.box.shape, 3, width=8)

@@ -40,20 +40,18 @@ SHAPES = [
 ]
 
 
-@pytest.mark.parametrize("name", ["slab", "naive"])
 @pytest.mark.parametrize(("shape", "settings", "low"), SHAPES)
 def test_an_engine_trains_on_the_device_as_on_the_cpu(
     noise_coreset: Callable[..., Coreset],
     trained: Callable[..., Any],
-    name: str,
     shape: tuple[int, ...],
     settings: dict[str, Any],
     low: float,
 ) -> None:
     coreset = noise_coreset(shape, low)
-    here = trained(coreset, settings, name, "cpu")
+    here = trained(coreset, settings, "slab", "cpu")
     with pretended_cuda() as pretended:
-        there = trained(coreset, settings, name, "cuda")
+        there = trained(coreset, settings, "slab", "cuda")
     assert pretended.counts["launches"] > 0
     assert there["error"] == pytest.approx(here["error"], rel=1e-3, abs=1e-6)
     # By count: near a kink of a ReLU float32 may take the other side.
@@ -130,7 +128,7 @@ def test_captured_steps_are_the_steps_kernel_by_kernel(
     batches = [few[number] for number in random.integers(0, 4, 16)]
     with pretended_cuda():
         captured = steps(coreset, batches)
-        monkeypatch.setattr("fhash_codec.paper.engines.graphs.MAX_GRAPHS", 0)
+        monkeypatch.setattr("fhash_codec.paper.engines.slab.MAX_GRAPHS", 0)
         plain = steps(coreset, batches)
     for name, array in plain.items():
         np.testing.assert_array_equal(captured[name], array, err_msg=name)

@@ -10,7 +10,6 @@ import re
 import sys
 import types
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +29,12 @@ SHAPE = (2, 6, 10, 20)
 """Shape of the series."""
 LOW = 0.8
 """Smallest value of the feature: few vertices are samples."""
-FILES = {
-    "slab": (
-        "fhash_codec.paper.engines.slab",
-        "fhash_codec.paper.engines.upsampling",
-        "fhash_codec.paper.engines.sending",
-        "fhash_codec.paper.engines.columns",
-        "fhash_codec.training.positions",
-    ),
-    "naive": ("fhash_codec.paper.engines.naive",),
-}
-"""Modules of an engine, the one with its class first."""
-BETWEEN = {"fhash_codec.paper.engines.columns"}
-"""Modules that put nothing on the device, but call one that does."""
+FILES = (
+    "fhash_codec.paper.engines.slab",
+    "fhash_codec.paper.engines.upsampling",
+    "fhash_codec.training.positions",
+)
+"""Modules of the slab engine, the one with its class first."""
 
 
 def text_of(name: str) -> str:
@@ -50,10 +42,10 @@ def text_of(name: str) -> str:
     return Path(str(importlib.import_module(name).__file__)).read_text(encoding="utf-8")
 
 
-def faulty(engine: str, module: str, source: str) -> type[Any]:
-    """The class of an engine with one module compiled from another source."""
+def faulty(module: str, source: str) -> type[Any]:
+    """The class of the engine with one module compiled from another source."""
     compiled: dict[str, types.ModuleType] = {}
-    for name in reversed(FILES[engine]):
+    for name in reversed(FILES):
         text = source if name == module else text_of(name)
         made = types.ModuleType(name)
         sys.modules[name], before = made, sys.modules[name]
@@ -67,67 +59,54 @@ def faulty(engine: str, module: str, source: str) -> type[Any]:
                 if getattr(value, "__module__", None) == earlier.__name__:
                     setattr(made, attribute, value)
         compiled[name] = made
-    found = compiled[FILES[engine][0]]
-    return getattr(found, {"slab": "SlabEngine", "naive": "NaiveEngine"}[engine])  # type: ignore[no-any-return]
+    return compiled[FILES[0]].SlabEngine  # type: ignore[no-any-return]
 
 
 def faults() -> list[Any]:
-    """Parameters (engine, module, source), one for each place that may forget the device."""
+    """Parameters (module, source), one for each place that may forget the device."""
     found = []
-    for engine, names in FILES.items():
-        for name in names:
-            text = text_of(name)
-            for match in DEVICE.finditer(text):
-                line = text[: match.start()].count("\n") + 1
-                if ON_THE_CPU in text.splitlines()[line - 1]:
-                    continue
-                found.append(
-                    pytest.param(
-                        engine,
-                        name,
-                        text[: match.start()] + text[match.end() :],
-                        id=f"{name.split('.')[-1]}:{line}",
-                    )
-                )
+    for name in FILES:
+        text = text_of(name)
+        for match in DEVICE.finditer(text):
+            line = text[: match.start()].count("\n") + 1
+            if ON_THE_CPU in text.splitlines()[line - 1]:
+                continue
+            source = text[: match.start()] + text[match.end() :]
+            found.append(pytest.param(name, source, id=f"{name.split('.')[-1]}:{line}"))
     return found
 
 
-def traffic(trained: Callable[..., Any], coreset: Coreset, engine: str) -> dict[str, int]:
+def traffic(trained: Callable[..., Any], coreset: Coreset) -> dict[str, int]:
     """Waits for the device and copies to it of a training, a continuation and an evaluation."""
     with pretended_cuda() as pretended:
-        trained(coreset, {"width": 8}, engine, "cuda")
+        trained(coreset, {"width": 8}, "slab", "cuda")
     return {name: pretended.counts[name] for name in ("waits", "copies", "pageable")}
 
 
 @pytest.fixture(scope="module")
-def rightly(
-    noise_coreset: Callable[..., Coreset], trained: Callable[..., Any]
-) -> Callable[[str], dict[str, int]]:
-    """A function of an engine's name: the traffic of the engine without a fault."""
-    return lru_cache(lambda engine: traffic(trained, noise_coreset(SHAPE, LOW), engine))
+def rightly(noise_coreset: Callable[..., Coreset], trained: Callable[..., Any]) -> dict[str, int]:
+    """The traffic of the engine without a fault."""
+    return traffic(trained, noise_coreset(SHAPE, LOW))
 
 
-@pytest.mark.parametrize(("engine", "module", "source"), faults())
+@pytest.mark.parametrize(("module", "source"), faults())
 def test_a_forgotten_device_is_seen(
     noise_coreset: Callable[..., Coreset],
     trained: Callable[..., Any],
-    rightly: Callable[[str], dict[str, int]],
+    rightly: dict[str, int],
     monkeypatch: pytest.MonkeyPatch,
-    engine: str,
     module: str,
     source: str,
 ) -> None:
-    expected, kind = rightly(engine), faulty(engine, module, source)
-    monkeypatch.setattr(sys.modules[FILES[engine][0]], kind.__name__, kind)
+    monkeypatch.setattr(sys.modules[FILES[0]], "SlabEngine", faulty(module, source))
     try:
-        found = traffic(trained, noise_coreset(SHAPE, LOW), engine)
+        found = traffic(trained, noise_coreset(SHAPE, LOW))
     except (MixedDevices, TypeError, AssertionError):
         return
     # What CUDA allows, but by a wait or a copy in each step.
-    assert found != expected
+    assert found != rightly
 
 
 def test_there_are_faults_of_every_module() -> None:
-    modules = {name for names in FILES.values() for name in names}
-    assert {parameter.values[1] for parameter in faults()} == modules - BETWEEN
+    assert {parameter.values[0] for parameter in faults()} == set(FILES)
     assert len(faults()) >= 8

@@ -7,10 +7,10 @@ from math import prod
 import numpy as np
 import pytest
 import torch
+from readable_paper import interpolate
 
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.upsampling import Upsampling, axis_matrices
-from fhash_codec.paper.tesseract import interpolate
 
 CPU = torch.device("cpu")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.coreset import occupancy
-from fhash_codec.paper.levels import level_resolutions
+from fhash_codec.paper.architecture import level_resolutions
 from fhash_codec.paper.tables.needed import Needed, corners, needed_by, spread
 from fhash_codec.paper.tables.trained_tables import trained_tables
 

@@ -13,8 +13,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.coreset import occupancy
 from fhash_codec.paper.network import ArrayTable, Network, SparseSource
-from fhash_codec.paper.point_tables import PointTables, SparsePatch
-from fhash_codec.paper.points import PointSampler, sample_points
+from fhash_codec.paper.points import PointSampler, PointTables, SparsePatch, sample_points
 from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.tables.needed import needed_by
 from fhash_codec.paper.tables.sparse_table import SparseTable
@@ -107,7 +106,7 @@ def test_points_have_the_bits_of_a_dense_one(random_model) -> None:
 
 @pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
 def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
-    """Pictures through the network do so, on the numpy path and on the native one."""
+    """Pictures through the network do so."""
     dense = random_model.network(fill=0.0)
     network = sparse(dense, random_model)
     tables = PointTables.of_box(network, key)
@@ -127,8 +126,9 @@ def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
 
 def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
     tables = PointTables.of_box(sparse(random_model.network(fill=0.0), random_model), 1.3)
-    assert not tables.readable
-    assert tables.at(1.3).readable
+    with pytest.raises(AssertionError, match="at several times"):
+        PointSampler(tables)
+    PointSampler(tables, 1.3)
 
 
 @pytest.mark.parametrize("box", [(1, 6, 9), (5, 1, 9), (5, 6, 1), (1, 1, 1)])

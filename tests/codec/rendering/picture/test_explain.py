@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, Scene, Volume
+from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
 
@@ -47,9 +47,7 @@ def test_every_plan_has_the_same_topics(volume: Volume) -> None:
         ({"size": [30, 20], "effects": {"antialiasing": 2}}, "picture", "30 x 20, perspective, 4 "),
         ({"scale": [1, 2, 3]}, "proportions", "stretched by 1, 2, 3: as the scene says"),
         ({"step": 0.5}, "time", "step 0.5, between two: both are decoded"),
-        ({"march": {"mode": "stream"}}, "march", "one sample of each ray in a pass"),
-        ({"march": {"mode": "arm"}}, "march", "as many samples as rays in a pass"),
-        ({"march": {"mode": "arm", "samples_per_pass": 5000}}, "march", "5,000 samples in a pass"),
+        ({}, "march", "decode once, then march what was decoded, since the file has no network"),
         ({"effects": {"maximum_intensity": True}}, "value", "the largest along each ray"),
         ({"effects": {"minimum_intensity": True}}, "value", "the smallest along each ray"),
         ({"effects": {"average_intensity": True}}, "value", "the mean along each ray"),
@@ -117,3 +115,19 @@ def test_places_and_planes_are_explained(tmp_path: Path) -> None:
     single = Coordinate(name="z", values=np.zeros(1))
     lit = explained(values[:, :1], single, effects={"shading": True})
     assert lit["gradient"] == "none: a plane is drawn in its colours, without light"
+
+
+@pytest.mark.parametrize(
+    ("march", "words"),
+    [
+        ({"mode": "stream"}, "one sample of each ray in a pass"),
+        ({"mode": "arm"}, "as many samples as rays in a pass"),
+        ({"mode": "arm", "samples_per_pass": 5000}, "5,000 samples in a pass"),
+    ],
+)
+def test_a_line_says_how_a_network_is_marched(
+    files: dict[str, Path], march: dict[str, Any], words: str
+) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        plan = Renderer(network).plan(Scene.from_dict({"march": march}))
+    assert words in dict(plan.reasons)["march"]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
@@ -152,7 +153,9 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
             {"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}},
             "one lamp",
         ),
-        ({"march": {"mode": "cache", "device": "cuda"}}, "computes on the CPU"),
+        ({"march": {"mode": "arm"}}, "march 'arm' is for a network, and .*compact, has none"),
+        ({"march": {"mode": "stream"}}, "march 'stream' is for a network"),
+        ({"march": {"device": "cuda"}}, "device 'cuda' is for a network"),
         ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
         ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
         ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
@@ -185,20 +188,33 @@ def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> Non
 
 
 @pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-@pytest.mark.parametrize("mode", ["stream", "arm"])
-def test_single_precision_with_a_large_offset_is_marched_without_it(
-    tmp_path: Path, mode: str
-) -> None:
+def test_single_precision_with_a_large_offset_is_marched_without_it(tmp_path: Path) -> None:
     z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
     field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
     fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
     with fhash_codec.open(tmp_path / "far.fhz") as far:
         assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
         shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
-        other = fhash_codec.render(
-            far, Scene.from_dict({"size": [32, 32], "march": {"mode": mode}})
-        )
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("fhash_codec.rendering.march.march_native", by_stream)
+            other = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
     np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
+
+
+def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
+    volume: Volume, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vertices = int(np.prod(volume.shape[1:]))
+    monkeypatch.setattr("fhash_codec.rendering.picture.planning.MAX_VALUES", vertices - 1)
+    march = {"lod": 0}
+    with pytest.raises(InputError, match=f"{vertices:,} vertices is too large to march; allowed"):
+        plan(volume, march=march)
+    assert plan(volume, march={"lod": 1}).lod == 1
+    monkeypatch.setattr("fhash_codec.rendering.picture.planning.MAX_VALUES", 1)
+    with fhash_codec.open(files["paper"]) as network:
+        assert plan(network, march={"mode": "arm"}).mode == "arm"
+        with pytest.raises(InputError, match="too large to march"):
+            plan(network, march={"mode": "arm"}, effects={"shadows": True})
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -319,14 +335,22 @@ def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
     ],
 )
 def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
-    volume: Volume, monkeypatch: pytest.MonkeyPatch, march: dict[str, str], gpu: bool, mode: str
+    volume: Volume,
+    files: dict[str, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    march: dict[str, str],
+    gpu: bool,
+    mode: str,
 ) -> None:
     def arrays_on(device: str) -> object:
         return object() if gpu and device == "auto" else NUMPY
 
     monkeypatch.setattr("fhash_codec.rendering.picture.planning.arrays_on", arrays_on)
-    planned = plan(volume, march=march)
+    with fhash_codec.open(files["paper"]) as network:
+        planned = plan(network, march=march)
     assert planned.mode == mode
+    if march.get("mode", "auto") != "arm" and march.get("device") != "cuda":
+        assert plan(volume, march=march).mode == "cache"
     line = planned.to_dict()["march"]
     assert line.startswith(f"{mode}: ")
     chosen = "mode" not in march
@@ -371,4 +395,4 @@ def test_a_plan_says_where_network_and_lattice_differ(
     fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
     with fhash_codec.open(path) as paper:
         assert words in plan(paper, march={"mode": mode}).to_dict()["march"]
-    assert words not in plan(volume, march={"mode": mode}).to_dict()["march"]
+    assert words not in plan(volume).to_dict()["march"]

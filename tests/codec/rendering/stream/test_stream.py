@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import FrameField
 
 import fhash_codec
-from fhash_codec import Renderer, Scene
+from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.stream.beams import Beams
-from fhash_codec.rendering.stream.fields import FrameField
-from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.task.task import Surface, Task
+from fhash_codec.rendering.stream.stream import Projection, crossings, stream
+from fhash_codec.rendering.task.arrays import NUMPY, Arrays
+from fhash_codec.rendering.task.task import Marched, Surface, Task
 
 FrameTask = Callable[..., tuple[FrameField, Task]]
+Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Any, Task]]
+FramePicture = Callable[[str, dict[str, Any]], Marched]
 
 
 def picture(
@@ -29,10 +33,26 @@ def picture(
     )
 
 
-def test_three_ways_make_one_picture(renderer: Renderer, scene: dict[str, Any]) -> None:
-    cache, streamed, adaptive = (
-        picture(renderer, mode, scene) for mode in ("cache", "stream", "arm")
-    )
+@pytest.fixture
+def frame_picture(planned: Planned, volume: Volume) -> Callable[[str, dict[str, Any]], Marched]:
+    """A function that draws a decoded frame of the compact file in a mode of marching."""
+
+    def of(mode: str, scene: dict[str, Any]) -> Marched:
+        field, task = planned(volume, {"size": [48, 40], **scene}, NUMPY)
+        if mode == "cache":
+            return march(field.frame, task)
+        return stream(
+            field,
+            task,
+            adaptive=mode == "arm",
+            budget=scene.get("march", {}).get("samples_per_pass"),
+        )
+
+    return of
+
+
+def test_three_ways_make_one_picture(frame_picture: FramePicture, scene: dict[str, Any]) -> None:
+    cache, streamed, adaptive = (frame_picture(mode, scene) for mode in ("cache", "stream", "arm"))
     assert cache.rgba[..., 3].max() > 0.05
     np.testing.assert_array_equal(streamed.rgba, adaptive.rgba)
     np.testing.assert_allclose(streamed.rgba, cache.rgba, atol=1e-3)
@@ -42,9 +62,9 @@ def test_three_ways_make_one_picture(renderer: Renderer, scene: dict[str, Any]) 
         np.testing.assert_allclose(streamed.normal, cache.normal, atol=1e-3)
 
 
-def test_adaptive_marching_takes_at_most_half_the_passes(renderer: Renderer) -> None:
+def test_adaptive_marching_takes_at_most_half_the_passes(frame_picture: FramePicture) -> None:
     streamed, adaptive, large = (
-        picture(renderer, mode, {"march": march})
+        frame_picture(mode, {"march": march})
         for mode, march in (("stream", {}), ("arm", {}), ("arm", {"samples_per_pass": 10**6}))
     )
     assert adaptive.counters["passes"] <= streamed.counters["passes"] / 2
@@ -52,33 +72,33 @@ def test_adaptive_marching_takes_at_most_half_the_passes(renderer: Renderer) -> 
     np.testing.assert_array_equal(large.rgba, streamed.rgba)
 
 
-def test_a_small_budget_is_plain_streaming(renderer: Renderer) -> None:
+def test_a_small_budget_is_plain_streaming(frame_picture: FramePicture) -> None:
     streamed, adaptive = (
-        picture(renderer, mode, {"march": {"samples_per_pass": 1}}) for mode in ("stream", "arm")
+        frame_picture(mode, {"march": {"samples_per_pass": 1}}) for mode in ("stream", "arm")
     )
     assert streamed.counters == adaptive.counters
 
 
 @pytest.mark.parametrize("mode", ["stream", "arm"])
-def test_counters_prove_that_nothing_else_is_done(renderer: Renderer, mode: str) -> None:
-    plain = picture(renderer, mode, {}).counters
+def test_counters_prove_that_nothing_else_is_done(frame_picture: FramePicture, mode: str) -> None:
+    plain = frame_picture(mode, {}).counters
     assert plain["gradients"] == plain["secondary_rays"] == 0
     assert plain["evaluations"] == plain["samples"] > 0
-    shaded = picture(renderer, mode, {"effects": {"shading": True}}).counters
+    shaded = frame_picture(mode, {"effects": {"shading": True}}).counters
     assert 0 < shaded["gradients"] <= shaded["samples"]
     assert {**shaded, "gradients": 0} == plain
-    around = picture(renderer, mode, {"effects": {"box": True}}).counters
+    around = frame_picture(mode, {"effects": {"box": True}}).counters
     assert around == plain
     strips = {"effects": {"axes": True, "colour_bar": True, "time_label": True}}
-    assert picture(renderer, mode, strips).counters["gradients"] == 0
-    depth = picture(renderer, mode, {"effects": {"buffers": ["depth"]}}).counters
+    assert frame_picture(mode, strips).counters["gradients"] == 0
+    depth = frame_picture(mode, {"effects": {"buffers": ["depth"]}}).counters
     assert depth == plain
 
 
-def test_bricks_that_cannot_be_seen_cost_nothing(renderer: Renderer) -> None:
+def test_bricks_that_cannot_be_seen_cost_nothing(frame_picture: FramePicture) -> None:
     narrow: dict[str, Any] = {"transfer_function": {"opacity": [[6, 0], [7, 0.5], [8, 0]]}}
     skipping, marching = (
-        picture(renderer, "arm", {**narrow, "march": {"skipping": on}}) for on in (True, False)
+        frame_picture("arm", {**narrow, "march": {"skipping": on}}) for on in (True, False)
     )
     np.testing.assert_array_equal(skipping.rgba, marching.rgba)
     assert skipping.counters["skipped_bricks"] > 0
@@ -86,20 +106,22 @@ def test_bricks_that_cannot_be_seen_cost_nothing(renderer: Renderer) -> None:
     assert skipping.counters["samples"] < marching.counters["samples"] / 3
 
 
-def test_only_samples_in_visible_cells_are_evaluated(renderer: Renderer) -> None:
+def test_only_samples_in_visible_cells_are_evaluated(
+    frame_picture: FramePicture, planned: Planned, volume: Volume
+) -> None:
     narrow = {"transfer_function": {"opacity": [[4, 0], [4.2, 0.1], [4.4, 0]]}}
     found, everything = (
-        picture(renderer, "arm", {**narrow, "march": {"skipping": on, "threshold": 0.0}})
+        frame_picture("arm", {**narrow, "march": {"skipping": on, "threshold": 0.0}})
         for on in (True, False)
     )
     np.testing.assert_array_equal(found.rgba, everything.rgba)
-    frame = renderer.volume.read(0)
+    frame = volume.read(0)
     corners = [
         frame[tuple(slice(up, n - 1 + up) for up, n in zip(corner, frame.shape, strict=True))]
         for corner in np.ndindex(2, 2, 2)
     ]
     visible = (np.min(corners, axis=0) < 4.4) & (np.max(corners, axis=0) > 4)
-    task = renderer.plan(Scene.from_dict({**narrow, "size": [48, 40]})).task
+    _, task = planned(volume, {**narrow, "size": [48, 40]}, NUMPY)
     beams = Beams.of(task, task.rays.grid.bounds, range(40))
     sample = np.arange(beams.end.max())[None]
     row, column = np.nonzero(sample < beams.end[:, None])
@@ -108,10 +130,10 @@ def test_only_samples_in_visible_cells_are_evaluated(renderer: Renderer) -> None
     assert inside <= found.counters["evaluations"] <= 1.1 * inside
 
 
-def test_rays_end_where_no_light_is_left(renderer: Renderer) -> None:
+def test_rays_end_where_no_light_is_left(frame_picture: FramePicture) -> None:
     opaque: dict[str, Any] = {"transfer_function": {"opacity": "opaque"}}
     ending, going = (
-        picture(renderer, "stream", {**opaque, "march": {"threshold": threshold}})
+        frame_picture("stream", {**opaque, "march": {"threshold": threshold}})
         for threshold in (1 / 1024, 0.0)
     )
     assert ending.counters["samples"] < going.counters["samples"] / 4
@@ -201,3 +223,66 @@ def test_nothing_is_seen_of_what_has_no_value(frame_task: FrameTask) -> None:
     found = stream(field, task, adaptive=False)
     assert not found.rgba.any()
     assert found.counters["samples"] == 0
+
+
+VALUES = np.array([[0.2, 0.9, np.nan, 0.4], [np.nan, 0.1, 0.6, 0.6], [np.nan] * 4])
+LENGTHS = np.array([[1.0, 1.0, 1.0, 0.5]] * 3)
+OPACITIES = np.where(np.isnan(VALUES), 0.0, 0.5 * np.nan_to_num(VALUES))
+
+
+@pytest.mark.parametrize("pace", [1, 3, 4])
+@pytest.mark.parametrize(
+    ("kind", "values", "at"),
+    [
+        ("maximum", [0.9, 0.6], [1, 2]),
+        ("minimum", [0.2, 0.1], [0, 1]),
+        ("average", [1.3 / 2.5, 1.0 / 2.5], [0, 1]),
+        ("attenuated", [0.9 * 0.9, 0.6 * 0.95], [1, 2]),
+    ],
+)
+def test_values_and_places(kind: str, values: list[float], at: list[int], pace: int) -> None:
+    projection = Projection(kind, (0.0, 1.0), 3, NUMPY)
+    alive = np.arange(3)
+    for first in range(0, 4, pace):
+        part = slice(first, min(first + pace, 4))
+        sample = np.broadcast_to(np.arange(4)[part], VALUES[:, part].shape)
+        projection.add(alive, sample, VALUES[:, part], LENGTHS[:, part], OPACITIES[:, part])
+    np.testing.assert_allclose(projection.values[:2], values, rtol=1e-14)
+    assert not np.isfinite(projection.values[2])
+    np.testing.assert_array_equal(projection.at[:2], at)
+
+
+def test_only_an_attenuated_maximum_can_be_finished_early() -> None:
+    for kind in ("maximum", "minimum", "average", "attenuated"):
+        projection = Projection(kind, (0.0, 1.0), 1, NUMPY)
+        projection.add(
+            np.array([0]), np.array([[0]]), np.array([[0.7]]), np.ones((1, 1)), np.full((1, 1), 0.5)
+        )
+        assert projection.finished(np.array([0]))[0] == (kind == "attenuated")
+
+
+def test_roots_are_exact() -> None:
+    sample = np.arange(6.0)[None]
+    found = crossings(
+        lambda row, at, counted: (at - 2.3) ** 3,
+        sample,
+        (sample - 2.3) ** 3,
+        (
+            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
+            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
+        ),
+    )
+    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
+    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
+    assert found.which[0, 1:3, 0].tolist() == [1, 0]
+
+
+def test_nothing_is_crossed_where_a_value_is_missing() -> None:
+    """Neither between samples of which one has no value, nor where the search meets none."""
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
+    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
+    assert not missing.opacity.any()
+    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
+    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
+    assert there.at[0, 2, 0] == 2.5

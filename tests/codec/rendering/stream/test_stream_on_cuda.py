@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from frame_field import FrameField
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
 from fhash_codec import Volume
 from fhash_codec.paper.engines.fused import driver
 from fhash_codec.paper.engines.fused.points import FusedPoints
-from fhash_codec.rendering.stream import canvas, fields
+from fhash_codec.rendering.stream import canvas
 from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.stream.stream import stream
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
@@ -50,11 +51,16 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 """Scenes of a decoded frame."""
+
+
 NETWORKS: dict[str, dict[str, Any]] = {
     "plain": {},
     "shaded": {"step": 0.7, "effects": {"shading": True, "buffers": ["depth", "normal"]}},
+    "central": {"effects": {"shading": {"gradient": "central"}}},
     "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
     "surfaces": {"effects": {"isosurfaces": [{"value": 5, "opacity": 0.5}, {"value": 7}]}},
+    "attenuated": {"effects": {"attenuated_maximum_intensity": True}},
+    "unskipped": {"march": {"skipping": False}},
 }
 """Scenes of a network for the fused kernels."""
 
@@ -81,12 +87,6 @@ def test_a_pass_through_a_frame_waits_little(
     planned: Planned, files: dict[str, Path], scene: str
 ) -> None:
     assert_a_pass_waits_little(planned, files["compact"], FRAMES[scene])
-
-
-def test_a_pass_through_a_network_waits_little(
-    planned: Planned, files: dict[str, Path], network_scene: dict[str, Any]
-) -> None:
-    assert_a_pass_waits_little(planned, files["paper"], network_scene)
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +122,15 @@ def test_a_pass_through_fused_kernels_waits_little(
 
         monkeypatch.setattr(FusedPoints, name, watched)
     assert_a_pass_waits_little(planned, files["paper"], NETWORKS[scene])
-    assert used == {"values", "slopes"}
+    assert "values" in used
 
 
 @pytest.mark.parametrize(
     ("cls", "name"),
     [
-        (fields.FrameField, "_flat"),
-        (fields.FrameField, "_last"),
-        (fields.FrameField, "first"),
+        (FrameField, "_flat"),
+        (FrameField, "_last"),
+        (FrameField, "first"),
         (canvas.Canvas, "_spacing"),
         (canvas.Canvas, "colour"),
     ],

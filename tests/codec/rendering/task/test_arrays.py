@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
+from fhash_codec.rendering.task.devices import arrays_on
+from fhash_formats.errors import InputError
 
 
 @pytest.fixture(params=["numpy", "torch"])
@@ -84,3 +89,28 @@ def test_counts_come_together_and_positions_by_their_count(arrays: Arrays) -> No
     assert (count, largest) == (3, 6)
     assert arrays.host(arrays.chosen(mask, count)).tolist() == [1, 2, 4]
     assert len(arrays.chosen(mask & False, 0)) == 0
+
+
+def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert arrays_on("cpu") is arrays_on("auto") is NUMPY
+    with pytest.raises(InputError, match="no CUDA device"):
+        arrays_on("cuda")
+    with pytest.raises(InputError, match="'gpu'; allowed: auto, cpu, cuda"):
+        arrays_on("gpu")
+
+
+def test_marching_on_the_processor_loads_no_torch() -> None:
+    code = (
+        "import sys; from fhash_codec.rendering.task import devices; "
+        "import fhash_codec.rendering.stream.stream; devices._driver_exists = lambda: False; "
+        "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.task.task import DENSEST, Frame, extinctions_in
+from fhash_codec.rendering.task.task import COUNTERS, DENSEST, Frame, complete, extinctions_in, rows
 
 GRID = Grid(counts=(11, 9, 1), origin=np.zeros(3), spacing=np.ones(3))
 
@@ -31,3 +31,16 @@ def test_the_bounds_of_a_frame_reach_to_where_it_has_values(
 def test_extinctions_in_another_length_stay_finite() -> None:
     extinctions = np.array([0.0, 2.0, 1e300])
     np.testing.assert_array_equal(extinctions_in(extinctions, 1e20), [0.0, 2e20, DENSEST])
+
+
+def test_counters_are_summed_in_one_order() -> None:
+    total = complete({"samples": 3, "rays": 1}, {"samples": 4})
+    assert list(total) == list(COUNTERS)
+    assert total == {**dict.fromkeys(COUNTERS, 0), "rays": 1, "samples": 7}
+    with pytest.raises(KeyError):
+        complete({"photons": 1})
+
+
+def test_every_counter_has_a_row() -> None:
+    assert [name for name, _, _ in rows({})] == [name.replace("_", " ") for name in COUNTERS]
+    assert ("secondary rays", "1,234", COUNTERS["secondary_rays"]) in rows({"secondary_rays": 1234})

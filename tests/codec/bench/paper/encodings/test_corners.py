@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from readable_paper import interpolate
 
 from fhash_codec.bench.paper.encodings.corners import GridLevel, HashLevel
-from fhash_codec.paper.tesseract import interpolate
 
 
 def random_points(count: int, sizes: tuple[int, ...]) -> torch.Tensor:

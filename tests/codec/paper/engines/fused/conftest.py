@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from readable_paper import NaiveEngine
 
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.fused.engine import FusedEngine
-from fhash_codec.paper.engines.naive import NaiveEngine
 from fhash_codec.paper.engines.slab import SlabEngine
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -53,7 +53,7 @@ def engines_of(noise_coreset, emulated):
             coreset,
             FusedEngine(architecture, coreset, rates, kernels=emulated(**device), **common),
             SlabEngine(architecture, coreset, rates, **common),
-            NaiveEngine(architecture, coreset, rates, dtype=torch.float64, **common),
+            NaiveEngine(architecture, coreset, rates, seed=7),
         )
 
     return make

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from pretended_cuda import CUDA, pretended_cuda
+from readable_paper import FHash
 
 from fhash_codec.paper.engines.fused.points import (
     FILES,
@@ -18,10 +19,8 @@ from fhash_codec.paper.engines.fused.points import (
     point_sizes,
 )
 from fhash_codec.paper.engines.fused.source import KERNELS, Unavailable
-from fhash_codec.paper.fhash import FHash
 from fhash_codec.paper.network import ArrayTable
-from fhash_codec.paper.point_tables import PointTables
-from fhash_codec.paper.points import PointSampler
+from fhash_codec.paper.points import PointSampler, PointTables
 
 CPU = torch.device("cpu")
 ORDERS = (0, 1, 5)

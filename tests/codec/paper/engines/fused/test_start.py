@@ -94,7 +94,7 @@ def test_points_that_the_kernels_cannot_do_are_left_to_torch_with_one_warning(
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(driver, "CudaDevice", lambda device: emulated())
     with pytest.warns(
-        FhashWarning, match="rays march by torch, since .*: the network has 3 hidden"
+        FhashWarning, match="evaluated on the CPU, since .*: the network has 3 hidden"
     ):
         assert start_points(network, 0.5, device) is None
     with warnings.catch_warnings():
