@@ -89,7 +89,7 @@ promise-order fhash_codec/compact/tiles_to_promise.py
 min(psnr, other_psnr) < self => max(psnr, other_psnr) < self
 step-weight fhash_codec/compact/model.py
 weights = [p - i for p, i => weights = [i - p for p, i
-level-of-two fhash_codec/paper/levels.py
+level-of-two fhash_codec/paper/architecture.py
 if previous > fold else 2 => if previous >= fold else 2
 needed-corner fhash_codec/paper/tables/needed.py
 result[last] |= layer => pass
