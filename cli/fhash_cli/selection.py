@@ -217,7 +217,7 @@ def opened_variables(
             yield [volume]
         return
     with fhash_codec.open(run, fill=fill) as whole:
-        every = list(whole) if isinstance(whole, fhash_codec.Dataset) else [whole.name]
+        every = list(whole) if isinstance(whole, fhash_codec.Dataset) else whole.container.names
         if variables is None:
             names = every
         elif variables in every:
