@@ -139,7 +139,7 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
         center=float(np.float32((low + high) / 2)),
         low=low,
         high=high,
-        offsets=(17, -10, -5, -3, -2, -1) if trellis else (-5, -1, 0),
+        offsets=(17, -10, -5, -3, -2, -1) if trellis else (-5, -1, 0, 1, 2, -3),
         double=double,
         quantum=quantum,
         head=None

@@ -96,7 +96,7 @@ def unpack_settings(data: bytes | memoryview) -> Settings:
     settings["range"] = take("2q" if whole else "2d")
     if whole:
         settings["origin"] = int.from_bytes(take("9s")[0], "little", signed=True)
-    settings["offsets"] = take("6b" if settings["trellis"] else "3b")
+    settings["offsets"] = take("6b")
     settings["axes"] = [
         Axis("klt", basis=unpack_basis(block()))
         if kind >> 4 == 4
@@ -199,10 +199,8 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
 
 def dequantised(integers: Values, settings: Settings, working: np.dtype[Any]) -> Values:
     """The coefficients of integers: a magnitude m > 0 stands for m + offset / 128 steps."""
-    one, two, *more = settings[
-        "offsets"
-    ]  # of magnitudes 1, 2, 3, 4, of odd ones from 5, of even ones from 6
-    shifts = np.array([0, one, two, *(more if len(more) > 1 else more * 4)]) / 128
+    # Of magnitudes 1, 2, 3, 4, of odd ones from 5, of even ones from 6.
+    shifts = np.array([0, *settings["offsets"]]) / 128
     magnitude = np.abs(integers)
     which = np.where(magnitude < 5, magnitude, 6 - (magnitude & 1))
     values = magnitude.astype(working) + shifts.astype(working)[which]

@@ -348,8 +348,7 @@ def linear_values(
         in_place: whether the integers may be overwritten.
     """
     if not lod:
-        one, two, *more = (offset / OFFSET_UNIT for offset in settings.offsets)
-        offsets = (one, two, *(more if len(more) > 1 else more * 4))
+        offsets = (offset / OFFSET_UNIT for offset in settings.offsets)
         numbers = (settings.step, *offsets, settings.center, settings.low, settings.high)
         values = transform.reconstruct(integers, numbers, in_place=in_place)
         if values is not None:

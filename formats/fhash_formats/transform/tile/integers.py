@@ -33,14 +33,14 @@ __all__ = [
 WEIGHT = 0.09
 """Squared steps of the plain quantiser that a bit is worth (best between 0.07 and 0.11 in
 experiments)."""
-OFFSETS = (-5, -1, 0)
-"""Shift, in 1/128 step, of the decoded magnitudes 1, 2 and more after the optimisation."""
+OFFSETS = (-5, -1, 0, 0, 0, 0)
+"""Shift, in 1/128 step, of the decoded magnitudes after the optimisation, see `dequantise`."""
 SHARE = 0.65
 """Step on the trellis as a share of the plain quantiser's of about the same error and bytes."""
 TRELLIS_WEIGHT = 0.27
 """Squared steps on the trellis that a bit is worth (0.25 to 0.3 are alike in experiments)."""
 TRELLIS_OFFSETS = (17, -10, -5, -3, -2, -1)
-"""Shift, in 1/128 step, of the magnitudes 1 to 4, odd ones from 5 on, and even ones from 6 on.
+"""The same with two quantisers.
 
 It is the mean over coefficients of many series, which differ by 3 or less.
 """

@@ -9,7 +9,7 @@ bytes (`TileSettings.to_bytes`), little-endian:
     step, quantum     float64 each
     center, low, high float64 each; with whole ends low and high int64
     origin            9 bytes, signed; only with whole ends
-    offsets           int8, three, or six with trellis
+    offsets           int8, six
     bases             of each axis with one, in order: a length and the packed basis
     head              a length and the packed head
     mask              u8 number of edges, plus 128 with others; the edges, float64; then u8 reach,
@@ -43,6 +43,8 @@ from fhash_formats.transform.values.quantise import OFFSET_UNIT
 
 __all__ = ["TileSettings", "read_varint", "varint"]
 
+OFFSETS = 6
+"""Reconstruction offsets."""
 _DOUBLE, _CLIP, _LABELS, _TRELLIS, _WHOLE, _HEAD, _MASK, _PREDICTOR = (1 << n for n in range(8))
 """Flags of a packed block."""
 _OTHERS = 128
@@ -71,8 +73,7 @@ class TileSettings:
         center: value that is coded as zero, in units of the values.
         low: lower end of the range to which values are clipped, before head and residual.
         high: upper end of that range.
-        offsets: reconstruction offsets of magnitudes 1, 2 and more, in 1/128 step. With `trellis`
-            six: of magnitudes 1, 2, 3, 4, of odd ones from 5 on, and of even ones from 6 on.
+        offsets: six reconstruction offsets, in 1/128 step; see `dequantise`.
         double: whether the arithmetic is in float64; otherwise it is in float32.
         quantum: step of the residual that keeps a bound, in units of the values; 0 without bound.
         head: the trained correction; None for none.
@@ -95,7 +96,7 @@ class TileSettings:
     center: float
     low: float
     high: float
-    offsets: tuple[int, ...] = (0, 0, 0)
+    offsets: tuple[int, ...] = (0,) * OFFSETS
     double: bool = False
     quantum: float = 0.0
     head: NeighbourHead | None = None
@@ -117,12 +118,12 @@ class TileSettings:
         smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
         if not (self.double or smallest < self.step < largest):
             raise InputError(f"step {self.step} is not for float32")
-        if len(self.offsets) != (6 if self.trellis else 3) or not all(
+        if len(self.offsets) != OFFSETS or not all(
             type(offset) is int and abs(offset) < OFFSET_UNIT for offset in self.offsets
         ):
             raise InputError(
-                f"offsets are {self.offsets!r:.60}; {'six' if self.trellis else 'three'} whole "
-                f"numbers within +-{OFFSET_UNIT - 1} are needed"
+                f"offsets are {self.offsets!r:.60}; six whole numbers within "
+                f"+-{OFFSET_UNIT - 1} are needed"
             )
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
@@ -180,7 +181,7 @@ class TileSettings:
             struct.pack("<3d", self.step, self.quantum, self.center),
             struct.pack("<2q" if whole else "<2d", *ends),
             self.origin.to_bytes(_ORIGIN, "little", signed=True) if whole else b"",
-            struct.pack(f"{len(self.offsets)}b", *self.offsets),
+            struct.pack(f"{OFFSETS}b", *self.offsets),
         ]
         blocks = [axis.basis.to_bytes() for axis in axes if axis.basis is not None]
         blocks += [] if self.head is None else [self.head.to_bytes()]
@@ -251,7 +252,7 @@ def _read(data: _Bytes) -> TileSettings:
     step, quantum, center = data.numbers("3d")
     low, high = data.numbers("2q" if flags & _WHOLE else "2d")
     origin = int.from_bytes(data.take(_ORIGIN), "little", signed=True) if flags & _WHOLE else 0
-    offsets = data.numbers("6b" if flags & _TRELLIS else "3b")
+    offsets = data.numbers(f"{OFFSETS}b")
     t, z, y, x = (_read_axis(data, *divmod(axis, 16)) for axis in axes)
     head = NeighbourHead.from_bytes(data.block()) if flags & _HEAD else None
     mask = _read_mask(data) if flags & _MASK else None

@@ -28,7 +28,7 @@ LARGEST = 1_000_000_000.0
 
 Values = npt.NDArray[Any]
 Offsets = tuple[int, ...]
-"""Reconstruction offsets by magnitude, three or six, in 1/OFFSET_UNIT step; see `dequantise`."""
+"""Six reconstruction offsets by magnitude, in 1/OFFSET_UNIT step; see `dequantise`."""
 
 
 def quantise(
@@ -66,13 +66,12 @@ def dequantise(
     Args:
         integers: integers q.
         step: quantiser step, in units of the coefficients.
-        offsets: offsets in 1/OFFSET_UNIT step, three or six: for |q| = 1, for |q| = 2, and for
-            larger ones; or for 1, 2, 3, 4, odd ones from 5 on, and even ones from 6 on.
+        offsets: in 1/OFFSET_UNIT step, of |q| = 1, 2, 3, 4, odd ones from 5 on, and even ones from
+            6 on.
         dtype: type of the coefficients, float32 or float64.
     """
     kind: np.dtype[Any] = np.dtype(dtype)
-    six = offsets if len(offsets) == 6 else (*offsets[:2], *offsets[2:] * 4)
-    shifts = np.array(six, dtype=np.float64) / OFFSET_UNIT
+    shifts = np.array(offsets, dtype=np.float64) / OFFSET_UNIT
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
     getattr(native.library(), f"fhash_dequantise_f{kind.itemsize * 8}")(
         ctypes.c_void_p(source.ctypes.data),

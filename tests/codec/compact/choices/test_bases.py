@@ -39,7 +39,7 @@ SETTINGS = TileSettings(
     center=0.0,
     low=0.0,
     high=40.0,
-    offsets=(0, 0, 0),
+    offsets=(0,) * 6,
     double=False,
 )
 

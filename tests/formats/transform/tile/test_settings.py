@@ -18,7 +18,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 CHANGES: list[dict[str, Any]] = [
     {},
-    {"double": True, "offsets": (-5, -1, 0)},
+    {"double": True, "offsets": (-5, -1, 0, 0, 0, 0)},
     {"mask": MaskLevels(), "quantum": 0.0},
     {"mask": MaskLevels(edges=(-1.5, 3.0), scores=(1, 0, 4095), others=(7, 8, 9), reach=64)},
     {"clip": True, "labels": True},
@@ -86,10 +86,8 @@ def test_text_that_holds_no_settings_is_damage(text: Any) -> None:
         ({"quantum": -1.0}, "do not fit together"),
         ({"center": float("nan")}, "center is nan"),
         ({"step": True}, "step is True"),
-        ({"offsets": (0, 0)}, "three whole numbers"),
-        ({"offsets": (0, 0, 128)}, "three whole numbers"),
-        ({"offsets": (0,) * 6}, "three whole numbers"),
-        ({"trellis": True}, "six whole numbers"),
+        ({"offsets": (0, 0, 0)}, "six whole numbers"),
+        ({"offsets": (0, 0, 0, 0, 0, 128)}, "six whole numbers"),
         ({"origin": 1.0}, "origin is 1.0; a 64-bit integer"),
         ({"origin": 1 << 64}, "a 64-bit integer is needed"),
         ({"high": 10**400}, "high is 1000"),
