@@ -58,6 +58,8 @@ class Selection:
         """Resolve the options; raises RegionError where they leave the series or its domain."""
         import numpy as np
 
+        from fhash_codec.value_type import holds
+
         chosen = steps_at(volume, times) if times else steps_of(volume, steps)
         region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
         # A level of detail has its own vertices: those of the feature bounding box in the region.
@@ -69,7 +71,7 @@ class Selection:
         whole = all(float(step).is_integer() for step in chosen)
         kind = np.dtype(dtype or (volume.dtype if whole else volume.float_dtype))
         own = volume.value_type.fill
-        if fill is None and own is not None and kind.kind in "iu":
+        if fill is None and own is not None and kind.kind in "iu" and holds(kind, own):
             fill = own
         check_fill(kind, fill)
         return cls(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -59,3 +61,12 @@ def test_integers_of_64_bits_come_exactly(tmp_path: Path) -> None:
         selection, frames, _ = decoded(volume, steps=slice(1, 3))
     assert selection.kind == values.dtype
     np.testing.assert_array_equal(frames, values[1:3])
+
+
+def test_the_source_s_own_fill_value_counts_where_the_type_has_it(run: Path) -> None:
+    with fhash_codec.open(run) as volume:
+        assert isinstance(volume, fhash_codec.Volume)
+        for own, taken in ((-9, -9), (1e300, None), (0.5, None)):
+            types = replace(volume.value_type, fill=own)
+            with patch.object(volume, "value_type", types):
+                assert Selection.of(volume, **{**WHOLE, "dtype": "int16"}).fill == taken

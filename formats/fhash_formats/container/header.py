@@ -71,6 +71,15 @@ QUALITY = (
     "max_abs_error_domain",
 )
 """Figures in `quality`, each a number or null."""
+BETWEEN = (
+    "psnr_key_frames",
+    "psnr",
+    "psnr_linear",
+    "psnr_fringe",
+    "psnr_fringe_linear",
+    "fringe_fraction",
+)
+"""Figures in `quality.between`, likewise."""
 EVERYTHING = "all"
 """Name of the feature that every vertex with a value belongs to."""
 NOT_STORED = "not_stored"
@@ -183,6 +192,9 @@ def validate_header(header: Mapping[str, Any]) -> None:
     for key in QUALITY:
         quality.number_or_null(key)
     _check_bulk(quality)
+    if quality.has("between") and quality.get("between") is not None:
+        for key in BETWEEN:
+            quality.record("between").number_or_null(key)
     if quality.has("steps"):
         for key in STEP_FIGURES:
             quality.record("steps").integers(key, shape[0] + 1, -MAX_LEVEL, MAX_LEVEL)
