@@ -1,4 +1,4 @@
-"""Decoding of the coreset's vertices beside whole blocks, for `fhash bench train`."""
+"""Decoding of the coreset's vertices beside the whole box, for `fhash bench train`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Layer, Network
-from fhash_codec.paper.regions import block_shape, decode_region
+from fhash_codec.paper.points import decode_region
 
 __all__ = ["bench_decode"]
 
@@ -41,9 +41,7 @@ class _ZeroTable:
 def bench_decode(
     architecture: Architecture, coreset: Coreset, layers: Sequence[Layer]
 ) -> dict[str, float]:
-    """Measure the decoding of key frames by their coreset alone, and by whole blocks, in turns.
-
-    Blocks without a vertex of the coreset are skipped either way.
+    """Measure the decoding of key frames: of their coreset alone, and of the whole box, in turns.
 
     Args:
         architecture: the sizes of the model.
@@ -52,7 +50,7 @@ def bench_decode(
 
     Returns:
         `decode_msamples_s`, 10^6 vertices of the coreset a second, and `decode_ratio`, how many
-        times as fast as whole blocks; medians over the turns.
+        times as fast as the whole box; medians over the turns.
     """
     size = architecture.embedding_size
     network = Network(
@@ -66,24 +64,14 @@ def bench_decode(
     every = -(-architecture.key_frames // KEY_FRAMES)
     keys = range(0, architecture.key_frames, every)
     masks = [unpack(coreset.occupancy[key], coreset.box.shape) for key in keys]
-    blocks = [_whole_blocks(mask) for mask in masks]
+    boxes = [np.ones_like(mask) for mask in masks]
     vertices = sum(int(np.count_nonzero(mask)) for mask in masks)
     speeds, ratios = [], []
     for _ in range(TURNS):
-        alone, whole = (_seconds(network, keys, requested) for requested in (masks, blocks))
+        alone, whole = (_seconds(network, keys, requested) for requested in (masks, boxes))
         speeds.append(vertices / alone)
         ratios.append(whole / alone)
     return {"decode_msamples_s": median(speeds) / 1e6, "decode_ratio": median(ratios)}
-
-
-def _whole_blocks(mask: Mask) -> Mask:
-    """Return the vertices (z, y, x) of all blocks that hold a vertex of a mask."""
-    result = np.zeros_like(mask)
-    shape = block_shape(mask.shape)
-    for first in np.ndindex(*(-(-n // m) for n, m in zip(mask.shape, shape, strict=True))):
-        block = tuple(slice(i * m, (i + 1) * m) for i, m in zip(first, shape, strict=True))
-        result[block] = mask[block].any()
-    return result
 
 
 def _seconds(network: Network, keys: Sequence[int], requested: Sequence[Mask]) -> float:

@@ -16,8 +16,7 @@ from fhash_codec.coreset.occupancy import read_occupancy
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.model_parts import CORNERS, Mlp, Table
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.points import sample_points
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import decode_region, sample_points
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError
@@ -78,7 +77,7 @@ class PaperModel:
     ) -> npt.NDArray[np.float64]:
         """Return the values (z, y, x) of a region.
 
-        Blocks of the decoder without a requested vertex are NaN and cost nothing.
+        Vertices that are not requested are NaN and cost nothing.
         """
         return self._range.from_unit(decode_region(self.network, key, region, requested=requested))
 

@@ -6,22 +6,6 @@ the level, at 0 where S is 1. Time follows the same rule, from the key index, wh
 between key frames. The inputs of the dense layers at a point are the embeddings of all levels,
 interpolated linearly along the four axes. Input level * embedding_size + e is embedding e of a
 level; the finest level comes first.
-
-The promise of repeatable values
---------------------------------
-A sample gets the same bits whatever other samples are evaluated with it. A matrix product of BLAS
-alone does not promise that: BLAS picks its kernel, and with it the order of the sums, by the shape
-of the matrices, and some kernels add in another order at another column. Two classes keep the
-promise, both by construction and on every machine:
-
-* `DenseLayers`, for the vertices of a region (`regions.py`). Regions are decoded in whole blocks at
-  fixed places, and a block in products of exactly `COLUMNS` columns. So a vertex always lies in the
-  same column of a product of the same shape. Where few vertices of a block are asked for, they move
-  to fewer products (`run_some`), each within its column.
-* The native library (`points.py`), for samples at free positions, which may come in any order. It
-  adds without BLAS.
-
-The bits may differ between machines, because their BLAS libraries and their vectors do.
 """
 
 from __future__ import annotations
@@ -41,21 +25,6 @@ from fhash_formats.errors import DamagedFileError, InputError
 Floats = npt.NDArray[np.float32]
 Layer = tuple[Floats, Floats]
 """Weight (out, in) and bias (out,)."""
-
-COLUMNS = 64
-"""Samples per matrix product: such a product runs in one thread and in the first-level cache."""
-PRODUCTS = 64
-"""Products per layer before the next layer: their outputs stay in the second-level cache."""
-MAX_SHARE = 0.75
-"""Share of all products up to which requested samples are gathered in fewer products.
-
-Gathering costs some 15 % of the products of the usual network, 64 wide with two hidden layers.
-"""
-MIN_WEIGHTS = 2048
-"""Numbers in the matrices of the smallest network for which samples are gathered.
-
-Those of a smaller one are multiplied as fast as the inputs are gathered.
-"""
 
 
 class TableSource(Protocol):
@@ -217,77 +186,3 @@ def _check_finite(values: npt.NDArray[Any], level: int) -> None:
             f"the table of level {level + 1} holds numbers that are not finite; "
             "the training diverged or the file is damaged"
         )
-
-
-class DenseLayers:
-    """Dense layers of a network, evaluated by matrix products of fixed shape.
-
-    The module's docstring says what that promises. An object has room for a fixed number of samples
-    and belongs to one thread. Write the inputs of n samples into `inputs[:-1, :n]`, call `run`, and
-    take the first n outputs; what the spare columns hold does not matter.
-
-    Attributes:
-        inputs: (network.inputs + 1, samples) float32, filled by the caller. The last row is 1 and
-            must stay so. The number of samples is rounded up to whole products.
-    """
-
-    def __init__(self, network: Network, samples: int) -> None:
-        self.matrices = network.matrices
-        self._weights = sum(matrix.size for matrix in self.matrices)
-        products = -(-samples // COLUMNS)
-        self.inputs = np.zeros((network.inputs + 1, products * COLUMNS), np.float32)
-        self.inputs[-1] = 1.0
-        self.outputs = np.empty((products, COLUMNS), np.float32)
-        self.hidden = [
-            np.empty((min(products, PRODUCTS), matrix.shape[0], COLUMNS), np.float32)
-            for matrix in self.matrices
-        ]
-
-    def run(self) -> Floats:
-        """Return the outputs (samples,) for `inputs`. The next run overwrites them."""
-        return self._run(self.inputs.reshape(len(self.inputs), -1, COLUMNS))
-
-    def run_some(self, requested: npt.NDArray[np.bool_]) -> Floats:
-        """Return outputs (samples,) for `inputs`; those that were not requested may be NaN.
-
-        A requested output has the bits that `run` gives it.
-
-        Args:
-            requested: bool (n,), the samples whose outputs are needed, of the first n; no others
-                are.
-        """
-        products = len(self.outputs)
-        most = int(MAX_SHARE * products) if self._weights >= MIN_WEIGHTS else 0
-        if np.count_nonzero(requested) > most * COLUMNS:
-            return self.run()
-        table = np.zeros((products, COLUMNS), np.bool_)
-        table.reshape(-1)[: len(requested)] = requested
-        ranks = np.cumsum(table, axis=0, dtype=np.int32)
-        needed = int(ranks[-1].max())
-        if needed > most:
-            return self.run()
-        # In each column the requested samples move up, so that they fill the first products.
-        samples = np.flatnonzero(table)
-        places = (ranks.reshape(-1)[samples] - 1) * COLUMNS + samples % COLUMNS
-        moved = np.zeros(needed * COLUMNS, np.intp)
-        moved[places] = samples
-        inputs = np.take(self.inputs, moved, axis=1, mode="clip")
-        outputs = np.full(products * COLUMNS, np.nan, np.float32)
-        outputs[samples] = self._run(inputs.reshape(len(inputs), needed, COLUMNS))[places]
-        return outputs
-
-    def _run(self, inputs: Floats) -> Floats:
-        """Return the outputs for inputs (network.inputs + 1, products, COLUMNS)."""
-        inputs = inputs.transpose(1, 0, 2)
-        for start in range(0, len(inputs), PRODUCTS):
-            current = inputs[start : start + PRODUCTS]
-            for matrix, hidden in zip(self.matrices, self.hidden, strict=True):
-                out = hidden[: len(current)]
-                # Hostile weights overflow; values are clipped to their range later.
-                with np.errstate(over="ignore", invalid="ignore"):
-                    np.matmul(matrix, current, out=out)
-                if hidden is not self.hidden[-1]:
-                    np.maximum(out, 0.0, out=out)
-                current = out
-            self.outputs[start : start + len(current)] = current[:, 0]
-        return self.outputs[: len(inputs)].reshape(-1)

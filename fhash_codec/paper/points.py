@@ -1,4 +1,4 @@
-"""Values and derivatives of a network at points between vertices, by the native library.
+"""Values and derivatives of a network at points and at vertices, by the native library.
 
 A point has the same bits whatever points are given with it, in whatever order
 (`fhash_codec/native/network/points.hpp`). The bits may differ between machines, since each uses the
@@ -15,6 +15,7 @@ from typing import Any, Literal, overload
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Spans
 from fhash_codec.native import network as native
 from fhash_codec.paper.architecture import Resolution
 from fhash_codec.paper.network import Floats, Network
@@ -26,6 +27,10 @@ AXES = ("key_index", "z", "y", "x")
 """Names of the coordinates of a point, in order."""
 CHUNK_POINTS = 4096
 """Points that one thread evaluates at a time."""
+SLAB_POINTS = 2**18
+"""Points of a region that are evaluated at a time."""
+SMALL_NUMBERS = 2**18
+"""Numbers up to which the part of a level that holds some vertices only gets all vertices."""
 SMALL_READ = 2**20
 """Vertices of the finest table that a group of points may always span."""
 LARGE_READ = 2**25
@@ -155,18 +160,43 @@ class PointTables:
 
         Levels that hold some vertices only stay so.
         """
-        high = [size - 1 for size in network.box_size]
-        if not network.sparse:
-            return cls.read(network, (key_index, 0, 0, 0), (key_index, *high))
+        z, y, x = ((0, size) for size in network.box_size)
+        return cls.of_region(network, key_index, (z, y, x), 0)
+
+    @classmethod
+    def of_region(
+        cls, network: Network, key_index: float, region: Spans, small: int = SMALL_NUMBERS
+    ) -> PointTables:
+        """Read what the vertices of a region need at one time, for `at` this time.
+
+        Args:
+            network: the network.
+            key_index: the time.
+            region: spans (z, y, x) in vertices of the box.
+            small: numbers up to which the part of a level that holds some vertices only gets all
+                vertices; of a larger part all that the level holds is read, which stays as it is.
+        """
         sizes = (network.key_frames, *network.box_size)
-        patches = []
+        ends = [[key_index, *(span[end] - end for span in region)] for end in (0, 1)]
+        patches: list[Patch] = []
         for level, resolution in enumerate(network.levels):
-            node = corners_before(sizes, resolution, (key_index, 0, 0, 0))[0]
-            nodes = range(node, min(node + 2, resolution[0]))
-            frames = [network.sparse_frame(level, number) for number in nodes]
-            patches.append(
-                SparsePatch.of_frames([frame for frame in frames if frame is not None], node)
+            first, last = (corners_before(sizes, resolution, end) for end in ends)
+            at = key_index * (resolution[0] - 1) / max(sizes[0] - 1, 1)
+            # On a time node this one is enough.
+            node = min(int(at), resolution[0] - 1)
+            nodes = range(node, node + 1 if at == node else node + 2)
+            part = tuple(
+                slice(start, min(stop + 2, length))
+                for start, stop, length in zip(first[1:], last[1:], resolution[1:], strict=True)
             )
+            numbers = network.embedding_size * math.prod(axis.stop - axis.start for axis in part)
+            frames = [network.sparse_frame(level, n) for n in nodes] if numbers > small else [None]
+            held = [frame for frame in frames if frame is not None]
+            if held:
+                patches.append(SparsePatch.of_frames(held, node))
+                continue
+            values = network.read(level, (slice(nodes.start, nodes.stop), *part))
+            patches.append(Patch.of(values, (node, *first[1:])))
         return cls(network, sizes, network.levels, tuple(patches))
 
     @property
@@ -193,6 +223,9 @@ class PointTables:
         library, sizes = native.library(), np.array(self.sizes, np.int64)
         patches = []
         for patch, level in zip(self.patches, self.levels, strict=True):
+            if len(patch.values) == 1:  # the time is that of a node, or the only one
+                patches.append(patch.at_one_time(patch.values))
+                continue
             values = np.empty((1, *patch.values.shape[1:]), np.float32)
             facts = np.array(patch.facts(level), np.int64)
             status = library.fhash_network_still(
@@ -310,6 +343,67 @@ def sample_points(
         if slopes is not None:
             slopes[group] = some_slopes
     return values if slopes is None else (values, slopes)
+
+
+def decode_region(
+    network: Network,
+    key_index: float,
+    region: Spans,
+    *,
+    requested: npt.NDArray[np.bool_] | None = None,
+    threads: int | None = None,
+) -> Floats:
+    """Return the normalised values float32 (z, y, x) at the vertices of a region.
+
+    They are those of `sample_points`, so that a region holds the bits of that part of the frame.
+
+    Args:
+        network: the trained network.
+        key_index: time in 0 .. key_frames - 1, fractional between key frames.
+        region: spans (z, y, x) in vertices of the feature bounding box.
+        requested: bool (z, y, x), the vertices whose values are needed; all if left out. Others are
+            NaN and cost nothing.
+        threads: number of threads; None for one per processor.
+
+    Raises:
+        RegionError: the region or the key index is outside the box.
+        InputError: `requested` has another shape or type.
+    """
+    _check_region(network, key_index, region, requested)
+    threads = usable_threads(threads)
+    result = np.full([stop - start for start, stop in region], np.nan, np.float32)
+    if requested is not None and not requested.any():
+        return result
+    sampler = PointSampler(PointTables.of_region(network, key_index, region), key_index)
+    flat = result.reshape(-1)
+    chosen = np.arange(flat.size) if requested is None else np.flatnonzero(requested)
+    for first in range(0, len(chosen), SLAB_POINTS):
+        slab = chosen[first : first + SLAB_POINTS]
+        places = np.unravel_index(slab, result.shape)
+        columns = [
+            (start + place).astype(np.float64)
+            for (start, _), place in zip(region, places, strict=True)
+        ]
+        values = np.empty(len(slab), np.float32)
+        sampler.sample([np.array([key_index], np.float64), *columns], values, None, threads)
+        flat[slab] = values
+    return result
+
+
+def _check_region(
+    network: Network, key_index: float, region: Spans, requested: npt.NDArray[np.bool_] | None
+) -> None:
+    if not 0 <= key_index <= network.key_frames - 1:
+        raise RegionError(f"key index {key_index} is outside 0..{network.key_frames - 1}")
+    for axis, (start, stop), size in zip("zyx", region, network.box_size, strict=True):
+        if not 0 <= start < stop <= size:
+            raise RegionError(f"region {axis} {start}:{stop} is empty or outside the box, 0:{size}")
+    shape = tuple(stop - start for start, stop in region)
+    if requested is not None and (requested.shape != shape or requested.dtype != np.bool_):
+        raise InputError(
+            f"requested is {requested.dtype} {requested.shape}; "
+            f"a bool array {shape} is needed, as large as the region"
+        )
 
 
 class PointSampler:

@@ -173,7 +173,7 @@ def _text(result: dict[str, Any]) -> str:
             *_threads(entry["engines"]),
             _points(entry["points"]),
             f"decoding {number(entry['decode_msamples_s'], digits=3)} M/s,"
-            f" {number(entry['decode_ratio'], digits=3)} times as fast as by whole blocks",
+            f" {number(entry['decode_ratio'], digits=3)} times as fast as the whole box",
             "",
         ]
     for peak in result["peaks"]:

@@ -3,8 +3,8 @@
 // The interpolation goes point by point, since neighbouring numbers of a table lie together: the
 // two corners along x are one row of 2 E numbers. The layers go by vectors of points. Each number
 // of a point is computed by operations that no other point of the tile changes, so a point has the
-// same bits whatever points are given with it. Sums have the form a + w (b - a) or s + w x, of
-// which the compiler makes one fused multiply-add where the machine has it.
+// same bits whatever points are given with it. Sums have the form (a - w a) + w b or s + w x, of
+// which the compiler makes fused multiply-adds where the machine has them.
 #pragma once
 
 #include <cstdint>
@@ -150,6 +150,12 @@ FHASH_INLINE typename Pair<C>::Row row_at(const float* from, std::int64_t embedd
     return row;
 }
 
+// The number between two, w of the way from a to b: exactly a where w is 0, and b where it is 1,
+// whatever the other one is. The ends of an axis have w = 1.
+template <class V> FHASH_INLINE V between(const V& a, const V& b, float w) {
+    return (a - w * a) + w * b;
+}
+
 // The place of a vertex among those that a level holds: the rank of its bit.
 FHASH_INLINE std::int64_t place_of(const Held& held, std::int64_t bit) {
     // The bit moves to the top of its word, and all that come after it fall out.
@@ -195,29 +201,31 @@ FHASH_INLINE void interpolate(const Level& level, const Task& task, const double
             corners[k] = SPARSE ? held_row<C>(level, table, corner, embedding)
                                 : row_at<C, TOGETHER>(table + corner, embedding);
             if (TIMES) {
-                by_t[k] = row_at<C, TOGETHER>(table + corner + t, embedding) - corners[k];
-                corners[k] = corners[k] + wt * by_t[k];
+                const Row next = row_at<C, TOGETHER>(table + corner + t, embedding);
+                by_t[k] = next - corners[k];
+                corners[k] = between(corners[k], next, wt);
             }
         }
-        const Row z0 = corners[2] - corners[0], z1 = corners[3] - corners[1];
-        const Row y0 = corners[0] + wz * z0, y1 = corners[1] + wz * z1;
-        const Row by_y = y1 - y0, line = y0 + wy * by_y;
+        const Row y0 = between(corners[0], corners[2], wz);
+        const Row y1 = between(corners[1], corners[3], wz);
+        const Row line = between(y0, y1, wy);
         const auto along_x = [&](const Row& row, int c) FHASH_LAMBDA {
-            return row[c] + wx * (row[C + c] - row[c]);
+            return between((float)row[c], (float)row[C + c], wx);
         };
         for (int c = 0; c < C; ++c) inputs[(first + c) * TILE + i] = along_x(line, c);
         if (GRADIENT) {
             float* change = changes + first * TILE + i;
-            const Row by_z = z0 + wy * (z1 - z0);
+            const Row z0 = corners[2] - corners[0], z1 = corners[3] - corners[1];
+            const Row by_z = between(z0, z1, wy), by_y = y1 - y0;
             for (int c = 0; c < C; ++c) {
                 change[c * TILE + axis] = pace[1] * along_x(by_z, c);
                 change[c * TILE + 2 * axis] = pace[2] * along_x(by_y, c);
                 change[c * TILE + 3 * axis] = pace[3] * (line[C + c] - line[c]);
             }
             if (TIMES) {
-                const Row low = by_t[0] + wz * (by_t[2] - by_t[0]);
-                const Row high = by_t[1] + wz * (by_t[3] - by_t[1]);
-                const Row both = low + wy * (high - low);
+                const Row low = between(by_t[0], by_t[2], wz);
+                const Row high = between(by_t[1], by_t[3], wz);
+                const Row both = between(low, high, wy);
                 for (int c = 0; c < C; ++c) change[c * TILE] = pace[0] * along_x(both, c);
             }
         }
@@ -414,7 +422,7 @@ FHASH_INLINE std::int64_t still_kernel(const Level& level, const std::int64_t* s
     const float* FHASH_RESTRICT from = level.table + (std::int64_t)offsets[0];
     const float* FHASH_RESTRICT next = from + level.axes[0].stride;
     const float weight = after[0];
-    for (std::int64_t i = 0; i < count; ++i) still[i] = from[i] + weight * (next[i] - from[i]);
+    for (std::int64_t i = 0; i < count; ++i) still[i] = between(from[i], next[i], weight);
     return 0;
 }
 

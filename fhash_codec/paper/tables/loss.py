@@ -18,8 +18,7 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.paper.network import Floats, Network
-from fhash_codec.paper.points import input_slopes
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import decode_region, input_slopes
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
 from fhash_formats.transform.tile.sections import Shape

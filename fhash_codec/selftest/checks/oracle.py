@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.points import sample_points
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import decode_region, sample_points
 from fhash_codec.paper.storage import load_network
 from fhash_codec.selftest.case import Finding, Run
 

@@ -22,10 +22,10 @@ from fhash_codec.paper.points import (
     PointSampler,
     PointTables,
     corners_before,
+    decode_region,
     input_slopes,
     sample_points,
 )
-from fhash_codec.paper.regions import decode_region
 from fhash_formats.errors import InputError, RegionError
 
 

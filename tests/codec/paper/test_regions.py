@@ -8,9 +8,9 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.paper import regions
+from fhash_codec.paper import points
 from fhash_codec.paper.network import ArrayTable
-from fhash_codec.paper.regions import block_shape, decode_region
+from fhash_codec.paper.points import decode_region, sample_points
 from fhash_formats.errors import InputError, RegionError
 
 
@@ -18,7 +18,7 @@ def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(
     networks, network, monkeypatch
 ) -> None:
     monkeypatch.setattr("fhash_formats.support.threads.ITEMS_PER_THREAD", 1)
-    monkeypatch.setattr(regions, "BLOCK_VERTICES", 512)
+    monkeypatch.setattr(points, "SLAB_POINTS", 64)
     rng = np.random.default_rng(5)
     for key_index in networks.key_indices(network):
         frame = decode_region(network, key_index, networks.box(network), threads=1)
@@ -33,7 +33,7 @@ def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(
             np.testing.assert_array_equal(cut, frame[tuple(slice(*r) for r in region)])
 
 
-def test_the_law_holds_for_the_default_blocks_and_network(networks) -> None:
+def test_the_law_holds_for_the_default_network(networks) -> None:
     net = networks.random((25, 40, 75), 3, 2, 2, 1, width=64)
     frame = decode_region(net, 0.4, networks.box(net), threads=4)
     for region in [
@@ -74,25 +74,7 @@ def test_half_precision_tables_decode_as_their_float32_numbers(networks) -> None
     )
 
 
-def test_blocks_without_a_requested_vertex_are_nan_and_the_others_as_ever(
-    networks, monkeypatch
-) -> None:
-    monkeypatch.setattr(regions, "BLOCK_VERTICES", 512)
-    net = networks.random((16, 32, 64), 1, 2, 2, 1)
-    frame = decode_region(net, 0, networks.box(net))
-    region = ((2, 16), (0, 30), (5, 64))
-    cut = frame[tuple(slice(*r) for r in region)]
-    requested = np.zeros(cut.shape, bool)
-    requested[1, 3, 4] = requested[-1, -1, -1] = True
-    decoded = decode_region(net, 0, region, requested=requested)
-    finite = np.isfinite(decoded)
-    assert finite[requested].all()
-    assert 0 < finite.mean() < 0.5
-    np.testing.assert_array_equal(decoded[finite], cut[finite])
-    assert np.isnan(decode_region(net, 0, region, requested=np.zeros(cut.shape, bool))).all()
-
-
-def test_vertices_in_few_products_have_the_bits_of_the_whole(networks, monkeypatch) -> None:
+def test_vertices_are_points_and_those_that_nobody_requested_are_nan(networks) -> None:
     """A ball, a plate, a column and random vertices, on a key frame and between two."""
     net = networks.random((25, 40, 64), 3, 2, 2, 2, width=64)
     z, y, x = np.ogrid[:25, :40, :64]
@@ -109,24 +91,14 @@ def test_vertices_in_few_products_have_the_bits_of_the_whole(networks, monkeypat
                 net, key_index, networks.box(net), requested=np.ascontiguousarray(requested)
             )
             np.testing.assert_array_equal(found[requested], frame[requested])
-            assert np.isnan(found[~requested]).all(), "few vertices cost few products"
-
-
-@pytest.mark.parametrize(
-    ("shape", "samples"),
-    [
-        ((8, 16, 32), 16 * 32 + 5),
-        ((8, 1, 36), 37),
-        ((8, 1, 37), 37),
-        ((8, 1, 59), 59),
-        ((8, 1, 60), 69),
-        ((1, 64, 128), 64 * 128),
-    ],
-    ids=str,
-)
-def test_planes_of_a_block_begin_in_other_columns(shape, samples) -> None:
-    """A single plane has no neighbour to begin apart from."""
-    assert regions._plane_samples(shape) == samples
+            assert np.isnan(found[~requested]).all()
+            places = np.argwhere(requested).T
+            np.testing.assert_array_equal(
+                sample_points(net, key_index, *places.astype(float)), found[requested]
+            )
+    region = ((2, 16), (0, 30), (5, 64))
+    nothing = np.zeros([stop - start for start, stop in region], bool)
+    assert np.isnan(decode_region(net, 0, region, requested=nothing)).all()
 
 
 def test_a_region_reads_just_its_surroundings_once_per_level(networks) -> None:
@@ -135,45 +107,13 @@ def test_a_region_reads_just_its_surroundings_once_per_level(networks) -> None:
     assert [len(table.regions) for table in net.tables] == [1] * len(net.levels)
     assert net.tables[0].regions[0][0] == (3, 4)  # on a key frame one time node is enough
     largest = prod(stop - start for start, stop in net.tables[0].regions[0][1:4])
-    assert largest <= (16 + 2 * 32) * (16 + 2 * 16) * (16 + 2 * 16)
+    assert largest <= (16 + 2) ** 3
     net = networks.recording(net)
     decode_region(net, 3.2, ((20, 36),) * 3)
     assert net.tables[0].regions[0][0] == (3, 5)
     net = networks.recording(net)
     decode_region(net, 3.2, ((20, 36),) * 3, requested=np.zeros((16, 16, 16), bool))
     assert not net.tables[0].regions
-
-
-def test_a_frame_read_in_slabs_has_the_same_bits(networks, monkeypatch) -> None:
-    net = networks.random((23, 20, 30), 4, 2, 2, 1)
-    frame = decode_region(net, 1.7, networks.box(net))
-    monkeypatch.setattr(regions, "READ_NUMBERS", 4 * 20 * 30 * 2)
-    slabs = networks.recording(net)
-    np.testing.assert_array_equal(decode_region(slabs, 1.7, networks.box(net)), frame)
-    assert len(slabs.tables[0].regions) == 6
-
-
-@pytest.mark.parametrize(
-    "box",
-    [
-        (1, 1, 1),
-        (1, 1, 5000),
-        (1, 300, 300),
-        (25, 125, 125),
-        (8, 16, 32),
-        (500, 2, 3),
-        (64, 64, 64),
-    ],
-    ids=str,
-)
-def test_blocks_are_bounded_and_barely_overhang(box) -> None:
-    shape = block_shape(box)
-    assert all(1 <= length <= size for length, size in zip(shape, box, strict=True))
-    assert prod(shape) <= regions.BLOCK_VERTICES
-    assert all(
-        -(-size // length) * length - size < -(-size // length)
-        for length, size in zip(shape, box, strict=True)
-    )
 
 
 @pytest.mark.parametrize("key_index", [-0.1, 3.1, float("nan"), float("inf")])

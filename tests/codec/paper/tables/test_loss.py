@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import decode_region
 from fhash_codec.paper.tables.loss import Samples
 from fhash_codec.paper.tables.tiles import tile_shape
 

@@ -13,8 +13,13 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.coreset import occupancy
 from fhash_codec.paper.network import ArrayTable, Network, SparseSource
-from fhash_codec.paper.points import PointSampler, PointTables, SparsePatch, sample_points
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import (
+    PointSampler,
+    PointTables,
+    SparsePatch,
+    decode_region,
+    sample_points,
+)
 from fhash_codec.paper.tables.needed import needed_by
 from fhash_codec.paper.tables.sparse_table import SparseTable
 from fhash_formats.container import Container, ContainerWriter
@@ -76,7 +81,7 @@ def test_a_decoded_region_has_the_bits_of_a_dense_one(
     random_model, monkeypatch, key, small
 ) -> None:
     """Whichever levels get all their vertices first."""
-    monkeypatch.setattr("fhash_codec.paper.regions.SMALL_NUMBERS", small)
+    monkeypatch.setattr("fhash_codec.paper.points.SMALL_NUMBERS", small)
     dense = random_model.network(fill=0.0)
     network = sparse(dense, random_model)
     whole = tuple((0, n) for n in dense.box_size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fhash_codec.paper.regions import decode_region
+from fhash_codec.paper.points import decode_region
 
 
 def test_the_coreset_does_not_depend_on_what_is_not_needed(random_model) -> None:
