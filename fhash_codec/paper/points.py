@@ -146,11 +146,8 @@ class PointTables:
         sizes = (network.key_frames, *network.box_size)
         patches = []
         for level, resolution in enumerate(network.levels):
-            first, last = (corners_before(sizes, resolution, end) for end in (low, high))
-            region = tuple(
-                slice(start, min(stop + 2, length))
-                for start, stop, length in zip(first, last, resolution, strict=True)
-            )
+            region = _part_between(sizes, resolution, low, high)
+            first = [axis.start for axis in region]
             patches.append(Patch.of(network.read(level, region), first))
         return cls(network, sizes, network.levels, tuple(patches))
 
@@ -177,18 +174,14 @@ class PointTables:
                 vertices; of a larger part all that the level holds is read, which stays as it is.
         """
         sizes = (network.key_frames, *network.box_size)
-        ends = [[key_index, *(span[end] - end for span in region)] for end in (0, 1)]
+        low, high = ([key_index, *(span[end] - end for span in region)] for end in (0, 1))
         patches: list[Patch] = []
         for level, resolution in enumerate(network.levels):
-            first, last = (corners_before(sizes, resolution, end) for end in ends)
+            part = _part_between(sizes, resolution, low, high)[1:]
             at = key_index * (resolution[0] - 1) / max(sizes[0] - 1, 1)
             # On a time node this one is enough.
             node = min(int(at), resolution[0] - 1)
             nodes = range(node, node + 1 if at == node else node + 2)
-            part = tuple(
-                slice(start, min(stop + 2, length))
-                for start, stop, length in zip(first[1:], last[1:], resolution[1:], strict=True)
-            )
             numbers = network.embedding_size * math.prod(axis.stop - axis.start for axis in part)
             frames = [network.sparse_frame(level, n) for n in nodes] if numbers > small else [None]
             held = [frame for frame in frames if frame is not None]
@@ -196,7 +189,7 @@ class PointTables:
                 patches.append(SparsePatch.of_frames(held, node))
                 continue
             values = network.read(level, (slice(nodes.start, nodes.stop), *part))
-            patches.append(Patch.of(values, (node, *first[1:])))
+            patches.append(Patch.of(values, (node, *(axis.start for axis in part))))
         return cls(network, sizes, network.levels, tuple(patches))
 
     @property
@@ -259,6 +252,17 @@ def corners_before(
         min(int(at * (corners - 1) / max(size - 1, 1)), max(corners - 2, 0))
         for at, corners, size in zip(point, resolution, sizes, strict=True)
     ]
+
+
+def _part_between(
+    sizes: Sequence[int], resolution: Sequence[int], low: Sequence[float], high: Sequence[float]
+) -> tuple[slice, ...]:
+    """Return the part (t, z, y, x) of a level that surrounds all points between two positions."""
+    first, last = (corners_before(sizes, resolution, end) for end in (low, high))
+    return tuple(
+        slice(start, min(stop + 2, length))
+        for start, stop, length in zip(first, last, resolution, strict=True)
+    )
 
 
 @overload

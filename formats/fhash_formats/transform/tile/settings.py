@@ -1,23 +1,7 @@
 """Settings with which tiles are coded: transform, step, range, trained head.
 
 All tiles of an array share their settings, or a tile has its own. In a file they are a block of
-bytes (`TileSettings.to_bytes`), little-endian:
-
-    flags             u8: 1 double, 2 clip, 4 labels, 8 trellis, 16 whole ends, 32 head, 64 mask,
-                      128 predictor
-    transform         u8 along t, z, y, x each: the kind's number in KINDS times 16, plus the depth
-    step, quantum     float64 each
-    center, low, high float64 each; with whole ends low and high int64
-    origin            9 bytes, signed; only with whole ends
-    offsets           int8, six
-    bases             of each axis with one, in order: a length and the packed basis
-    head              a length and the packed head
-    mask              u8 number of edges, plus 128 with others; the edges, float64; then u8 reach,
-                      and scores and others, uint16
-    predictor         float64 step and origin; u8 levels of t, z, y, x; u8 the order, two bits for
-                      each axis, the first lowest; u8 reach; a length and the coded weights
-
-A length is that of the bytes that follow (LEB128).
+bytes, whose fields FORMAT.md lists (Settings).
 """
 
 from __future__ import annotations
@@ -152,7 +136,7 @@ class TileSettings:
         return np.dtype(np.int64)
 
     def to_bytes(self) -> bytes:
-        """The packed block; the module's docstring describes its bytes."""
+        """The packed block. Raises InputError for ends about an origin that are no int64."""
         whole = self.origin != 0 or any(
             type(end) is int and abs(end) > _EXACT for end in (self.low, self.high)
         )
