@@ -35,22 +35,20 @@ from fhash_formats.errors import (
 )
 
 if TYPE_CHECKING:
-    from fhash_codec.appending.append import append
-    from fhash_codec.appending.merging import merge
-    from fhash_codec.appending.writer import Writer
+    from fhash_codec.appending.parts import merge
+    from fhash_codec.appending.writer import Writer, append
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.dataset import Dataset, open
-    from fhash_codec.dataset_encoding import encode_dataset
-    from fhash_codec.encoding import encode
+    from fhash_codec.encoding import encode, encode_dataset
     from fhash_codec.plain import export_plain
     from fhash_codec.rendering import render
     from fhash_codec.rendering.renderer import Renderer
-    from fhash_codec.rendering.scene.scene import Scene
+    from fhash_codec.rendering.scenes import Scene
+    from fhash_codec.views.pack import pack
+    from fhash_codec.views.store import zarr_store
+    from fhash_codec.views.unpack import unpack
     from fhash_codec.volume import Volume
-    from fhash_codec.zarr_chunks.pack import pack
-    from fhash_codec.zarr_chunks.unpack import unpack
-    from fhash_codec.zarr_view.store import zarr_store
 
 __version__ = version("fhash")
 
@@ -58,20 +56,20 @@ _MODULES = {
     "Dataset": "dataset",
     "EncodeConfig": "config",
     "Renderer": "rendering.renderer",
-    "Scene": "rendering.scene.scene",
+    "Scene": "rendering.scenes",
     "Volume": "volume",
     "Writer": "appending.writer",
-    "append": "appending.append",
+    "append": "appending.writer",
     "diff": "comparison",
     "encode": "encoding",
-    "encode_dataset": "dataset_encoding",
+    "encode_dataset": "encoding",
     "export_plain": "plain",
-    "merge": "appending.merging",
+    "merge": "appending.parts",
     "open": "dataset",
-    "pack": "zarr_chunks.pack",
+    "pack": "views.pack",
     "render": "rendering",
-    "unpack": "zarr_chunks.unpack",
-    "zarr_store": "zarr_view.store",
+    "unpack": "views.unpack",
+    "zarr_store": "views.store",
 }
 """Public names that load on first use, with their modules in this package."""
 

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_formats.errors import InputError, suggestion
 
 TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
 """Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""

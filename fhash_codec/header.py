@@ -1,38 +1,257 @@
-"""A container's header and the arrays of a series beside it (FORMAT.md), the same in both profiles.
-
-Each profile adds what it alone knows, such as its model.
-"""
+"""Header of a container: its name, provenance, source, quality and figures of single steps."""
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import write_bits
-from fhash_codec.coreset.scan import Scan
+from fhash_codec.features.occupancy import write_bits
+from fhash_codec.features.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.provenance import date_of, source_parts
-from fhash_codec.step_figures import read_steps, write_steps
 from fhash_formats.container import (
     SOURCE,
     Container,
     ContainerWriter,
     describe_coordinates,
+    describe_metadata,
+    read_metadata,
 )
-from fhash_formats.container.header import HISTORY, MISSING_ARRAY, NOT_STORED, STEP_FIGURES
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series
-from fhash_formats.support.attributes import json_attributes
-from fhash_formats.support.number_types import is_within
+from fhash_formats.container.header import (
+    CONFIG_DEFAULTS,
+    HISTORY,
+    LOWEST,
+    MISSING_ARRAY,
+    NOT_STORED,
+    STEP_BYTES,
+    STEP_FIGURES,
+    STEPS,
+)
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series, SourceMetadata, with_history
+from fhash_formats.support.values import is_within, json_attributes
+
+DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
+.pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
+DATA_SUFFIXES = frozenset(DATA_SUFFIX_NAMES.split())
+"""Suffixes of data files that are read or written. No container may have one of them.
+
+Those that say nothing of their content (.zip, .bin, .dat) are allowed.
+"""
+
+
+def check_name(path: Path) -> None:
+    """Raise InputError for a container named like a data file: most often the source itself."""
+    if path.suffix.lower() in DATA_SUFFIXES:
+        raise InputError(
+            f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz"
+        )
+
+
+PACKED = "pack"
+"""Command in the header's `encoder` of a file whose tiles come from a Zarr store."""
+
+FIGURES = {"fhash_max_error": "max_abs_error", "fhash_psnr": "psnr"}
+"""Attributes of a variable that say how well the file holds it, and their names in its header."""
+
+MAX_OPTION = 80
+"""Letters of the value of an option in a line of the history; a longer one is cut."""
+
+
+def source_parts(
+    series: Series, coords: Mapping[str, Coordinate], attributes: Mapping[str, Any]
+) -> tuple[dict[str, Any] | None, dict[str, npt.NDArray[Any]]]:
+    """The header's `source` of a series, and the arrays that belong to it.
+
+    coords, attributes: as the header has them. The entry is None where nothing is known.
+    """
+    metadata = series.metadata
+    if metadata is None:
+        return None, {}
+    assert set(metadata.dimensions.values()) <= {*AXES, ""}
+    return describe_metadata(metadata, coords, attributes)
+
+
+def date_of(config: EncodeConfig) -> dict[str, str]:
+    """The time of the encoding for the header's `source`, in UTC.
+
+    It is left out with the other times: then the same input and settings give the same bytes.
+    """
+    now = datetime.now(UTC).replace(microsecond=0, tzinfo=None)
+    return {"date": f"{now.isoformat()}Z"} if config.timings else {}
+
+
+def figure_attributes(header: Mapping[str, Any]) -> dict[str, float]:
+    """Attributes of a variable that say how well the file holds it, as far as it tells."""
+    found = {key: header["quality"].get(name) for key, name in FIGURES.items()}
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def source_attributes(metadata: SourceMetadata) -> dict[str, str]:
+    """Attributes of a file that name its source and the digest of it, as far as they are known."""
+    named = {"fhash_source": metadata.file, "fhash_source_digest": metadata.digest}
+    return {key: text for key, text in named.items() if text}
+
+
+def metadata_of(container: Container, coords: Mapping[str, Coordinate]) -> SourceMetadata | None:
+    """The source as a container tells it, with a line of history for the encoding.
+
+    coords: those of the container. None where it says nothing.
+    """
+    metadata = read_metadata(container.header, container.arrays, coords)
+    if metadata is None:
+        return None
+    line = history_line(container.header)
+    return replace(metadata, attributes=with_history(metadata.attributes, line))
+
+
+def history_line(header: Mapping[str, Any]) -> str:
+    """The encoding as a line of the global attribute `history`, as CF asks of a program.
+
+    It has the date where the header has it, the version of the encoder, and the command that asks
+    for the same settings.
+    """
+    source = header.get(SOURCE, {})
+    date = f"{source['date']} " if isinstance(source.get("date"), str) else ""
+    name = f" {source['file']}" if isinstance(source.get("file"), str) else ""
+    begun = f"{date}fhash {header['encoder']['version']}: fhash"
+    if header["encoder"].get("command") == PACKED:
+        return f"{begun} pack{name}"
+    words = "".join(f" {word}" for word in _options(header))
+    return f"{begun} encode{name}{words}"
+
+
+def _options(header: Mapping[str, Any]) -> list[str]:
+    """The settings other than the defaults, as options of the command line."""
+    config, profile = header.get("config", {}), header["model"]["profile"]
+    defaults = EncodeConfig(profile=profile).to_dict() | {"profile": CONFIG_DEFAULTS["profile"]}
+    named = {each.name: each.metadata.get("option") or each.name for each in fields(EncodeConfig)}
+    words = []
+    for name, option in named.items():
+        value = config.get(name)
+        if value is None or value == defaults.get(name):
+            continue
+        flag = option.replace("_", "-").lstrip("-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+            continue
+        for each in value if isinstance(value, list | tuple) else [value]:
+            words.append(f"--{flag} {str(each)[:MAX_OPTION]}")
+    return words
+
+
+MAX_LISTED = 512
+"""Steps whose figures stand in the header; an array of its own takes some 400 bytes."""
+HUNDREDTHS = 2000
+"""Hundredths of a dB of a factor of ten."""
+EXACT = -1
+"""Number in place of the decibels of a figure that is 0."""
+UNKNOWN = -2
+"""Number in place of the decibels of a figure without a finite value."""
+DIGITS_OF_A_STEP = 5
+"""Significant digits of a figure that comes back from decibels."""
+
+
+def write_steps(
+    writer: ContainerWriter, figures: Mapping[str, Sequence[float | None]], data_range: float
+) -> dict[str, list[int]]:
+    """Write the figures of all steps, or return what the header's `quality.steps` is.
+
+    Args:
+        writer: of the container; it gets an array for more than MAX_LISTED steps.
+        figures: one for each step, by the names STEP_FIGURES.
+        data_range: width of the header's value range.
+
+    Returns an empty object where there is an array.
+    """
+    levels = {name: _levels(figures[name], data_range) for name in STEP_FIGURES}
+    if len(levels[STEP_FIGURES[0]]) <= MAX_LISTED + 1:
+        return levels
+    numbers = np.array([listed[1:] for listed in levels.values()]) - UNKNOWN
+    planes = np.moveaxis(numbers.astype("<u4").view(np.uint8).reshape(*numbers.shape, 4), -1, 0)
+    lowest = [listed[0] for listed in levels.values()]
+    writer.add_whole(STEPS, planes[:STEP_BYTES], attributes={LOWEST: lowest})
+    return {}
+
+
+def read_steps(
+    header: Mapping[str, Any], arrays: Mapping[str, Any]
+) -> list[dict[str, float | None]]:
+    """The figures of each step by name, rounded to the worse side; none where the file has none.
+
+    Args:
+        header: of a variable.
+        arrays: StoredArray by name.
+    """
+    quality = header["quality"]
+    if "steps" in quality:
+        lists = [quality["steps"][name] for name in STEP_FIGURES]
+    elif STEPS in arrays:
+        array = arrays[STEPS]
+        weights = 256 ** np.arange(STEP_BYTES)
+        numbers = np.tensordot(weights, array.read().astype(np.int64), 1) + UNKNOWN
+        pairs = zip(array.attributes[LOWEST], numbers.tolist(), strict=True)
+        lists = [[lowest, *levels] for lowest, levels in pairs]
+    else:
+        return []
+    low, high = header["value_range"]
+    # Rounding must not pass the largest error of all steps.
+    limits = (None, quality.get("max_abs_error"))
+    columns = [
+        [_step_figure(first, level, high - low, limit) for level in levels]
+        for (first, *levels), limit in zip(lists, limits, strict=True)
+    ]
+    return [dict(zip(STEP_FIGURES, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _levels(figures: Sequence[float | None], data_range: float) -> list[int]:
+    """The smallest level, then each level counted from it, or EXACT or UNKNOWN."""
+    width = _decades(data_range)
+    levels: list[int | None] = []
+    for figure in figures:
+        if figure is not None and 0 < figure < math.inf:
+            levels.append(math.floor(HUNDREDTHS * (width - math.log10(figure))))
+        else:
+            levels.append(None)
+    lowest = min((level for level in levels if level is not None), default=0)
+    result = [lowest]
+    for figure, level in zip(figures, levels, strict=True):
+        unlike = EXACT if figure == 0 else UNKNOWN
+        result.append(unlike if level is None else level - lowest)
+    return result
+
+
+def _decades(data_range: float) -> float:
+    """The decimal logarithm of a range; of the largest float64 for one beyond it."""
+    return math.log10(min(data_range or 1.0, sys.float_info.max))
+
+
+def _step_figure(lowest: int, level: int, data_range: float, limit: float | None) -> float | None:
+    """The figure that is so many hundredths of a dB below a range, rounded up."""
+    if level < 0:
+        return 0.0 if level == EXACT else None
+    exponent = _decades(data_range) - (lowest + level) / HUNDREDTHS
+    if not -323 < exponent < 308:
+        return None
+    value = math.pow(10.0, exponent)
+    if limit is not None and value >= limit:
+        return float(limit)
+    context = Context(prec=DIGITS_OF_A_STEP, rounding=ROUND_CEILING)
+    rounded = float(context.create_decimal_from_float(value))
+    return rounded if limit is None else min(rounded, float(limit))
+
 
 MAX_POINTS = 24
 """Points of a training history that a file of the profile paper keeps at most."""

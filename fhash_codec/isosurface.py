@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import AXES, Coordinate
-from fhash_formats.writers.mesh import Mesh
+from fhash_formats.writers.vtk import Mesh
 
 __all__ = ["isosurface", "require_marching_cubes"]
 

@@ -15,24 +15,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.plain import correction_of, correction_type, predicted
-from fhash_codec.container_name import check_name
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import pack, packed_bytes, write_bits
-from fhash_codec.header import write_coordinates
-from fhash_codec.model_parts import TABLE_AXES, Table
+from fhash_codec.boxes import TABLE_AXES, Box, Table
+from fhash_codec.compact.model import correction_of, correction_type, predicted
+from fhash_codec.features.occupancy import pack, packed_bytes, write_bits
+from fhash_codec.header import check_name, write_coordinates
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, SPARSE, STEPS
+from fhash_formats.container.hierarchy import COORDINATES
 from fhash_formats.container.source_entry import AUXILIARY
-from fhash_formats.container.variables import COORDINATES
 from fhash_formats.errors import InputError
-from fhash_formats.support.atomic import check_output
-from fhash_formats.support.slabs import chunk_region, slab_shape
-from fhash_formats.transform.head.head import NeighbourHead
+from fhash_formats.support.files import check_output
+from fhash_formats.support.threads import chunk_region, slab_shape
+from fhash_formats.transform.head import NeighbourHead
 
 __all__ = ["export_plain"]
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 from fhash_formats.support.dates import CALENDARS, DATE, SECOND, Clock, clock, instants
-from fhash_formats.support.numbers import is_number
+from fhash_formats.support.values import is_number
 
 DIGITS = (6, 17)
 """Fewest and most digits of a number."""

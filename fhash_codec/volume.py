@@ -1,33 +1,155 @@
-"""`Volume`: a `.fhz` file read like an array (t, z, y, x). numpy only."""
+"""Volume of a file: values of regions and steps, of all or some features."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.array_like import ArrayLike
-from fhash_codec.card import Card
+from fhash_codec.boxes import (
+    ArrayLike,
+    Box,
+    Sizes,
+    Spans,
+    checked_region,
+    coarse_vertices,
+    shared_part,
+)
 from fhash_codec.compact.model import CompactModel
-from fhash_codec.coreset.boxes import Box, Spans
-from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import describe_file, read_missing
-from fhash_codec.indexing import checked_region, coarse_vertices, shared_part
 from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
-from fhash_codec.sampling import sampled
 from fhash_codec.times import Time, times_of
-from fhash_codec.value_type import ValueType, filled, placed, rounded
-from fhash_codec.volume_model import Decoded, open_model
+from fhash_codec.volume_model import Card, Decoded, open_model, sampled
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
-from fhash_formats.support.number_types import exact_number
-from fhash_formats.transform.values.elementwise import about_origin
+from fhash_formats.support.values import exact_number
+from fhash_formats.transform.values import about_origin
+
+Number = int | float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValueType:
+    """Types of decoded values.
+
+    Attributes:
+        source: type of the source.
+        floats: type of computed values: float64 for sources of float64 or of integers above 16
+            bits, else float32.
+        own: type in which values at vertices and steps lose nothing: the source's for integers that
+            the file holds as integers of every step, else `floats`.
+        has_gaps: whether some vertices have no value.
+        fill: the number that stood in the source for a missing value; None where it is unknown.
+    """
+
+    source: np.dtype[Any]
+    floats: np.dtype[Any]
+    own: np.dtype[Any]
+    has_gaps: bool
+    fill: Number | None
+
+    @classmethod
+    def of(cls, container: Container) -> ValueType:
+        """The types of a container."""
+        header = container.header
+        variable, model = header["variable"], header["model"]
+        source = np.dtype(variable["dtype"])
+        stored_as_integers = (
+            source.kind in "iu"
+            and model["profile"] == "compact"
+            and model.get("values", model["tables"]) == source.name
+            and model["levels"][0][0] == header["domain"]["shape"][0]
+        )
+        return cls(
+            source=source,
+            floats=decoded_type(source),
+            own=source if stored_as_integers else decoded_type(source),
+            has_gaps=_has_gaps(header) or "missing/bits" in container.arrays,
+            fill=variable.get("fill"),
+        )
+
+    def of_array(self, fill: Number | None) -> tuple[np.dtype[Any], Number | None]:
+        """The type of values in an array, and what stands in it where there is no value.
+
+        Integers stay what they are if none is missing, or if the fill value is one of their type.
+        A fill value that was not asked for is the source's own, and only for integers.
+
+        fill: the number asked for; None for none. Returns None for the fill value where it is NaN.
+        """
+        if self.own.kind == "f":
+            return self.own, fill
+        chosen = self.fill if fill is None else fill
+        if chosen is not None and not holds(self.own, chosen):
+            chosen = None
+        if chosen is not None or not self.has_gaps:
+            return self.own, 0 if chosen is None else int(chosen)
+        return self.floats, fill
+
+
+def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of decoded values: a float wide enough for the source's own precision."""
+    narrow = source.itemsize <= 2 or source == np.float32
+    return np.dtype(np.float32 if narrow else np.float64)
+
+
+def holds(dtype: np.dtype[Any], number: Number) -> bool:
+    """Whether a type has this number exactly; floats have every number up to their largest."""
+    if dtype.kind == "f":
+        return number != number or abs(number) <= float(np.finfo(dtype).max)
+    limits = np.iinfo(dtype)
+    if not np.isfinite(float(number)) or number != int(number):
+        return False
+    return bool(limits.min <= int(number) <= limits.max)
+
+
+def placed(
+    values: npt.NDArray[Any], where: npt.NDArray[np.bool_], box: Box, shape: Sizes
+) -> npt.NDArray[Any]:
+    """Values (z, y, x) where a mask is True, in a box of an array of a shape that is NaN elsewhere.
+
+    The values themselves where they are all of the array. Values and mask may have more axes before
+    z, which the result has, too.
+    """
+    if box.shape == shape and where.all():
+        return values
+    result = np.full((*values.shape[:-3], *shape), np.nan, dtype=values.dtype)
+    np.copyto(result[..., *box.slices()], values, where=where)
+    return result
+
+
+def filled(values: npt.NDArray[Any], fill: Number | None) -> npt.NDArray[Any]:
+    """Floats with a fill value in place of NaN; None leaves them as they are."""
+    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)
+
+
+def rounded(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Floats as the nearest integers of a type, 0 for NaN.
+
+    The ends of 64-bit types are no floats: what rounding puts beyond them becomes the nearest float
+    within.
+    """
+    limits = np.iinfo(dtype)
+    low, high = float(limits.min), float(limits.max)
+    if int(high) > limits.max:
+        high = float(np.nextafter(high, 0))
+    wide = np.nan_to_num(values.astype(np.float64), nan=0.0)
+    return np.clip(np.rint(wide), low, high).astype(dtype)
+
+
+def _has_gaps(header: Mapping[str, Any]) -> bool:
+    """Whether some vertices of the domain are outside the coreset, by the header."""
+    box = [[0, length] for length in header["domain"]["shape"][1:]]
+    return bool(header["coreset_fraction"] < 1 or header["feature_bounding_box"] != box)
+
 
 OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
@@ -430,3 +552,96 @@ class Volume(Card, ArrayLike):
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
         return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"
+
+
+class FeatureVolume(Volume):
+    """A `Volume` whose coreset is that of some features of the file.
+
+    Attributes:
+        numbers: of these features among those of the file, counted from 0.
+    """
+
+    def __init__(
+        self, container: Container, numbers: Sequence[int], *, fill: int | float | None = None
+    ) -> None:
+        """Read from an open container; `only_features` gives the numbers."""
+        super().__init__(container, fill=fill)
+        self.numbers = tuple(numbers)
+
+    def _occupied(self, key: float, region: Box) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the features' coreset at a key index; region in vertices of the box."""
+        assert isinstance(self._model, PaperModel), "only_features refuses other profiles"
+        first, last = int(np.floor(key)), int(np.ceil(key))
+        return self._model.occupied_by(self.numbers, first, last, region)
+
+    def __reduce__(self) -> tuple[Any, tuple[Place]]:
+        again = partial(_reopen, self.numbers, self.variable, self._asked_fill)
+        return again, (self.container.reopening(),)
+
+
+def only_features(volume: Volume, features: Sequence[str]) -> Volume:
+    """The volume with some features of its file alone.
+
+    It shares the open container, so that closing either closes both. A volume whose file has these
+    features and no others comes back as it is.
+
+    Args:
+        volume: an open container.
+        features: as the file names them; "segmentation" stands for the one with a threshold.
+
+    Raises InputError for a feature that the file does not name, and for a file that keeps its
+    features merged.
+    """
+    numbers = _numbers(volume, features)
+    if set(numbers) == set(range(len(_names(volume)))):
+        return volume
+    if not holds_features_apart(volume):
+        raise InputError(
+            f"{volume.path}: its features are merged, none can be taken alone; "
+            "encode with --profile paper, which keeps several features apart"
+        )
+    return FeatureVolume(volume.container, numbers, fill=volume._asked_fill)
+
+
+def holds_features_apart(volume: Volume) -> bool:
+    """Whether a file keeps the occupancy of each of its features."""
+    return isinstance(volume._model, PaperModel)
+
+
+def _numbers(volume: Volume, features: Sequence[str]) -> tuple[int, ...]:
+    """The numbers of features among those of a file, ascending and each once; errors as above."""
+    names = _names(volume)
+    found = set()
+    for text in features:
+        equal = [
+            number
+            for number, name in enumerate(names)
+            if name == text or (text == "segmentation" and name.startswith("segmentation:"))
+        ]
+        if not equal:
+            raise InputError(
+                f"{volume.path}: '{text[:80]}' is none of its features: {', '.join(names)[:400]}"
+            )
+        found.update(equal)
+    return tuple(sorted(found))
+
+
+def feature_names(volume: Volume) -> list[str]:
+    """The features that a volume shows, as its file names them: all, or those chosen."""
+    names = _names(volume)
+    if isinstance(volume, FeatureVolume):
+        return [names[number] for number in volume.numbers]
+    return names
+
+
+def _names(volume: Volume) -> list[str]:
+    """The features of a file, as it names them."""
+    return [str(name) for name in volume.container.header["features"]]
+
+
+def _reopen(
+    numbers: Sequence[int], variable: str | None, fill: int | float | None, path: Place
+) -> Volume:
+    """A volume of some features of the file at a place."""
+    container = open(path, variable=variable, fill=fill).container
+    return FeatureVolume(container, numbers, fill=fill)

@@ -1,43 +1,259 @@
-"""xarray's engine `fhash`: `xr.open_dataset("run.fhz")` gives what it gives of the source.
-
-The dataset is lazy: values are decoded when they are asked for, tile by tile. The engine hands
-xarray an undecoded dataset, of the values and of all that belongs to them (`Volume.metadata`), and
-xarray decodes it by CF as it does any file. docs/xarray.md is for users.
-
-Importing this module registers `Dataset.fhash` and `DataArray.fhash`, whose `encode` writes a
-container.
-"""
+"""Backend of xarray: containers as datasets of lazy arrays."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
-from xarray.backends import BackendEntrypoint
+from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
+from fhash_codec.boxes import Box, slice_of, step_blocks
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.labelled import labelled_series
+from fhash_codec.dataset import Handle, acquire, place_of, release
 from fhash_codec.encoding import encode
-from fhash_codec.lazy_array import FhashArray, Form
-from fhash_codec.provenance import figure_attributes, history_line, source_attributes
-from fhash_codec.shared_volumes import acquire, place_of
-from fhash_codec.side_by_side import SideBySide, shown_names
-from fhash_codec.value_type import holds
-from fhash_codec.volume import OUTSIDE, Volume
+from fhash_codec.features.selection import labelled_series
+from fhash_codec.header import figure_attributes, history_line, source_attributes
+from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf_packing import SCALING
-from fhash_formats.series import AXES
-from fhash_formats.source_metadata import SourceVariable, meant, with_history
-from fhash_formats.support.attributes import PACKING
+from fhash_formats.readers.common.cf import SCALING
+from fhash_formats.series import AXES, NO_AXIS, SourceVariable, meant, renamed, with_history
+from fhash_formats.support.values import PACKING
 
-__all__ = ["FhashBackend"]
+Key = tuple[Any, ...]
+
+
+def shown_names(names: Mapping[str, str]) -> dict[str, str]:
+    """The name under which each variable of a file is shown, by its name in the file.
+
+    names: of the variables in their sources, by their names in the file. Where several have the
+        same name in their sources, all variables are shown by their names in the file.
+    """
+    if len(set(names.values())) == len(names):
+        return dict(names)
+    return {name: name for name in names}
+
+
+class SideBySide:
+    """A dataset that takes one variable after the other.
+
+    Attributes:
+        variables: those of the dataset so far, by name.
+    """
+
+    def __init__(self, data: Mapping[str, Collection[str]]) -> None:
+        """Keep names free. data: dimensions of the variables that will be added, by name."""
+        self.variables: dict[str, xr.Variable] = {}
+        self._data = data
+        # A variable alone may have the name of its own dimension.
+        self._taken = set(data) if len(data) > 1 else set()
+        self._counts: dict[str, int] = {}
+        self._known: dict[Key, str] = {}
+        # Length of each dimension, and what its coordinate holds; None without a coordinate.
+        self._dimensions: dict[str, tuple[int, Key | None]] = {}
+
+    def add(
+        self, name: str, values: xr.Variable, beside: Mapping[str, xr.Variable]
+    ) -> dict[str, str]:
+        """Add a variable and the arrays beside it; return the names of these in the dataset."""
+        sizes: dict[str, int] = {}
+        for variable in (values, *beside.values()):
+            sizes |= {str(dim): size for dim, size in variable.sizes.items()}
+        names = {dim: self._dimension(dim, size, beside.get(dim)) for dim, size in sizes.items()}
+        for other, variable in beside.items():
+            if other in names:
+                continue
+            dimensions = tuple(names[str(dim)] for dim in variable.dims)
+            if other in self._data and set(variable.dims) == set(self._data[other]):
+                names[other] = other  # the values of another variable of the file
+                continue
+            key = (other, dimensions, _content(variable))
+            names[other] = self._named(other, key, lambda free: free not in self._taken)
+        changed = {old: new for old, new in names.items() if old != new}
+        for other, variable in beside.items():
+            if names[other] not in self._data:
+                self.variables.setdefault(names[other], _renamed(variable, names, changed))
+        self.variables[name] = _renamed(values, names, changed)
+        return {other: names[other] for other in beside}
+
+    def _dimension(self, name: str, size: int, coordinate: xr.Variable | None) -> str:
+        """The name in the dataset of a dimension, which is shared where nothing contradicts."""
+        content = None if coordinate is None else _content(coordinate)
+
+        def fits(free: str) -> bool:
+            if free not in self._dimensions:
+                return free not in self._taken
+            length, other = self._dimensions[free]
+            return length == size and (content is None or other in (None, content))
+
+        found = self._named(name, (name, size, content), fits)
+        before = self._dimensions.get(found, (size, None))[1]
+        self._dimensions[found] = size, content if before is None else before
+        return found
+
+    def _named(self, wish: str, key: Key, fits: Callable[[str], bool]) -> str:
+        """The name of what a key says, or a new one: the wish, or with a number."""
+        if key not in self._known:
+            name = wish
+            while not fits(name):
+                self._counts[wish] = self._counts.get(wish, 1) + 1
+                name = f"{wish}_{self._counts[wish]}"
+            self._known[key] = name
+            self._taken.add(name)
+        return self._known[key]
+
+
+def _content(variable: xr.Variable) -> Key:
+    """The form, values and attributes of an array, for comparison with others."""
+    values = np.asarray(variable.values)
+    data = repr(values.tolist()).encode() if values.dtype.kind == "O" else values.tobytes()
+    attributes = repr(sorted(variable.attrs.items(), key=lambda item: str(item[0])))
+    form = (variable.dims, values.shape, values.dtype.str)
+    return (*form, sha256(data).digest(), attributes)
+
+
+def _renamed(
+    variable: xr.Variable, names: Mapping[str, str], changed: Mapping[str, str]
+) -> xr.Variable:
+    """A variable with other names of its dimensions and in its attributes."""
+    if not changed:
+        return variable
+    dimensions: Sequence[str] = [names[str(dim)] for dim in variable.dims]
+    attributes = renamed(variable.attrs, changed)
+    return xr.Variable(dimensions, variable._data, attributes, encoding=variable.encoding)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Form:
+    """The form in which a volume is shown.
+
+    Attributes:
+        dimensions: of the variable, each with its axis or NO_AXIS.
+        lod: level of detail, None for every vertex.
+        outside: as in `Volume.read`.
+    """
+
+    dimensions: Mapping[str, str]
+    lod: int | None
+    outside: str
+
+    def vertices(self, volume: Volume) -> dict[str, range]:
+        """Steps and vertices of the domain that are shown, by axis."""
+        steps, *space = map(range, volume.shape)
+        if self.lod is not None:
+            space = list(volume.lod_vertices(self.lod))
+        return dict(zip(AXES, (steps, *space), strict=True))
+
+    def sizes(self, volume: Volume) -> dict[str, int]:
+        """Length of each dimension."""
+        lengths = {axis: len(along) for axis, along in self.vertices(volume).items()}
+        return {name: lengths.get(axis, 1) for name, axis in self.dimensions.items()}
+
+    def chunks(self, volume: Volume) -> dict[str, int]:
+        """Length of a tile along each dimension."""
+        t, *space = volume.chunks
+        tile = dict(zip(AXES, (t, *(max(1, n >> (self.lod or 0)) for n in space)), strict=True))
+        sizes = self.sizes(volume)
+        return {name: min(tile.get(axis, 1), sizes[name]) for name, axis in self.dimensions.items()}
+
+
+class FhashArray(BackendArray):
+    """A variable of a container, decoded as it is indexed; pickled as its place."""
+
+    def __init__(
+        self, place: str, name: str, form: Form, storage_options: Mapping[str, Any] | None
+    ) -> None:
+        self._place, self._name, self._form = place, name, form
+        self._options = storage_options
+        self._handle: Handle | None = acquire(place, storage_options)
+        self._digest = self._handle.digest
+        volume = self._handle.volumes[name]
+        self.shape = tuple(form.sizes(volume).values())
+        self.dtype = volume.dtype if form.lod is None else volume.float_dtype
+
+    def _opened(self) -> Handle:
+        """The open file, for as long as it is held; InputError where it has been replaced."""
+        handle = self._handle
+        if handle is None or not handle.is_of_this_process():
+            handle = self._handle = acquire(self._place, self._options, self._digest)
+        return handle
+
+    def release(self) -> None:
+        """Close the file, unless others read from it; the next reading opens it again."""
+        if self._handle is not None:
+            release(self._handle)
+            self._handle = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_handle": None}
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.BASIC, self._get
+        )
+
+    def _get(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
+        """Values at whole numbers and slices, one for each dimension."""
+        dimensions = list(self._form.dimensions.items())
+        chosen = {
+            axis: _positions(length, part)
+            for (_, axis), length, part in zip(dimensions, self.shape, key, strict=True)
+        }
+        values = self._values({axis: chosen.get(axis, range(1)) for axis in AXES})
+        # from t, z, y, x to the dimensions that there are, in their order
+        present = [axis for _, axis in dimensions if axis != NO_AXIS]
+        ordered = [axis for axis in AXES if axis in present]
+        values = values.reshape([len(chosen[axis]) for axis in ordered])
+        values = values.transpose([ordered.index(axis) for axis in present])
+        for place, (_, axis) in enumerate(dimensions):
+            if axis == NO_AXIS:
+                values = np.expand_dims(values, place)
+        left = (
+            part if axis == NO_AXIS else slice(None) if isinstance(part, slice) else 0
+            for (_, axis), part in zip(dimensions, key, strict=True)
+        )
+        return values[tuple(left)]
+
+    def _values(self, ranges: Mapping[str, range]) -> npt.NDArray[Any]:
+        """Values (t, z, y, x) at some of the steps and vertices that are shown."""
+        # held until the values are there, even if another thread releases it
+        handle, form = self._opened(), self._form
+        volume = handle.volumes[self._name]
+        result = np.empty([len(ranges[axis]) for axis in AXES], dtype=self.dtype)
+        if not result.size:
+            return result
+        shown = form.vertices(volume)
+        region = Box.of(
+            (shown[axis][min(ranges[axis])], shown[axis][max(ranges[axis])] + 1)
+            for axis in AXES[1:]
+        )
+        local = tuple(slice_of(ranges[axis], min(ranges[axis])) for axis in AXES[1:])
+        if form.lod is not None:
+            for number, step in enumerate(ranges["t"]):
+                result[number] = volume.read_lod(step, form.lod, region)[local]
+            return result
+        for places, steps in step_blocks(ranges["t"], region.shape):
+            values = volume.values_of_steps(steps, region, outside=form.outside)
+            result[places] = values[:, *local]
+        return result
+
+
+def _positions(length: int, part: int | slice) -> range:
+    """The positions that a number or slice of a key stands for."""
+    if isinstance(part, slice):
+        return range(length)[part]
+    position = range(length)[part]
+    return range(position, position + 1)
+
 
 SUFFIX = ".fhz"
 FILLS = ("_FillValue", "missing_value")

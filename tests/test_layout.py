@@ -28,8 +28,8 @@ ALLOWED = {
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
 TORCH_FILES = re.compile(
-    r"paper/(training|engines)/.+\.py|training/.+\.py|bench/train/.+\.py"
-    r"|rendering/task/torch_arrays\.py|bench/paper/(bench|between|training)\.py"
+    r"paper/(train|fit|engines/.+)\.py|devices\.py|bench/train/.+\.py"
+    r"|rendering/torch_arrays\.py|bench/paper/(bench|between|training)\.py"
     r"|bench/paper/encodings/.+\.py"
 )
 """Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""

@@ -20,12 +20,12 @@ SCRIPT = """
 import json, sys
 from click.testing import CliRunner
 from fhash_cli.main import program
-from fhash_codec.compact.choices import head, head_prospects
+from fhash_codec.compact import head
 
 head.TRIAL_BUDGET = head.Budget(updates=60, samples=8192)
-head.MIN_BYTES, head_prospects.MAX_OF_TRIAL = 0, 1e6  # a head is trained, whether it pays or not
+head.MIN_BYTES, head.MAX_OF_TRIAL = 0, 1e6  # a head is trained, whether it pays or not
 budget = head.Budget(updates=80, samples=8192)
-head.EFFORTS[5] = head_prospects.Effort(candidates=4, budget=budget, perceptron=budget)
+head.EFFORTS[5] = head.Effort(candidates=4, budget=budget, perceptron=budget)
 for line in sys.stdin:
     result = CliRunner().invoke(program, json.loads(line))
     print(json.dumps([result.exit_code, result.stdout, result.stderr]))

@@ -12,7 +12,7 @@ import click
 
 from fhash_cli.options import check_writable
 from fhash_cli.output import say
-from fhash_codec.demo.gallery import GALLERY_SERIES, PICTURES, Picture
+from fhash_codec.gallery import GALLERY_SERIES, PICTURES, Picture
 from fhash_formats.errors import InputError
 
 __all__ = ["make_gallery", "page"]
@@ -46,7 +46,7 @@ def make_gallery(
             say(f"drawing '{picture.name}'")
         container = str(data / f"{picture.series}.fhz")
         _run(run["render"], [container, "-o", str(path), *picture.options, "--force", "-q"])
-    from fhash_formats.support.atomic import replacing
+    from fhash_formats.support.files import replacing
 
     with replacing(text, force=force) as temporary:
         temporary.write_text(page(folder.name), encoding="utf-8")

@@ -42,7 +42,13 @@ COMMANDS = {
     "selftest": "check hard cases on this machine",
     "completion": "print the shell code that completes fhash's words on Tab",
 }
-"""Help line of each command; its module `fhash_cli.commands.NAME` is imported only on use."""
+"""Help line of each command; its module of `fhash_cli.commands` is imported only on use."""
+FILES = {
+    **dict.fromkeys(("plan", "merge", "append"), "parts"),
+    **dict.fromkeys(("pack", "unpack", "export", "serve"), "zarr"),
+    **dict.fromkeys(("verify", "diff"), "checks"),
+}
+"""Modules of the commands that share one; any other command has one of its own name."""
 
 
 class Program(click.Group):
@@ -59,7 +65,10 @@ class Program(click.Group):
         """The click command of a name; None for a name that is unknown."""
         if name not in COMMANDS:
             return None
-        return cast(click.Command, importlib.import_module(f"fhash_cli.commands.{name}").command)
+        module = importlib.import_module(f"fhash_cli.commands.{FILES.get(name, name)}")
+        return cast(
+            click.Command, getattr(module, f"{name}_command" if name in FILES else "command")
+        )
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands for `--help`, without importing them."""

@@ -1,10 +1,11 @@
-"""Options that several commands share, and their types: slices, regions, encoding settings."""
+"""The base of every command, and the options and their types that several commands share."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import math
+import re
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,8 +14,297 @@ from typing import Any
 
 import click
 
-from fhash_cli.intervals import NumberType, SliceType
 from fhash_formats.errors import InputError, OutputError
+from fhash_formats.support.values import is_number
+
+AXES = 3
+"""Axes of a region: z, y and x."""
+
+
+class NumberType(click.ParamType[int | float]):
+    """A number; whole numbers stay exact beyond the precision of floats."""
+
+    name = "V"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | float:
+        """The number."""
+        for number in (int, float):
+            try:
+                return number(value)
+            except ValueError:
+                continue
+        self.fail(f"{value!r} is not a number", param, ctx)
+
+
+class SliceType(click.ParamType[slice]):
+    """Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive."""
+
+    name = "A:B:S"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> slice:
+        """The slice that a text stands for; `-1` is `slice(-1, None)`, the last."""
+        if isinstance(value, slice):
+            return value
+        try:
+            return parse_slice(str(value))
+        except ValueError as error:
+            self.fail(
+                f"'{value}' {error}; write an index or a half-open range A:B or A:B:S,"
+                " such as 4, 40:50, 10: or ::2",
+                param,
+                ctx,
+            )
+
+
+class IntervalsType(click.ParamType[tuple[Any, ...]]):
+    """Intervals along z, y and x, of indices or (`number=float`) of positions.
+
+    An end that is left out stands for the end of the domain. Axes that are left out at the end, or
+    in place of `...`, are taken whole. A single index stands for its interval of length 1.
+    """
+
+    def __init__(self, number: type[int] | type[float]) -> None:
+        self.number = number
+        self.name = "z0:z1,y0:y1,x0:x1"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
+        """((z0, z1), (y0, y1), (x0, x1)), None for an end left out."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            return self._intervals(str(value))
+        except ValueError as error:
+            example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
+            self.fail(f"'{value}': {error}; write z0:z1,y0:y1,x0:x1 as in {example}", param, ctx)
+
+    def _intervals(self, text: str) -> tuple[Any, ...]:
+        """The intervals along all axes; raises ValueError with the reason."""
+        parts = [part.strip() for part in text.split(",")]
+        if parts.count("...") > 1:
+            raise ValueError("'...' stands there twice")
+        given = len(parts) - parts.count("...")
+        if given > AXES:
+            raise ValueError(f"{given} intervals, and a region has {AXES} axes (z, y, x)")
+        place = parts.index("...") if "..." in parts else len(parts)
+        whole = [":"] * (AXES - given)
+        return tuple(map(self._interval, [*parts[:place], *whole, *parts[place + 1 :]]))
+
+    def _interval(self, part: str) -> tuple[Any, Any]:
+        """One interval; raises ValueError with the reason."""
+        if not part:
+            raise ValueError("an interval is empty; ':' is a whole axis")
+        if self.number is int:
+            try:
+                chosen = parse_slice(part)
+            except ValueError as error:
+                raise ValueError(f"'{part}' {error}") from None
+            if chosen.step is not None:
+                raise ValueError(f"'{part}' has a step, which a region has not (--lod coarsens)")
+            return chosen.start, chosen.stop
+        ends = part.split(":")
+        if len(ends) == 1:
+            raise ValueError(f"'{part}' is one position, and an interval has two ends")
+        if len(ends) > 2:
+            raise ValueError(f"'{part}' has more than two ends")
+        low, high = (_position(end) for end in ends)
+        if low is not None and high is not None and low > high:
+            raise ValueError(f"'{part}' ends before it begins")
+        return low, high
+
+
+def parse_slice(text: str) -> slice:
+    """`A:B:S` or one index as a slice; raises ValueError that says in a clause why it is none."""
+    words = [part.strip() for part in text.split(":")]
+    for word in words:
+        if word and not _is_integer(word):
+            kind = "is between two" if is_number(word) else "is no number"
+            raise ValueError(f"is not made of indices: {word} {kind}")
+    if not any(words) and len(words) == 1:
+        raise ValueError("is empty")
+    parts = [int(word) if word else None for word in words]
+    if len(parts) == 1 and parts[0] is not None:
+        index = parts[0]
+        return slice(index, index + 1 if index != -1 else None)
+    if len(parts) > 3:
+        raise ValueError("has more than three parts")
+    if len(parts) == 3 and parts[2] is not None and parts[2] < 1:
+        raise ValueError(f"has the step {parts[2]}, and steps go upwards by 1 or more")
+    return slice(*parts)
+
+
+def written(low: int | None, high: int | None) -> str:
+    """A range as a user writes it; a single index for a range of length 1."""
+    if low is not None and (high == low + 1 or (low == -1 and high is None)):
+        return str(low)
+    return f"{'' if low is None else low}:{'' if high is None else high}"
+
+
+def _position(text: str) -> float | None:
+    """An end of an interval of positions; None if it is left out."""
+    if not text.strip():
+        return None
+    if not is_number(text) or math.isnan(float(text)):
+        raise ValueError(f"'{text}' is no position")
+    return float(text)
+
+
+def _is_integer(text: str) -> bool:
+    return text.lstrip("+-").isdecimal() and text.lstrip("+-").isascii() and len(text) < 20
+
+
+MAX_BUDGET = 86_400.0
+"""Longest budget, in seconds."""
+
+
+class DurationType(click.ParamType[float]):
+    """A time such as 90s, 2m or 1h; a plain number is in seconds."""
+
+    name = "TIME"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Seconds; refuses what is no time, and one outside of 1 s to 24 h."""
+        if isinstance(value, float):
+            return value
+        match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh]?)", str(value).strip())
+        if match is None:
+            self.fail(f"'{value}' is no time; write one such as 90s, 2m or 1h", param, ctx)
+        seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+        if not 1 <= seconds <= MAX_BUDGET:
+            self.fail(f"'{value}' is {seconds:g} s; allowed: 1s to 24h", param, ctx)
+        return seconds
+
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Input": ("var", "axes", "t", "shape", "dtype", "endian", "missing", "select"),
+    "Quality, one of": (
+        "psnr", "psnr-bulk", "max-error", "max-error-rel", "ratio", "min-psnr", "target", "bound",
+    ),
+    "Feature": ("feature", "dilation"),
+    "Steps and region": ("time", "roi", "box", "lod"),
+    "Values": ("outside", "fill"),
+    "Profile compact": ("profile", "effort", "tile"),
+    "Profile paper": (
+        "key-frames", "fold", "embedding-size", "hidden-layers", "width", "epochs",
+        "learning-rate", "schedule", "batch", "tables", "engine", "engines",
+    ),
+    "Scene": (
+        "scene", "steps", "paper-shape", "gallery", "set", "effect", "size", "background",
+        "antialiasing", "scale",
+    ),
+    "Camera": (
+        "view", "azimuth", "elevation", "zoom", "projection", "position", "focal-point", "view-up",
+    ),
+    "Colour and opacity": (
+        "cmap", "opacity", "range", "density", "isosurface", "volume", "no-volume", "track",
+    ),
+    "Clipping": ("clip", "clip-box", "clip-plane"),
+    "Animation": (
+        "animate", "frames", "fps", "pictures", "evolution", "columns", "part-of", "split",
+    ),
+    "Accuracy and speed": (
+        "march", "device", "step", "threshold", "samples-per-pass", "skipping",
+    ),
+    "Comparison": ("peer", "part", "seconds", "turns", "speed"),
+    "Address": ("host", "port"),
+    "Cases": ("all", "case", "group"),
+    "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
+    "Run": (
+        "seed", "timings", "deterministic", "processes", "explain", "json", "q", "quiet", "v",
+        "verbose", "help",
+    ),
+}  # fmt: skip
+"""Names of options by group, in the order of the help; options that none names come last."""
+ELSEWHERE = {
+    ("decode", "t"): "Steps and region",
+    ("decode", "dtype"): "Values",
+    ("decode", "isosurface"): "Output",
+    ("render", "t"): "Steps and region",
+    ("encode", "device"): "Run",
+    ("train", "device"): "Run",
+    ("rate", "device"): "Run",
+    ("demo", "shape"): "Scene",
+    ("diff", "max-error"): "Quality, gates",
+    ("diff", "min-psnr"): "Quality, gates",
+    ("diff", "min-psnr-bulk"): "Quality, gates",
+    ("rate", "target"): "Comparison",
+    ("rate", "bound"): "Comparison",
+    ("rate", "profile"): "Comparison",
+    ("train", "engines"): "Comparison",
+}
+"""Groups of options that mean something else in one command, by command and option."""
+WHY_ONCE = {"var": "a file RUN.fhz holds one variable, so encode each with a command of its own"}
+"""Advice to those who repeat an option, where it is not plain; by the name of its parameter."""
+LAST = ("Output", "Run")
+"""Groups that end the help, in this order."""
+OTHERS = "Further options"
+"""Group of the options that GROUPS does not name."""
+
+
+def group_of(command: str, option: click.Option) -> str:
+    """The group of an option of a command: the first that names it, else the last of all."""
+    names = [name.lstrip("-") for name in option.opts]
+    for name in names:
+        if (command, name) in ELSEWHERE:
+            return ELSEWHERE[command, name]
+    return next((title for title, members in GROUPS.items() if set(names) & set(members)), OTHERS)
+
+
+class BaseCommand(click.Command):
+    """A command whose help lists its options by purpose, and which takes single values once."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse an option that is given twice and takes one value: click would drop the first."""
+        if not ctx.resilient_parsing:
+            given = self.make_parser(ctx).parse_args(args=list(args))[2]
+            for option in given:
+                if given.count(option) > 1 and isinstance(option, click.Option):
+                    _check_repeated(option, ctx)
+        return super().parse_args(ctx, args)
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The options of the help, in their groups."""
+        rows: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None and isinstance(parameter, click.Option):
+                title = group_of(self.name or "", parameter)
+                rows.setdefault(title, []).append(record)
+        last = [title for title in LAST if title in rows]
+        first = [title for title in dict.fromkeys((*GROUPS, *rows)) if title in rows]
+        for title in [title for title in first if title not in last] + last:
+            with formatter.section(title):
+                formatter.write_dl(rows[title])
+
+
+class BaseGroup(click.Group):
+    """A group of such commands."""
+
+    command_class = BaseCommand
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse a line without a command by the names of the commands, not by the whole help."""
+        if not args and not ctx.resilient_parsing:
+            names = ", ".join(self.list_commands(ctx))
+            raise click.UsageError(f"Missing command; give one of {names}", ctx)
+        return super().parse_args(ctx, args)
+
+
+def _check_repeated(option: click.Option, ctx: click.Context) -> None:
+    """Raise UsageError for an option that is given twice, unless that means something."""
+    if option.multiple or option.count or (option.is_flag and not option.secondary_opts):
+        return
+    name = "/".join([option.opts[-1], *option.secondary_opts])
+    advice = WHY_ONCE.get(option.name or "", "give it once")
+    raise click.UsageError(f"{name} is given more than once; {advice}", ctx)
+
 
 Command = Callable[..., None]
 
@@ -49,7 +339,7 @@ def check_writable(
     Raises InputError in every case (exit code 2): only the command line is wrong so far.
     """
     from fhash_formats import save_check
-    from fhash_formats.support.atomic import check_output
+    from fhash_formats.support.files import check_output
 
     try:
         (save_check if region else check_output)(Path(path), force, sources=sources)

@@ -11,18 +11,102 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.intervals import IntervalsType
-from fhash_cli.options import Command, feature_option
-from fhash_cli.scene_types import NumbersType, OpacityType, PlaneType, SizeType
+from fhash_cli.options import Command, IntervalsType, feature_option
 from fhash_cli.selection import time_of
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_formats.errors import InputError, suggestion
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
-    from fhash_codec.rendering.scene.scene import Scene
+    from fhash_codec.rendering.scenes import Scene
 
-__all__ = ["SceneOptions", "scene_options"]
+NUMBERS = {2: "A,B", 3: "X,Y,Z"}
+"""Placeholders of options that take so many numbers."""
+
+
+class NumbersType(click.ParamType[tuple[float, ...]]):
+    """A fixed count of numbers with commas between them."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.name = count, NUMBERS[count]
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """The numbers; the scene checks later whether their values are allowed."""
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self.count:
+            self.fail(
+                f"'{value}' is not {self.count} numbers with commas between them,"
+                f" such as {','.join('123'[: self.count])}",
+                param,
+                ctx,
+            )
+        return numbers
+
+
+class SizeType(click.ParamType[tuple[int, int]]):
+    """Pixels across and down, WxH, or one number for both."""
+
+    name = "WxH"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """The two numbers."""
+        try:
+            across, _, down = str(value).lower().partition("x")
+            return int(across), int(down or across)
+        except ValueError:
+            self.fail(f"'{value}' is not a size in pixels such as 800x600", param, ctx)
+
+
+class OpacityType(click.ParamType[Any]):
+    """Points VALUE:OPACITY with commas between them, or the name of an opacity preset.
+
+    named: whether it may be a name.
+    """
+
+    def __init__(self, *, named: bool = True) -> None:
+        self.named, self.name = named, "NAME|V:O,..." if named else "G:F,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The name, or a list of points."""
+        if self.named and ":" not in str(value):
+            return value
+        try:
+            return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
+        except ValueError:
+            what = "neither the name of an opacity nor" if self.named else "not"
+            self.fail(f"'{value}' is {what} points such as 0:0,0.5:0.2,2:1", param, ctx)
+
+
+class PlaneType(click.ParamType[dict[str, Any]]):
+    """A clip plane: its normal and an offset, or a point of it and its normal."""
+
+    name = "NX,NY,NZ,D"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> dict[str, Any]:
+        """The settings of a ClipPlane."""
+        try:
+            numbers = [float(part) for part in str(value).split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 4:
+            return {"normal": numbers[:3], "offset": numbers[3]}
+        if len(numbers) == 6:
+            return {"point": numbers[:3], "normal": numbers[3:]}
+        self.fail(
+            f"'{value}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
+            " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5",
+            param,
+            ctx,
+        )
+
 
 PLACES = {
     "time": "time",
@@ -78,7 +162,7 @@ class SceneOptions:
 
     def scene(self, volume: Volume) -> Scene:
         """The scene; raises InputError for what it may not hold."""
-        from fhash_codec.rendering.scene.scene import Scene
+        from fhash_codec.rendering.scenes import Scene
 
         base = Scene() if self.file is None else Scene.load(self.file)
         values = base.to_dict()
@@ -289,7 +373,7 @@ def _put(values: dict[str, Any], place: str, value: Any) -> None:
 
 def _effect(name: str) -> str:
     """The field of Effects that a name stands for; raises InputError for an unknown name."""
-    from fhash_codec.rendering.scene.scene import Effects
+    from fhash_codec.rendering.scenes import Effects
 
     names = [
         field.name

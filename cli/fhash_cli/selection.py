@@ -6,15 +6,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from fhash_cli.intervals import written
+from fhash_cli.options import written
 from fhash_formats.errors import RegionError
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fhash_codec import Volume
-    from fhash_formats.series import Coordinate
-    from fhash_formats.source_metadata import SourceMetadata
+    from fhash_formats.series import Coordinate, SourceMetadata
 
 Span = tuple[int, int]
 
@@ -185,7 +184,7 @@ def opened(
     variable: which one, where the container has several.
     """
     import fhash_codec
-    from fhash_codec.feature_volume import only_features
+    from fhash_codec.volume import only_features
     from fhash_codec.volume import open as open_volume
 
     volume = open_volume(run, variable=variable, fill=fill)
@@ -210,7 +209,7 @@ def opened_variables(
     several: whether more than one can be taken. The rest is as for `opened`.
     """
     import fhash_codec
-    from fhash_codec.feature_volume import only_features
+    from fhash_codec.volume import only_features
 
     if not several:
         with opened(run, fill, features, variables) as volume:

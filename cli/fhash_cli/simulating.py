@@ -181,7 +181,7 @@ def write_series(
     OutputError for a disk with too little room.
     """
     from fhash_formats import Region, save_region
-    from fhash_formats.support.space import check_space
+    from fhash_formats.support.files import check_space
 
     check_writable(path, force, region=True, sources=_sources(chosen))
     check_space(path, raw_bytes(simulation) + OVERHEAD_BYTES)
@@ -209,7 +209,7 @@ def result_of(
     chosen: SceneOptions, simulation: Simulation, seconds: float, explain: bool
 ) -> dict[str, Any]:
     """A simulation as JSON values: what was computed, and with `explain` why."""
-    from fhash_codec.simulation.explain import counts, reasons
+    from fhash_codec.simulation.simulate import counts, reasons
 
     result: dict[str, Any] = {
         "scene": chosen.name,
@@ -225,7 +225,7 @@ def result_of(
 
 def simulation_rows(simulation: Simulation, seconds: float, explain: bool) -> list[tuple[str, str]]:
     """Rows of a table about a simulation; with `explain` what was computed, and why."""
-    from fhash_codec.simulation.explain import counts, reasons
+    from fhash_codec.simulation.simulate import counts, reasons
 
     vertices = max(simulation.counters.vertices, 1)
     speed = f"{number(seconds / vertices * 1e9, digits=3)} ns a value"

@@ -12,7 +12,7 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
-    from fhash_formats.readers.common.listing import Listed
+    from fhash_formats.readers.common.variables import Listed
 
 ALL = "all"
 """Value of `--var` that stands for every variable that can be encoded as it is."""
@@ -85,7 +85,7 @@ def _names(
     quiet: bool,
 ) -> list[str]:
     """The names that `--var` asks for, those of vectors whole."""
-    from fhash_codec.dataset_encoding import encodable
+    from fhash_codec.encoding import encodable
 
     if source.var is None:
         if len(parts) > 1:

@@ -1,10 +1,10 @@
 """Encoding on a cluster of dask: the plan is made once and sent, workers code parts, one is made.
 
 Each task works in one thread of a worker. The first ones scan a long series, whose figures the
-client joins (coreset/scan.py). Then each codes a part of it (parts.py) and returns the bytes of its
-file. The client keeps these in files beside the output and joins them (merging.py). So it holds the
-results of a few tasks at a time, and the output is complete or absent. The client needs to have the
-methods `submit` and, for arrays of dask, `compute`; dask is not imported.
+client joins (features/scan.py). Then each codes a part of it (parts.py) and returns the bytes of
+its file. The client keeps these in files beside the output and joins them (parts.py). So it holds
+the results of a few tasks at a time, and the output is complete or absent. The client needs to have
+the methods `submit` and, for arrays of dask, `compute`; dask is not imported.
 """
 
 from __future__ import annotations
@@ -24,26 +24,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.merging import join_parts
-from fhash_codec.appending.parts import Part, encode_part
+from fhash_codec.appending.parts import Part, encode_part, join_parts
 from fhash_codec.appending.series_plan import SeriesPlan, bounded
-from fhash_codec.compact.tiles.blocks import fits_memory
+from fhash_codec.compact.tiles import fits_memory
+from fhash_codec.comparison import report
 from fhash_codec.config import EncodeConfig
-from fhash_codec.container_name import check_name
-from fhash_codec.coreset.features import InTime, parse_feature
-from fhash_codec.coreset.lazy import LazyFrames
-from fhash_codec.coreset.scan import Scan, SpanScan
-from fhash_codec.coreset.selection import Source, mask_files, open_source
-from fhash_codec.measure.ranks import Ranks
-from fhash_codec.progress import Progress, silent
-from fhash_codec.report import report
-from fhash_codec.stage_clock import recording, stage
+from fhash_codec.features.features import InTime, parse_feature
+from fhash_codec.features.scan import Scan, SpanScan
+from fhash_codec.features.selection import LazyFrames, Source, mask_files, open_source
+from fhash_codec.header import check_name
+from fhash_codec.measure.value_range import Ranks
+from fhash_codec.progress import Progress, recording, silent, stage
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import ClusterError, InputError
 from fhash_formats.series import Series
-from fhash_formats.support import leftovers
-from fhash_formats.support.atomic import check_output, explained
-from fhash_formats.support.locations import local_path
+from fhash_formats.support import files as leftovers
+from fhash_formats.support.files import check_output, explained, local_path
 from fhash_formats.support.threads import at_most
 
 __all__ = ["HeldSteps", "encode_on_cluster"]

@@ -1,27 +1,273 @@
-"""`GrowingFile`: a compact file that gets layer after layer, and is complete after each."""
+"""Growing containers: figures, open layers, and how work is taken up after a stop."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from fhash_codec.appending.figures import Figures
-from fhash_codec.appending.layers import CodedLayer, LayerCoder
-from fhash_codec.header import write_coordinates
-from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import StoredArray, describe_coordinates
-from fhash_formats.container.coding import transform_codecs
+from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.tiles import Coding, Tile, code
+from fhash_codec.config import EncodeConfig
+from fhash_codec.header import brief_quality, full_header, write_coordinates
+from fhash_codec.measure.errors import Values, error_sums, psnr
+from fhash_codec.measure.value_range import ValueRange, power_of_two
+from fhash_formats.container import (
+    SOURCE,
+    Container,
+    ContainerWriter,
+    StoredArray,
+    describe_coordinates,
+)
+from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
-from fhash_formats.container.header import NOT_STORED, TABLE
+from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, STEPS, TABLE
+from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, MAX_SPANS, Coordinate, NotStored
+from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
+from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
+from fhash_formats.support.values import exact_number, is_within
+from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.encoding import TRELLIS_WEIGHT, WEIGHT, CodedTile
+from fhash_formats.transform.tile_format import TileSettings
 
-__all__ = ["GrowingFile"]
+ROUNDED_ONCE = 1 - 1e-12
+"""Factor of a figure that was rounded up to some decimals, so that it is not once more.
+
+Its float may lie above the decimal number.
+"""
+
+
+class StepErrors(NamedTuple):
+    """Errors of one step, scaled by the power of two of its `Figures`."""
+
+    number: int
+    """Number of values."""
+    squares: float
+    """Sum of the squared errors."""
+    largest: float
+    """Largest absolute error."""
+
+
+class Figures:
+    """Errors of the steps of a file so far.
+
+    Attributes:
+        scale: power of two by which errors are multiplied before they are squared.
+        steps: errors of each step.
+    """
+
+    def __init__(self, scale: float, steps: Sequence[StepErrors] = ()) -> None:
+        self.scale = scale
+        self.steps = list(steps)
+
+    @staticmethod
+    def scale_of(value_range: ValueRange) -> float:
+        """The power of two by which errors of values of a range are scaled."""
+        width = value_range.high - value_range.low
+        return power_of_two(width if width > 0 else max(abs(value_range.high), 1.0))
+
+    @classmethod
+    def of_header(cls, header: Mapping[str, Any], scale: float) -> Figures:
+        """The errors that a full header (`full_header`) tells, rounded to the worse side.
+
+        Raises InputError for a file that does not tell them of each step.
+        """
+        steps, *frame = header["domain"]["shape"]
+        told = header["quality"].get("per_step", [])
+        most = header["quality"].get("max_abs_error")
+        # That of all steps is rounded less: it keeps the promise where those of steps may not.
+        limit = float(most) if isinstance(most, int | float) else math.inf
+        count, errors = math.prod(frame), []
+        for step in range(steps):
+            figures = told[step] if step < len(told) else {}
+            pair: list[Any] = [figures.get(name) for name in ("rmse", "max_abs_error")]
+            if not all(isinstance(one, int | float) and one >= 0 for one in pair):
+                raise InputError(
+                    f"the file does not tell the errors of step {step}, and a longer one could not"
+                )
+            root = float(pair[0]) * ROUNDED_ONCE * scale
+            largest = min(float(pair[1]), limit) * ROUNDED_ONCE * scale
+            errors.append(StepErrors(count, count * root * root, largest))
+        return cls(scale, errors)
+
+    def measure(self, original: Values, decoded: Values) -> StepErrors:
+        """The errors of a decoded frame (z, y, x)."""
+        sums = error_sums(original, decoded, None, self.scale)
+        if sums.number != original.size:
+            raise RuntimeError("a decoded frame has values that are not finite")
+        return StepErrors(sums.number, sums.squares, sums.largest)
+
+    def header(self, writer: ContainerWriter, data_range: float) -> dict[str, Any]:
+        """The header's `quality`.
+
+        Args:
+            writer: of the container; it gets an array for the figures of many steps.
+            data_range: width of the header's value range.
+        """
+        count = sum(step.number for step in self.steps)
+        squares = math.fsum(step.squares for step in self.steps)
+        root = math.sqrt(squares / count)
+        whole = {
+            "psnr": psnr(data_range * self.scale, root),
+            "rmse": self._figure(root),
+            "max_abs_error": self._figure(max(step.largest for step in self.steps)),
+        }
+        per_step = [
+            {
+                "rmse": self._figure(math.sqrt(step.squares / step.number)),
+                "max_abs_error": self._figure(step.largest),
+            }
+            for step in self.steps
+        ]
+        everywhere = {f"{name}_domain": value for name, value in whole.items()}
+        quality: dict[str, Any] = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
+        return brief_quality(writer, quality, data_range, len(self.steps))
+
+    def _figure(self, scaled: float) -> float | None:
+        """A scaled error in data units; None where it is not finite."""
+        with np.errstate(over="ignore"):
+            figure = float(np.float64(scaled) / self.scale)
+        return figure if math.isfinite(figure) else None
+
+
+DECODED_AGAIN = 8
+"""Tiles of which one is decoded from its bytes, as a reader does it."""
+Index = tuple[int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodedLayer:
+    """A layer of tiles, coded.
+
+    Attributes:
+        streams: bytes of each tile, in C order.
+        errors: of each step.
+        nonzero: number of coefficients that are not 0.
+        value_range: of the values, in data units.
+    """
+
+    streams: list[bytes]
+    errors: list[StepErrors]
+    nonzero: int
+    value_range: ValueRange
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerCoder:
+    """Coder of the layers of a file; its tiles keep a strict bound of the error.
+
+    Attributes:
+        tile: shape (t, z, y, x) of a tile.
+        settings: that all tiles share.
+        coding: options of the encoder, the bound among them.
+        dtype: number type of the values.
+    """
+
+    tile: tuple[int, int, int, int]
+    settings: TileSettings
+    coding: Coding
+    dtype: np.dtype[Any]
+
+    def code(
+        self, frames: Sequence[npt.NDArray[Any]], figures: Figures, workers: ThreadPoolExecutor
+    ) -> CodedLayer:
+        """Code some steps, at most those of a tile; a shorter layer is padded by its last step.
+
+        frames: finite values (z, y, x) of each step. figures: measures the errors.
+        """
+        values = np.stack(frames)
+        decoded = np.empty_like(values)
+        grid = [-(-n // length) for n, length in zip(values.shape[1:], self.tile[1:], strict=True)]
+        streams, nonzero = [], 0
+        indices: list[Index] = [(z, y, x) for z, y, x in product(*map(range, grid))]
+        tiles = (self._tile(values, index) for index in indices)
+        coded = map_ahead(workers, self._code, enumerate(tiles), 2 * usable_threads())
+        for index, tile in zip(indices, coded, strict=True):
+            region = chunk_region(index, self.tile[1:], values.shape[1:])
+            part = decoded[(slice(None), *region)]
+            part[...] = tile.decoded[tuple(slice(0, n) for n in part.shape)]
+            streams.append(tile.data)
+            nonzero += tile.nonzero
+        errors = [figures.measure(*pair) for pair in zip(values, decoded, strict=True)]
+        value_range = ValueRange(*_ends(values))
+        return CodedLayer(streams=streams, errors=errors, nonzero=nonzero, value_range=value_range)
+
+    def _tile(self, values: npt.NDArray[Any], index: Index) -> Tile:
+        """A tile of a layer; beyond the end of an axis border values are repeated and not counted.
+
+        As `Blocks.read` makes it.
+        """
+        region = (slice(None), *chunk_region(index, self.tile[1:], values.shape[1:]))
+        part = values[region]
+        padding = [(0, n - m) for n, m in zip(self.tile, part.shape, strict=True)]
+        if not any(after for _, after in padding):
+            return Tile(np.ascontiguousarray(part), None)
+        counted = np.pad(np.ones(part.shape, bool), padding)
+        return Tile(np.pad(part, padding, mode="edge"), counted)
+
+    def _code(self, job: tuple[int, Tile]) -> CodedTile:
+        """Code a tile, by settings of its own where its values leave the range of the shared ones.
+
+        The bound holds either way. The shared ones clip such values, and the residual then has to
+        bring them back; of the two codings the one with fewer bytes is taken.
+        """
+        number, tile = job
+        own = replace(self.coding, own_settings=True)
+        trials = [(code(tile, other, own)[0], other) for other in self._wider(tile)]
+        if not self._is_far(tile):
+            trials.insert(0, (code(tile, self.settings, self.coding)[0], self.settings))
+        coded, settings = min(trials, key=lambda trial: len(trial[0].data))
+        if number % DECODED_AGAIN == 0:
+            again = decode_tile(coded.data, self.tile, self.dtype, settings)
+            if not np.array_equal(again, coded.decoded):
+                raise RuntimeError(f"tile {number} decodes to other values than its encoder found")
+        return coded
+
+    def _is_far(self, tile: Tile) -> bool:
+        """Whether the differences from the origin that tiles share are beyond int64."""
+        origin = self.settings.origin
+        return origin != 0 and not all(
+            is_within(int(end) - origin, np.dtype(np.int64)) for end in _ends(tile.values)
+        )
+
+    def _wider(self, tile: Tile) -> Iterator[TileSettings]:
+        """Yield settings with a wider range for a tile whose values leave that of the file."""
+        shared = self.settings
+        ends = ValueRange(*_ends(tile.values))
+        low, high = ends.moved(-shared.origin).ends
+        if self._is_far(tile):
+            origin = ends.origin(self.dtype)
+            low, high = ends.moved(-origin).ends
+            wider = replace(shared, origin=origin, center=0.0, low=low, high=high)
+            yield replace(wider, double=True, head=None, predictor=None)
+            return
+        if self.coding.exact or (shared.low <= low and high <= shared.high):
+            return
+        yield replace(
+            shared,
+            low=min(low, shared.low),
+            high=max(high, shared.high),
+            head=None,
+            predictor=None,
+            clip=False,
+        )
+
+
+def _ends(values: npt.NDArray[Any]) -> tuple[float, float]:
+    """The least and the greatest of finite values, exactly."""
+    return exact_number(values.min().item()), exact_number(values.max().item())
+
 
 MAX_STEPS = 1 << 20
 """Steps of a growing file: its header tells the errors of each, and has at most 16 MiB."""
@@ -195,3 +441,186 @@ class GrowingFile:
             },
             "quality": self.figures.header(self._container, self._range.high - self._range.low),
         }
+
+
+@contextmanager
+def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
+    """The file `path` for further layers; it stays as it is until the first one is added.
+
+    steps: number of its steps to keep; all if None.
+
+    Raises InputError for a file that cannot be continued or does not end with a whole layer,
+    MissingInputError and DamagedFileError as `Container.open`.
+    """
+    state = os.stat(path) if path.exists() else None
+    with Container.open(path) as container:
+        assert state is not None
+        if container.variables:
+            raise InputError(f"{path} has several variables; only a file of one can grow")
+        header = full_header(container.header, container.arrays)
+        settings = _settings(container, header)
+        kept = _kept_steps(container, steps)
+        value_range = ValueRange(*header["value_range"])
+        growing = GrowingFile(
+            path,
+            _coder(container.arrays[TABLE], settings, header, value_range),
+            _lasting(header) | {"history": container.header["history"]},
+            {axis: container.coordinate(stored) for axis, stored in AXIS_NAMES.items()},
+            _figures(path, header, value_range, kept),
+            continues=state,
+        )
+        with growing:
+            _keep(growing, container, kept, value_range)
+            yield growing
+
+
+def bound_of_file(header: Mapping[str, Any]) -> float | None:
+    """The strict bound of the error that a full header promises, in data units; None without."""
+    config = header["config"]
+    low, high = header["value_range"]
+    if isinstance(config.get("max_error"), int | float):
+        return float(config["max_error"])
+    if isinstance(config.get("max_error_rel"), int | float):
+        return float(config["max_error_rel"]) * float(high - low)
+    return None
+
+
+def _settings(container: Container, header: Mapping[str, Any]) -> TileSettings:
+    """The settings that all tiles share; raises InputError for a file that cannot grow."""
+    path, model = container.path, header["model"]
+    if model["profile"] != COMPACT or PLAIN_FEATURE in header["required_features"]:
+        kind = "plain" if PLAIN_FEATURE in header["required_features"] else model["profile"]
+        raise InputError(f"{path} is a {kind} file; only files of the profile compact can grow")
+    table = container.arrays.get(TABLE)
+    settings = None if table is None else table.settings
+    if table is None or not isinstance(settings, TileSettings):
+        raise InputError(f"{path}: its tiles share no settings, by which more could be coded")
+    steps, *frame = header["domain"]["shape"]
+    box = [[0, n] for n in frame]
+    gaps = table.masked or header["coreset_fraction"] != 1 or "missing/bits" in container.arrays
+    if gaps or header["feature_bounding_box"] != box or table.shape != (steps, *frame):
+        raise InputError(
+            f"{path} keeps features or has missing values or key frames; only a file that keeps "
+            "every vertex of every step can grow"
+        )
+    if bound_of_file(header) is None:
+        raise InputError(
+            f"{path} does not promise a bound of the error, which alone can be kept for steps that "
+            "come later; encode it with --max-error or --max-error-rel"
+        )
+    return settings
+
+
+def _kept_steps(container: Container, steps: int | None) -> int:
+    """The number of steps to keep; raises InputError unless they are whole layers."""
+    path, table = container.path, container.arrays[TABLE]
+    there, layer = table.shape[0], table.chunk_shape[0]
+    kept = there if steps is None else steps
+    if kept > there or kept < 1:
+        raise InputError(f"{path}: {kept} steps are to be kept; it has {there}")
+    if kept % layer:
+        whole = kept // layer * layer
+        fewer = f"keep {whole} steps and append the others again, or " if whole else ""
+        raise InputError(
+            f"{path}: step {kept} lies within a layer of {layer} steps that are coded together, "
+            f"and coding some of them twice would add up errors; {fewer}begin another file"
+        )
+    return kept
+
+
+def _coder(
+    table: StoredArray, settings: TileSettings, header: Mapping[str, Any], value_range: ValueRange
+) -> LayerCoder:
+    """The coder of further layers: options of the encoder as the file's effort asks for."""
+    effort = header["config"].get("effort")
+    config = EncodeConfig(max_error=bound_of_file(header))
+    goal = goal_of(config, value_range, 1, 0, integers=table.dtype.kind in "iu")
+    coding = Coding(
+        weight=TRELLIS_WEIGHT if settings.trellis else WEIGHT,
+        filled=True,
+        density=0,
+        passes=1 if effort in (1, 2) else 2,
+        rounds=0 if effort == 1 else 2,
+    )
+    t, z, y, x = table.chunk_shape
+    return LayerCoder(
+        tile=(t, z, y, x), settings=settings, coding=goal.bounded(coding), dtype=table.dtype
+    )
+
+
+def _lasting(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of a full header that stay the same while the file grows."""
+    encoder = {name: header["encoder"][name] for name in ("version", "seed")}
+    model = {name: value for name, value in header["model"].items() if name != "tiling"}
+    config = {**header["config"], "max_error": bound_of_file(header), "max_error_rel": None}
+    return {
+        **header,
+        **({SOURCE: _lasting_source(header[SOURCE])} if SOURCE in header else {}),
+        "encoder": encoder,
+        "model": {**model, "gains": []},
+        "config": config,
+    }
+
+
+def _lasting_source(source: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry of the source without what is true of the first steps alone."""
+    lasting = {name: value for name, value in source.items() if name not in ("digest", "date")}
+    # Later times may need every bit of float64.
+    lasting["variables"] = [
+        {key: value for key, value in one.items() if key != "dtype" or one.get("axis") != "t"}
+        for one in source.get("variables", [])
+    ]
+    return lasting
+
+
+def _figures(path: Path, header: Mapping[str, Any], value_range: ValueRange, kept: int) -> Figures:
+    """The errors of the steps that are kept."""
+    try:
+        figures = Figures.of_header(header, Figures.scale_of(value_range))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    del figures.steps[kept:]
+    return figures
+
+
+def _keep(growing: GrowingFile, container: Container, kept: int, value_range: ValueRange) -> None:
+    """Write what is kept of a file: arrays that do not depend on time, and layers of tiles."""
+    for name, array in container.arrays.items():
+        if name in (TABLE, STEPS) or name.startswith("coords/"):
+            continue
+        if _follows_time(array, container):
+            raise InputError(
+                f"{container.path}: array {name} has a value for each step; a file with such "
+                "arrays cannot grow"
+            )
+        growing.carry(name, array)
+    for one in container.header.get(SOURCE, {}).get("variables", []):
+        if "axis" not in one and container.coordinate("time").name in one.get("dimensions", []):
+            raise InputError(
+                f"{container.path}: {one['name']} of its source has a value for each step; a file "
+                "with such arrays cannot grow"
+            )
+    table = container.arrays[TABLE]
+    times = container.coordinate("time").values
+    layer = table.chunk_shape[0]
+    told = container.header["model"]["parameters"]
+    head = growing.coder.settings.head
+    weights = 0 if head is None else head.size
+    for number in range(kept // layer):
+        first = number * layer
+        tiles = product(*map(range, table.grid[1:]))
+        with damage_named(container.path):
+            streams = [bytes(table.coded((number, *tile))) for tile in tiles]
+        # Where steps are dropped this is a share: the file has one number for all of them.
+        before, after = (max(0, told - weights) * k // table.grid[0] for k in (number, number + 1))
+        span = [float(time) for time in times[first : first + layer]]
+        growing.keep(streams, span, after - before, value_range)
+
+
+def _follows_time(array: StoredArray, container: Container) -> bool:
+    """Whether an array has an axis of steps."""
+    names = {"t", "time", container.coordinate("time").name}
+    named = array.dimension_names or ()
+    return bool(names.intersection(named)) or (
+        not named and container.header["domain"]["shape"][0] in array.shape
+    )

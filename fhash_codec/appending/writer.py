@@ -1,4 +1,4 @@
-"""`Writer`: frames of a running simulation in, a file out that is complete after every layer."""
+"""Writer of a series step by step, and `append`, which continues a file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,22 +16,155 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.figures import Figures
-from fhash_codec.appending.growing import GrowingFile
-from fhash_codec.appending.planning import bound_of, plan_layers
-from fhash_codec.appending.resuming import continued
-from fhash_codec.compact.tiles.tiling import parse_tile
+from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, continued
+from fhash_codec.compact.attempt import parse_tile
+from fhash_codec.compact.encode import training_header
+from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.plan import plan
+from fhash_codec.compact.tiles import Blocks
 from fhash_codec.config import EncodeConfig
-from fhash_codec.container_name import check_name
+from fhash_codec.features.selection import FeatureSelection, Source, open_source, select_features
+from fhash_codec.header import HEAD_POINTS, brief_history, check_name
 from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.progress import Progress, silent
+from fhash_codec.volume import Volume
+from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, check_values, index_coordinate
-from fhash_formats.support.atomic import check_output
-from fhash_formats.support.attributes import json_attributes
-from fhash_formats.support.number_types import exact_number
+from fhash_formats.series import (
+    AXES,
+    AXIS_NAMES,
+    ArraySeries,
+    Coordinate,
+    Series,
+    check_values,
+    index_coordinate,
+)
+from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.support.values import exact_number, json_attributes
 
-__all__ = ["Writer"]
+OVERHEAD_BYTES = 2000
+"""Approximate bytes of a file without its tiles."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrowingPlan:
+    """The decisions that are made on the first steps of a file.
+
+    Attributes:
+        coder: of the layers.
+        header: of the file as far as it stays the same while the file grows.
+    """
+
+    coder: LayerCoder
+    header: dict[str, Any]
+
+
+def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
+    """The strict bound of the error that settings promise, in data units.
+
+    value_range: of the whole run; None if it is not known.
+
+    Raises InputError for settings that a file cannot keep whose later steps are not known yet.
+    """
+    if config.profile != "compact":
+        raise InputError(
+            f"profile '{config.profile}' needs all steps at once; a file that grows is of the "
+            "profile compact"
+        )
+    if config.features != ("all",):
+        raise InputError(
+            f"features {', '.join(config.features)} are given; a file that grows keeps everything "
+            "(feature 'all')"
+        )
+    if config.max_error is not None:
+        return float(config.max_error)
+    if config.max_error_rel is None:
+        raise InputError(
+            "a file that grows promises a bound of the error, which holds step by step: give "
+            "max_error, or max_error_rel with value_range; a PSNR or a ratio depends on steps that "
+            "are yet to come"
+        )
+    if value_range is None:
+        raise InputError(
+            "max_error_rel is a fraction of the range of the whole run, which is not known yet: "
+            "give value_range=(low, high) beside it, or max_error in data units"
+        )
+    return config.max_error_rel * (value_range.high - value_range.low)
+
+
+def plan_layers(
+    frames: Sequence[npt.NDArray[Any]],
+    config: EncodeConfig,
+    bound: float,
+    value_range: ValueRange | None,
+) -> GrowingPlan:
+    """Choose tiles and settings on the first steps.
+
+    frames: finite values (z, y, x) of each step. bound: of the error, in data units.
+    value_range: that is expected of the whole run; that of the frames if None.
+
+    Raises InputError for a tile that cannot be had.
+    """
+    series = ArraySeries(np.stack(frames))
+    series.keep_extremes = True  # values of a simulation are data
+    promised = replace(config, max_error=bound, max_error_rel=None, timings=False)
+    selection = select_features(series, promised, silent)
+    whole = _joined(selection.scanned.value_range, value_range)
+    origin = whole.origin(series.dtype)
+    expected = whole.moved(-origin)
+    raw_bytes = prod(series.shape) * series.dtype.itemsize
+    integers = series.dtype.kind in "iu"
+    goal = goal_of(promised, expected, raw_bytes, OVERHEAD_BYTES, integers=integers)
+    with thread_pool() as workers:
+        found = plan(
+            Blocks(series, selection.extent, series.shape, origin),
+            expected,
+            promised,
+            goal,
+            OVERHEAD_BYTES,
+            workers,
+            silent,
+            selection.features,
+        )
+    coder = LayerCoder(
+        tile=found.blocks.tile,
+        settings=replace(found.settings, origin=origin),
+        coding=found.coding,
+        dtype=found.blocks.source_dtype,
+    )
+    header = _header(selection, promised, coder)
+    header["training"] = training_header(found.history, timings=False)
+    header["history"] = brief_history(found.history, timings=False, most=HEAD_POINTS)
+    return GrowingPlan(coder=coder, header=header)
+
+
+def _joined(first: ValueRange, second: ValueRange | None) -> ValueRange:
+    if second is None:
+        return first
+    return ValueRange(min(first.low, second.low), max(first.high, second.high))
+
+
+def _header(selection: FeatureSelection, config: EncodeConfig, coder: LayerCoder) -> dict[str, Any]:
+    """The header's entries that the first steps decide."""
+    head, extent = coder.settings.head, selection.extent
+    return {
+        "encoder": {"version": version("fhash"), "seed": config.seed},
+        "background": extent.background,
+        "feature_bounding_box": [list(span) for span in extent.box],
+        "features": [str(feature) for feature in selection.features],
+        "dilation": config.dilation,
+        "coreset_fraction": 1.0,
+        "model": {
+            "profile": "compact",
+            "embedding_size": 1,
+            "tables": coder.dtype.name,
+            "head": None if head is None else {"hidden": list(head.hidden), "cross": head.cross},
+            "gains": [],
+        },
+        "config": config.to_dict(),
+    }
+
 
 WINDOW_STEPS = 8
 """Steps on which tiles and settings are chosen where the tile does not say how many."""
@@ -346,3 +481,109 @@ def _positions(
                 attributes=json_attributes(attributes, without=frozenset()),
             )
     return result
+
+
+def append(
+    source: Source, path: str | Path, *, keep: int | None = None, progress: Progress = silent
+) -> dict[str, Any]:
+    """Append the steps of a series to the file `path`, in its tiles, settings and bound.
+
+    source: a file, a Series or an array, as `encode` takes it: of the number type and the shape
+        (z, y, x) of the file, without missing values. Its times follow those of the file; where
+        neither has times, steps are counted on.
+    keep: number of steps of the file to keep, whole layers; all if None.
+
+    Returns path, bytes, steps, and of these kept and appended; psnr, rmse and max_abs_error over
+    all steps. The file is replaced by the longer one at the end, or stays as it was. Raises
+    InputError for a file that cannot grow and for steps that do not fit.
+    """
+    path = Path(path)
+    with open_source(source) as series:
+        with open_volume(path) as volume:
+            _require_same(series, volume)
+        with continued(path, keep) as growing:
+            kept = growing.steps
+            growing.note(series.not_stored, series.shape[0])
+            times = _times(series, growing)
+            _add(series, growing, times, progress)
+            series.check()
+            growing.publish()
+            steps = growing.steps
+    with open_volume(path) as volume:
+        info = volume.info
+        figures = {name: info["quality"].get(name) for name in ("psnr", "rmse", "max_abs_error")}
+    counted = {"steps": steps, "kept": kept, "appended": steps - kept}
+    return {"path": str(path), "bytes": info["bytes"], **counted, **figures}
+
+
+def _add(
+    series: Series, growing: GrowingFile, times: npt.NDArray[np.float64], progress: Progress
+) -> None:
+    """Code all steps of a series, layer by layer."""
+    layer, steps = growing.coder.tile[0], series.shape[0]
+    with thread_pool() as workers:
+        for first in range(0, steps, layer):
+            span = range(first, min(first + layer, steps))
+            frames = [_frame(series, step) for step in span]
+            coded = growing.coder.code(frames, growing.figures, workers)
+            growing.add(coded, times[span.start : span.stop].tolist(), publish=False)
+            progress("appending", span.stop, steps, "")
+
+
+def _frame(series: Series, step: int) -> npt.NDArray[Any]:
+    """A frame; raises InputError for one with missing values."""
+    frame = series.read(step)
+    if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+        raise InputError(
+            f"{series.source}: step {step} has values that are missing or infinite; a file that "
+            "grows has none: encode these data as a file of their own"
+        )
+    return frame
+
+
+def _require_same(series: Series, volume: Volume) -> None:
+    """Raise InputError unless a series is more of what a volume is."""
+    what, path = series.source, volume.path
+    for name, here, there in (
+        ("shape (z, y, x)", series.shape[1:], volume.shape[1:]),
+        ("number type", str(series.source_dtype or series.dtype), volume.info["variable"]["dtype"]),
+    ):
+        if here != there:
+            raise InputError(f"{what} has {name} {here}, {path} has {there}; they must be the same")
+    if series.units and volume.units and series.units != volume.units:
+        raise InputError(f"{what} is in {series.units}, {path} in {volume.units}; convert one")
+    for axis in AXES[1:]:
+        these, those = series.coords[axis].values, volume.coords[axis].values
+        if not np.array_equal(these, those) and not _is_index(these):
+            raise InputError(
+                f"{what} has positions {these[0]:.9g} to {these[-1]:.9g} along {axis}, {path} has "
+                f"{those[0]:.9g} to {those[-1]:.9g}; they must be the same"
+            )
+    units = series.coords["t"].attributes.get("units")
+    other = volume.coords["t"].attributes.get("units")
+    if units is not None and other is not None and units != other:
+        raise InputError(f"times of {what} are in '{units}', those of {path} in '{other}'")
+
+
+def _times(series: Series, growing: GrowingFile) -> npt.NDArray[np.float64]:
+    """The times of the steps to append; raises InputError unless they follow those of the file."""
+    times, before = series.coords["t"].values, growing.times
+    if _is_index(times) and _is_index(np.array(before)):
+        return times + len(before)
+    _require_ascending(series.source, [*before[-1:], *times.tolist()], bool(before))
+    return times
+
+
+def _require_ascending(what: str, times: list[float], follows: bool) -> None:
+    if follows and not times[1] > times[0]:
+        raise InputError(
+            f"{what} begins at time {times[1]:.9g}, and the file ends at {times[0]:.9g}; keep "
+            "fewer steps of the file, or select later ones of the data"
+        )
+    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+        raise InputError(f"{what}: its times must be finite and ascend")
+
+
+def _is_index(positions: npt.NDArray[np.float64]) -> bool:
+    """Whether positions are those of an axis without any: counted from 0."""
+    return np.array_equal(positions, np.arange(positions.size))

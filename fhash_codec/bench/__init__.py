@@ -1,4 +1,4 @@
 """Measurements that stay in the product."""
 
 # `train` imports torch at once; how torch's threads wait must be set before.
-import fhash_codec.training.threads  # noqa: F401
+import fhash_codec.devices  # noqa: F401

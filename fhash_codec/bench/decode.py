@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.network import Layer, Network
-from fhash_codec.paper.points import decode_region
+from fhash_codec.boxes import Box
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.features.occupancy import unpack
+from fhash_codec.paper.model import decode_region
+from fhash_codec.paper.network import Architecture, Layer, Network
 
 __all__ = ["bench_decode"]
 

@@ -16,7 +16,7 @@ import fhash_codec
 from fhash_codec.bench.label_kinds import KINDS
 from fhash_codec.bench.machine import machine
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashError, InputError

@@ -1,25 +1,344 @@
-"""Records that the stages of planning hand on: what is planned, and the best attempt so far."""
+"""Shapes of tiles, the price of access to regions, and attempts at a plan."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import product
+from math import prod
 from typing import Any
 
-from fhash_codec.compact.choices.head import HeadHistory
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.access import Tiling
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.compact.tiles.sample import Sample
+from fhash_codec.compact.head import HeadHistory
+from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.features import Feature
+from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Parts
-from fhash_formats.transform.tile.sections import Shape
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.errors import InputError
+from fhash_formats.transform.stream import MAX_TILE_VERTICES
+from fhash_formats.transform.tile_format import Shape, TileSettings
+
+TILE_VERTICES = 1 << 19
+"""Vertices of the tiles for a first look, at most."""
+MAX_VERTICES = 4 << 20
+"""Vertices of a tile at most, unless it is asked for or is the whole series.
+
+Several tiles are in memory at a time, each of them several times over.
+"""
+FIRST_STEPS = 8
+"""Time steps of the tiles for a first look."""
+MIN_LENGTH = 24
+"""Vertices along a space axis below which the axis is not cut further."""
+PRICE_OF_PADDING = 3.0
+"""Price of vertices beyond the border, per share of all vertices."""
+PRICE_OF_MORE = 0.3
+"""Price of more tiles than asked for, per factor of e."""
+PRICE_OF_FEWER = 0.05
+"""Price of fewer tiles than asked for, per factor of e."""
+PRICE_OF_SHORT = 0.1
+"""Price of each space axis that is cut into parts shorter than MIN_LENGTH."""
+
+
+def parse_tile(text: str, shape: Shape) -> Shape | None:
+    """Return the shape that a setting names, cut to the series; None for 'auto'.
+
+    Raises InputError for another text and for a tile that is too large to decode.
+    """
+    if text == "auto":
+        return None
+    if text == "whole":
+        return _check_size(text, shape)
+    try:
+        numbers = [int(number) for number in text.split("x")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4 or min(numbers) < 1:
+        raise InputError(
+            f"tile is '{text}'; allowed: auto, whole, or four whole numbers as in 4x32x32x32"
+            " (t, z, y, x)"
+        )
+    t, z, y, x = (min(n, length) for n, length in zip(numbers, shape, strict=True))
+    return _check_size(text, (t, z, y, x))
+
+
+def _check_size(text: str, tile: Shape) -> Shape:
+    if prod(tile) > MAX_TILE_VERTICES:
+        raise InputError(
+            f"tile '{text}' has {prod(tile):,} vertices; at most {MAX_TILE_VERTICES:,} are decoded"
+            " together; name another"
+        )
+    return tile
+
+
+def even_tile(shape: Shape, tiles: int, steps: int) -> Shape:
+    """Return a tile of about `steps` steps, so that about `tiles` tiles make up a shape.
+
+    Space is cut along its longest axis. The number of parts along each axis may then change by
+    one, so that few vertices lie beyond the border, since those have to be coded, too.
+    """
+    parts_asked = [-(-shape[0] // steps), 1, 1, 1]
+    while prod(parts_asked) < tiles:
+        lengths = [-(-n // p) for n, p in zip(shape, parts_asked, strict=True)]
+        axis = max((1, 2, 3), key=lambda a: (lengths[a], a))
+        if lengths[axis] < MIN_LENGTH:
+            break
+        parts_asked[axis] += 1
+    lowest_price, best_tile = math.inf, shape
+    for change in product((0, -1, 1), repeat=4):
+        parts = [min(max(p + c, 1), n) for p, c, n in zip(parts_asked, change, shape, strict=True)]
+        tile = _tile_of(shape, parts)
+        price = _price(shape, tile, parts, prod(parts_asked), steps)
+        if price < lowest_price - 1e-9:
+            lowest_price, best_tile = price, tile
+    return best_tile
+
+
+def _tile_of(shape: Shape, parts: list[int]) -> Shape:
+    """Return the tile that cuts each axis into a number of parts."""
+    t, *space = (-(-n // p) for n, p in zip(shape, parts, strict=True))
+    # Even lengths keep the vertices of the first coarse level on one lattice.
+    z, y, x = (n if p == 1 else n + n % 2 for n, p in zip(space, parts[1:], strict=True))
+    return t, z, y, x
+
+
+def _price(shape: Shape, tile: Shape, parts: list[int], tiles: int, steps: int) -> float:
+    """Return the price of a tile where `tiles` tiles of `steps` steps are asked for.
+
+    Infinite for tiles that are too long, too large, or too many or too few.
+    """
+    count = prod(-(-n // length) for n, length in zip(shape, tile, strict=True))
+    more = math.log(count / tiles)
+    if (
+        tile[0] > max(steps * 1.5, 1)
+        or not 0.4 <= count / tiles <= 1.5
+        or (more < 0 and prod(tile) > MAX_VERTICES)
+    ):
+        return math.inf
+    padding = count * prod(tile) / prod(shape) - 1
+    short = sum(
+        p > 1 and length < MIN_LENGTH for p, length in zip(parts[1:], tile[1:], strict=True)
+    )
+    return (
+        PRICE_OF_PADDING * padding
+        + PRICE_OF_SHORT * short
+        + (PRICE_OF_MORE * more if more > 0 else -PRICE_OF_FEWER * more)
+    )
+
+
+def first_tile(shape: Shape) -> Shape:
+    """Return the tile for a first look at a series."""
+    return even_tile(shape, max(1, prod(shape) // TILE_VERTICES), min(shape[0], FIRST_STEPS))
+
+
+MAX_WHOLE_VERTICES = 12 << 20
+"""Vertices of a series up to which it may be one tile: a larger one takes long to decode."""
+
+PRICES = {"fast": 1.5, "balanced": 1.1, "small": 1.0}
+"""Bytes that tiles may take, as a multiple of those of the best tiling, by the wish for access."""
+MARGIN = 0.06
+"""Part of an allowed price that no trial may take.
+
+Prices of whole files were up to 0.09 above those of the trials (turbulence within 1 %), and 0.05 in
+most of the worst cases.
+"""
+MARGIN_FORETOLD = 0.035
+"""Part of an allowed price that no foretold one may take, which is too high rather than too low."""
+WORTH = {"fast": 1.0, "balanced": 0.01, "small": 0.0}
+"""Share of the bytes that half the work for a region is worth, by the wish for access."""
+REGION = 16
+"""Vertices of a region along each axis in space; it is of one step."""
+FAST_ENOUGH = 1 << 16
+"""Vertices that decode in a moment, so that nothing smaller is worth any bytes."""
+LENGTHS = (1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)
+"""Lengths in steps that tiles are tried at, approximately."""
+EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
+"""Edges in space in vertices that tiles are tried at, approximately."""
+SHORTEST = 8
+"""Vertices of a tile along the longest axis in space, at least, where it alone is cut."""
+CUT_IN_SPACE = 6.0
+"""Share of the bytes that a cut across space costs, times the vertices between such cuts.
+
+The most that was found on series of many kinds where nothing is tried (effort 1).
+"""
+CUT_IN_TIME = 10.0
+"""The same of a cut in time, by steps."""
+BYTES_OF_TILE = 100
+"""Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TilingTrial:
+    """A tiling that was tried, or the one that was taken without."""
+
+    tile: Shape
+    size: float
+    """Bytes that the tiles take, at the quality of the first trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiling:
+    """The chosen tiles, and what was tried."""
+
+    tile: Shape
+    price: float | None
+    """Bytes as a multiple of those of the best tiling; foretold where none was tried, and None for
+    tiles that were asked for."""
+    trials: list[TilingTrial] = field(default_factory=list)
+    parts: list[Shape] = field(default_factory=list)
+    """Shapes of the parts that the tilings were tried on; none for the whole series."""
+
+    @property
+    def best(self) -> Shape | None:
+        """Tile of the fewest bytes of those tried."""
+        return min(self.trials, key=lambda trial: trial.size).tile if self.trials else None
+
+    def describe(self) -> str:
+        """Return the tilings that were tried, with their prices, as one line."""
+        if not self.trials:
+            return f"foretold: {self.price:.2f} times the bytes of one tile"
+        least = min(trial.size for trial in self.trials)
+        told = ", ".join(
+            f"{' x '.join(map(str, trial.tile))} at {trial.size / least:.2f}"
+            for trial in self.trials
+        )
+        parts = " and ".join(" x ".join(map(str, part)) for part in self.parts)
+        return f"tried {told}{f', on parts of {parts} vertices' if parts else ''}"
+
+
+def region_vertices(shape: Shape, tile: Shape, region: int = REGION) -> float:
+    """Return the vertices that a reader decodes for a region of one step, in the mean.
+
+    shape: of the box over all steps.
+    tile: of a tile.
+    region: vertices of the region along each axis in space.
+    """
+    mean = 1.0
+    for axis, (length, n) in enumerate(zip(shape, tile, strict=True)):
+        span = 1 if axis == 0 else min(region, length)
+        mean *= n if n >= length else n + span - 1
+    return mean
+
+
+def burden(access: str, price: float, work: float) -> float:
+    """Return what tiles cost in bytes and in work for a region together, as a logarithm.
+
+    access: the wish, a name of `WORTH`.
+    price: bytes as a multiple of those of the best tiling.
+    work: vertices that are decoded for a region.
+    """
+    return math.log(price) + WORTH[access] * math.log2(work)
+
+
+def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> list[Shape]:
+    """Return tiles of at most some vertices, those of the fastest region first.
+
+    Axes in space are cut into parts of about one edge, time into parts of about one length. Of the
+    tiles whose regions take no more than FAST_ENOUGH vertices, only the one of the slowest is
+    among them.
+
+    slabs: whether there are also tiles with cuts across the longest axes in space alone: where all
+        of space is too much, these have the fewest cuts.
+    """
+    lengths = {_part(shape[0], length, even=False) for length in (shape[0], *LENGTHS)}
+    spaces = {
+        (_part(z, edge), _part(y, edge), _part(x, edge))
+        for z, y, x in [shape[1:]]
+        for edge in (max(shape[1:]), *EDGES)
+    }
+    if slabs:
+        spaces |= {slab for space in spaces for slab in _slabs(shape, space)}
+    tiles: list[Shape] = [(t, *space) for t in lengths for space in spaces]
+    if slabs:
+        tiles += [tile for t in lengths for tile in _largest_slabs(shape, t, max_vertices)]
+    tiles = [tile for tile in tiles if prod(tile) <= max_vertices]
+    tiles = sorted(set(tiles), key=lambda tile: (region_vertices(shape, tile), tile))
+    fast = sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles)
+    return tiles[max(fast - 1, 0) :]
+
+
+def _slabs(shape: Shape, space: tuple[int, int, int]) -> list[tuple[int, int, int]]:
+    """Return parts of space with the cuts of one part across the one or two longest axes alone."""
+    longest = sorted(range(3), key=lambda axis: (shape[1 + axis], axis), reverse=True)
+    slabs = []
+    for cut in (longest[:1], longest[:2]):
+        z, y, x = (space[axis] if axis in cut else shape[1 + axis] for axis in range(3))
+        slabs.append((z, y, x))
+    return slabs
+
+
+def _largest_slabs(shape: Shape, steps: int, max_vertices: int) -> list[Shape]:
+    """Return tiles of some steps with cuts across the longest axis in space alone.
+
+    They are as large as they may be.
+    """
+    across = max((1, 2, 3), key=lambda axis: (shape[axis], axis))
+    most = max_vertices * shape[across] // (steps * prod(shape[1:]))
+    if not SHORTEST <= most < shape[across]:
+        return []
+    tile = [steps, *shape[1:]]
+    parts = -(-shape[across] // (most - most % 2))
+    tile[across] = _part(shape[across], -(-shape[across] // parts))
+    t, z, y, x = tile
+    return [(t, z, y, x)]
+
+
+def part_of(tile: Shape, vertices: int) -> Shape:
+    """Return the lengths of a part of a tile: x and y are shortened first, to 8 at least."""
+    lengths = list(tile)
+    for axis in (3, 2, 1, 0):
+        while prod(lengths) > vertices and lengths[axis] > 8:
+            lengths[axis] = max(8, lengths[axis] // 2)
+            other = {3: 2, 2: 3}.get(axis)
+            if other is not None and prod(lengths) > vertices and lengths[other] > lengths[axis]:
+                lengths[other] = max(8, lengths[other] // 2)
+    t, z, y, x = lengths
+    return t, z, y, x
+
+
+def _part(length: int, edge: int, *, even: bool = True) -> int:
+    """Return the length of equal parts of about `edge`; even, where there are several."""
+    parts = max(1, math.floor(length / edge + 0.5)) if even else -(-length // edge)
+    part = -(-length // parts)
+    # Even lengths keep the vertices of the first coarse level on one lattice.
+    return part + part % 2 if even and parts > 1 else part
+
+
+def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
+    """Return the price of tiles that nothing was tried for: the most that is likely.
+
+    size: bytes of the series as one tile.
+    """
+    cuts = CUT_IN_TIME * (1 / tile[0] - 1 / shape[0])
+    cuts += CUT_IN_SPACE * sum(
+        1 / n - 1 / length for length, n in zip(shape[1:], tile[1:], strict=True) if n < length
+    )
+    count = prod(-(-length // n) for length, n in zip(shape, tile, strict=True))
+    return 1 + cuts + BYTES_OF_TILE * (count - 1) / max(size, 1.0)
+
+
+def cheap_tiling(shape: Shape, size: float, access: str) -> Tiling:
+    """Return the tiles of the fastest region whose foretold price is allowed.
+
+    Foretold prices are too rough to say which tiles are best.
+
+    size: bytes of the series, roughly.
+    access: the wish, a name of `PRICES`.
+    """
+    may_be_one = prod(shape) <= MAX_WHOLE_VERTICES
+    tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES if may_be_one else MAX_VERTICES)
+    prices = [foretold_price(shape, tile, size) for tile in tiles]
+    # The best tiling of a long series is no single tile.
+    lowest = min(prices)
+    allowed = max(PRICES[access] - MARGIN_FORETOLD, 1.0)
+    for tile, told in zip(tiles, prices, strict=True):
+        if told <= allowed * lowest:
+            return Tiling(tile=tile, price=told / lowest)
+    raise AssertionError("the lowest price is allowed")
 
 
 class GainLog:

@@ -1,15 +1,150 @@
-"""The promise of quality that the compact profile keeps."""
+"""Goals of an encode, the search for the coarsest setting that keeps one, and what is promised."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
-from fhash_codec.compact.tiles.coding import BulkPart, Coding
+from fhash_codec.compact.tiles import BulkPart, Coding
 from fhash_codec.config import PROMISES, EncodeConfig
-from fhash_codec.measure.bulk import is_wide, whole_psnr
+from fhash_codec.measure.errors import is_wide, whole_psnr
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
+
+Result = TypeVar("Result")
+
+SLOPE = 5.5
+"""dB by which the PSNR falls when the step grows by a factor of e: the first assumption."""
+MIN_SLOPE = 2.0
+"""Smallest such slope (dB per factor of e) that is believed."""
+MAX_SLOPE = 12.0
+"""Largest such slope (dB per factor of e) that is believed."""
+MIN_APART = 1e-9
+"""Smallest difference of two log steps from which a slope is taken."""
+EXCHANGE = 4.5
+"""dB that an octave of bytes buys, where no search says it better."""
+MIN_LOSS = 0.02
+"""Smallest difference in dB of two outcomes from which their exchange rate is taken."""
+
+
+def secant(points: Sequence[tuple[float, float]], target: float, slope: float) -> float:
+    """Return the log step at which a PSNR should be reached, by the last two points.
+
+    points: pairs (log step, PSNR in dB) that were tried, at least one.
+    target: the PSNR in dB.
+    slope: dB by which the PSNR falls per unit of the log step, for a single point or two points
+        at one place.
+    """
+    log_step, psnr = points[-1]
+    if len(points) > 1 and abs(points[-2][0] - log_step) > MIN_APART:
+        slope = min(max(-(psnr - points[-2][1]) / (log_step - points[-2][0]), MIN_SLOPE), MAX_SLOPE)
+    return log_step + (psnr - target) / slope
+
+
+class PsnrSearch:
+    """Search for the quantiser step at which a PSNR is reached, by secants of the log step."""
+
+    def __init__(self, min_step: float, max_step: float) -> None:
+        """Begin a search between two steps."""
+        self._min_step, self._max_step = min_step, max_step
+        self._points: list[tuple[float, float]] = []
+
+    def add(self, step: float, psnr: float) -> None:
+        """Take up a trial: a step and the PSNR in dB that it gave."""
+        self._points.append((math.log(step), psnr))
+
+    def step_for(self, psnr: float) -> float:
+        """Return the step at which a PSNR should be reached; needs at least one trial."""
+        log_step = secant(self._points, psnr, SLOPE)
+        low, high = math.log(self._min_step), math.log(self._max_step)
+        return math.exp(min(max(log_step, low), high))
+
+
+def step_after_gain(step: float, gain: float) -> float:
+    """Return the step whose PSNR is lower by `gain` dB than that of `step`, by the usual slope."""
+    return step * math.exp(gain / SLOPE)
+
+
+def arithmetic_mean(low: float, high: float) -> float:
+    """Return the middle of an interval of logarithms."""
+    return (low + high) / 2
+
+
+def geometric_mean(low: float, high: float) -> float:
+    """Return the middle of an interval of positive numbers on a logarithmic scale."""
+    return math.sqrt(low * high)
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """An interval that holds the number looked for, narrowed by each trial."""
+
+    low: float
+    high: float
+    middle: Callable[[float, float], float]
+    """Mean of the two ends that a bisection goes on with."""
+
+    def narrowed(self, tried: float, *, too_low: bool) -> Bracket:
+        """Return the part of the interval above a number that was too low, or else below it."""
+        if too_low:
+            return replace(self, low=max(self.low, tried))
+        return replace(self, high=min(self.high, tried))
+
+    def inside(self, prediction: float) -> float:
+        """Return a prediction that lies inside the interval, else the middle of the interval."""
+        if self.low < prediction < self.high:
+            return prediction
+        return self.middle(self.low, self.high)
+
+
+def exchange(points: Sequence[tuple[float, float]], usual: float) -> float:
+    """Return the dB that one more octave of bytes buys, by the last points some way apart.
+
+    points: pairs (log2 of the bytes, PSNR in dB) in the order of their trials.
+    usual: the result where no two successive points are apart.
+    """
+    for (size, psnr), (size_before, psnr_before) in zip(points[::-1], points[-2::-1], strict=False):
+        gain = psnr - psnr_before
+        if abs(gain) >= MIN_LOSS and gain * (size - size_before) > 0:
+            return gain / (size - size_before)
+    return usual
+
+
+def cheapest(
+    run: Callable[[Sequence[int]], Sequence[tuple[float, Result] | None]],
+    start: int,
+    last: int,
+    *,
+    strides: Sequence[int],
+) -> Result:
+    """Return the result of the cheapest whole number from 0 to `last`, by descent from `start`.
+
+    run: returns cost and result at each of some numbers; None where there is none (never at
+        `start`).
+    strides: distances to the neighbours that are tried, one after the other.
+    """
+    trials: dict[int, tuple[float, Result] | None] = {}
+    best = start
+
+    def cost(number: int) -> float:
+        trial = trials.get(number)
+        return float("inf") if trial is None else trial[0]
+
+    for stride in strides:
+        while True:
+            neighbours = (best, best + stride, best - stride)
+            new = [number for number in neighbours if number not in trials and 0 <= number <= last]
+            trials.update(zip(new, run(new), strict=True))
+            cheapest_neighbour = min(neighbours, key=cost)
+            if cheapest_neighbour == best:
+                break
+            best = cheapest_neighbour
+    trial = trials[best]
+    assert trial is not None
+    return trial[1]
+
 
 MAX_INTEGER_ERROR = 2.0**40
 """Bound on integers from which on a half more makes no difference."""
@@ -131,3 +266,134 @@ def promise(
     if bulk is None or value_range is None or not is_wide(bulk, value_range):
         return {"psnr": DEFAULT_PSNR}
     return {"psnr": DEFAULT_PSNR, "psnr_bulk": DEFAULT_PSNR_BULK}
+
+
+FAR_BELOW = 15.0
+"""dB by which the PSNR of the bulk may be below that of the whole range without a remark."""
+
+DECIDED = 0.3
+"""dB by which a PSNR must exceed its promise, and the other one may, where that one decided."""
+
+
+def missed_promise(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+    """Text on a promise that a file misses; None if it keeps what the settings promise.
+
+    figures: of the file, as in `report`; `promised` has what its header says was promised.
+    """
+    promised = figures["promised"]
+    return (
+        _missed_bound(config, figures)
+        or _missed_psnr(promised.get("psnr"), figures["psnr"], figures["rmse"], "the coreset")
+        or _missed_bulk(promised.get("psnr_bulk"), figures)
+        or _missed_ratio(config, figures)
+    )
+
+
+def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
+    """Remarks on a file that keeps its promise, for the user, one line each.
+
+    figures: of the file, as in `report`.
+    """
+    bulk = figures["quality"]["bulk"]
+    psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
+    trained = config.profile == "paper" and config.psnr is None
+    if config.psnr_bulk is None and not trained and None not in (psnr, psnr_bulk):
+        enough = min(DEFAULT_PSNR_BULK, psnr - FAR_BELOW)
+        if psnr_bulk < enough:
+            low, high = bulk["range"]
+            yield (
+                f"98 % of the values lie from {low:g} to {high:g}, and have {psnr_bulk:.1f} dB "
+                f"within that range, beside {psnr:.1f} dB within the whole; "
+                f"{_mending(config)} keeps them"
+            )
+    if config.ratio is not None and figures["ratio"] > config.ratio * RATIO_SLACK:
+        why = (
+            "its values are exact already"
+            if figures["rmse"] == 0
+            else "no step of the quantiser comes nearer"
+        )
+        yield (
+            f"the file is {figures['ratio']:.4g} times smaller than the data, "
+            f"{config.ratio:g} times were asked for: {why}"
+        )
+
+
+def decided_by_bulk(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+    """Text on a file that is larger for its bulk's sake; None where that did not decide.
+
+    figures: of the file, as in `report`.
+    """
+    given = [name for name in PROMISES if getattr(config, name) is not None]
+    psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
+    if config.profile != "compact" or None in (psnr, psnr_bulk):
+        return None
+    if given not in ([], ["psnr", "psnr_bulk"]):
+        return None
+    whole = DEFAULT_PSNR if config.psnr is None else config.psnr
+    bulk = DEFAULT_PSNR_BULK if config.psnr_bulk is None else config.psnr_bulk
+    if psnr < whole + DECIDED or psnr_bulk > bulk + DECIDED:
+        return None
+    low, high = figures["quality"]["bulk"]["range"]
+    share = 1 - 2 ** (-(psnr - whole) / EXCHANGE)
+    return (
+        f"the bulk decided: {bulk:g} dB within it, from {low:g} to {high:g}, took {psnr:.1f} dB "
+        f"over all values, where {whole:g} are promised; that is about {share:.0%} of the file, "
+        f"and --psnr {whole:g} alone leaves it out"
+    )
+
+
+def _mending(config: EncodeConfig) -> str:
+    """The option that keeps the bulk, beside the promise or in its place."""
+    option = f"--psnr-bulk {DEFAULT_PSNR_BULK:g}"
+    given = [name for name in PROMISES if getattr(config, name) is not None]
+    if not given:
+        return option
+    name = given[0]
+    relation = "beside" if name == "psnr" else "instead of"
+    return f"{option} {relation} --{name.replace('_', '-')}"
+
+
+def _missed_bound(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+    """Text on an error beyond the promised bound; None if there is no such promise or it holds."""
+    bound = math.inf
+    if config.max_error is not None:
+        bound = config.max_error
+    elif config.max_error_rel is not None:
+        bound = config.max_error_rel * figures["data_range"]
+    largest = figures["max_abs_error"]
+    if largest is not None and largest > bound:
+        return f"a largest error of {largest:g}, at most {bound:g} was asked for"
+    return None
+
+
+def _missed_psnr(
+    promised: float | None, psnr: float | None, rmse: float | None, where: str
+) -> str | None:
+    """Text on a PSNR below the promised one; None if there is no such promise or it holds."""
+    if promised is None or rmse == 0:
+        return None
+    if psnr is None:
+        return f"an unknown PSNR over {where}, {promised:g} dB were asked for"
+    if psnr < promised:
+        return f"{psnr:.2f} dB over {where}, {promised:g} dB were asked for"
+    return None
+
+
+def _missed_bulk(promised: float | None, figures: Mapping[str, Any]) -> str | None:
+    """Text on a PSNR of the bulk below the promised one; None if there is none or it holds."""
+    bulk = figures["quality"]["bulk"]
+    if promised is None or figures["rmse"] == 0:
+        return None
+    if bulk is None:
+        return (
+            "the middle 98 % of the values are all the same, and have no PSNR, "
+            f"{promised:g} dB were asked for"
+        )
+    return _missed_psnr(promised, bulk["psnr"], bulk["rmse"], "the bulk")
+
+
+def _missed_ratio(config: EncodeConfig, figures: Mapping[str, Any]) -> str | None:
+    """Text on a file that is too large for the promised ratio; None if it is not."""
+    if config.ratio is None or figures["ratio"] >= config.ratio:
+        return None
+    return f"{figures['ratio']:.4g} times smaller than the data, {config.ratio:g} were asked for"

@@ -1,8 +1,9 @@
-"""The model of a compact file: values at vertices in a table, linear between them. numpy only."""
+"""Model of the profile compact, read from a file: values, tables, head, and plain arrays."""
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, lru_cache
 from itertools import product
 from math import prod
 from typing import Any
@@ -10,15 +11,259 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.parts import CompactTable, head_mlp, level_count, read_coarse
-from fhash_codec.compact.plain import PlainArray
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import read_occupancy
-from fhash_codec.model_parts import Mlp, Table
-from fhash_formats.container import Container
+from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
+from fhash_codec.features.occupancy import read_occupancy
+from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.values.elementwise import cast
+from fhash_formats.support.threads import chunk_region, common_part
+from fhash_formats.transform.head import Layer, NeighbourHead
+from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.values import cast
+
+MAX_LEVELS = 11
+"""Levels of a file at most: level l is level of detail l - 1, of which the coder has 0 to 10."""
+
+
+def level_count(box: tuple[int, ...]) -> int:
+    """Return the number of levels of a box (z, y, x): ceil(log2) of its longest axis, at least 1.
+
+    That is the rule of the paper for a fold of 2 (equations 5 and 6).
+    """
+    return min(MAX_LEVELS, max(1, (max(box) - 1).bit_length()))
+
+
+class CompactTable:
+    """A `TableSource` of a level, decoded from the tiles of the coded array."""
+
+    def __init__(self, array: StoredArray, halvings: int) -> None:
+        """Read every 2^halvings-th vertex of the array (t, z, y, x) of a compact file."""
+        steps, *box = array.shape
+        self._array, self._halvings = array, halvings
+        self.shape = (steps, *ceil_halvings(box, halvings), 1)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers: that of the tables of the tiles."""
+        settings = self._array.settings
+        return settings.table_dtype if isinstance(settings, TileSettings) else np.dtype(np.float64)
+
+    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Return the numbers of a region, 5 slices of step 1 with explicit ends."""
+        time, *space, last = region
+        box = Box.of((along.start, along.stop) for along in space)
+        result = np.empty((time.stop - time.start, *box.shape), self.dtype)
+        for number, step in enumerate(range(time.start, time.stop)):
+            result[number] = read_coarse(
+                self._array, step, self._halvings, box, self._array.decode_table, self.dtype
+            )
+        return result[..., np.newaxis][..., last]
+
+
+def read_coarse(
+    array: StoredArray,
+    step: int,
+    lod: int,
+    region: Box,
+    decode: Callable[[tuple[int, ...], int], npt.NDArray[Any]],
+    dtype: np.dtype[Any],
+) -> npt.NDArray[Any]:
+    """Return every 2^lod-th vertex (z, y, x) of a region of the array at a step.
+
+    Each tile is low-passed on its own.
+
+    region: counted in coarse vertices.
+    decode: gives a chunk of the array by its index and the level of detail.
+    """
+    tile, stride = array.chunk_shape, 1 << lod
+    result = np.empty([high - low for low, high in region], dtype=dtype)
+    grid = [
+        range(low * stride // n, (high - 1) * stride // n + 1)
+        for (low, high), n in zip(region, tile[1:], strict=True)
+    ]
+    array.prefetch((range(step // tile[0], step // tile[0] + 1), *grid), lod)
+    for index in product(*grid):
+        # Coarse vertices of the region that lie in the tile.
+        ends = [
+            (max(-(-i * n // stride), a), min(-(-(i + 1) * n // stride), b))
+            for i, n, (a, b) in zip(index, tile[1:], region, strict=True)
+        ]
+        if any(first >= stop for first, stop in ends):
+            continue
+        chunk = decode((step // tile[0], *index), lod)[step % tile[0]]
+        target, source = [], []
+        for i, n, (first, stop), (low, _), size in zip(
+            index, tile[1:], ends, region, chunk.shape, strict=True
+        ):
+            target.append(slice(first - low, stop - low))
+            source.append(_nearest(first, stop, stride, i * n, size))
+        result[tuple(target)] = chunk[np.ix_(*source)]
+    return result
+
+
+def head_mlp(head: NeighbourHead | None) -> Mlp:
+    """Return the MLP of a head; one without layers where there is none."""
+    if head is None:
+        return Mlp(weights=(), biases=(), activation="", stencil=NEIGHBOURS)
+    weights, biases = zip(*(layer.parameters for layer in head.layers), strict=True)
+    return Mlp(
+        weights=weights,
+        biases=biases,
+        activation="leaky",
+        stencil=NEIGHBOURS,
+        constants={
+            "sigma": head.sigma,
+            "low": head.low,
+            "high": head.high,
+            "cross": int(head.cross),
+        },
+    )
+
+
+def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.NDArray[np.int64]:
+    """Return the vertex of a tile's own coarse lattice that is nearest to each coarse vertex.
+
+    A tile that begins between two coarse vertices has a lattice of its own.
+
+    first, stop: range of the coarse vertices, counted from the beginning of the box.
+    start: first vertex of the tile along the axis.
+    size: vertices of the tile's own coarse lattice.
+    """
+    vertices = np.arange(first, stop) * stride - start
+    return np.minimum((vertices + stride // 2) // stride, size - 1)
+
+
+CACHED_TILES = 8
+"""Corrected tiles that an open file keeps."""
+MAX_FRACTION = 1e-3
+"""Largest distance of a weight from a whole multiple of its unit, in units: float32 stores up to
+127 of them with an error of 1e-5."""
+
+Region = tuple[slice, ...]
+
+
+def predicted(
+    table: npt.NDArray[Any], head: NeighbourHead | None, dtype: np.dtype[Any]
+) -> npt.NDArray[Any]:
+    """Return what the head makes of the table (t, z, y, x) of a tile, in the type of the values."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return cast(table if head is None else head.apply(np.ascontiguousarray(table)), dtype)
+
+
+def correction_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the corrections of values of a type."""
+    narrow = dtype.itemsize <= 2 or dtype == np.float32
+    return np.dtype(np.float32 if narrow else np.float64)
+
+
+def correction_of(values: npt.NDArray[Any], base: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return what takes predicted to decoded values, of one type; 0 where a value is not finite."""
+    kind = correction_type(values.dtype)
+    if values.dtype.kind != "f":
+        # Modulo 2^64, so that neighbouring integers beyond 2^53 are still told apart.
+        return (values.astype(np.int64) - base.astype(np.int64)).astype(kind)
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = values.astype(np.float64) - base.astype(np.float64)
+    return np.where(np.isfinite(difference), difference, 0.0).astype(kind)
+
+
+def corrected(base: npt.NDArray[Any], corrections: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return predicted values with their corrections, in their own type."""
+    if base.dtype.kind != "f":
+        with np.errstate(invalid="ignore"):
+            return (base.astype(np.int64) + corrections.astype(np.int64)).astype(base.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        values: npt.NDArray[Any] = (base.astype(np.float64) + corrections).astype(base.dtype)
+    return values
+
+
+def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> NeighbourHead | None:
+    """Return the head of a plain file. Raises DamagedFileError where its arrays do not fit it."""
+    described = model["head"]
+    if described is None:
+        return None
+    layers = []
+    try:
+        for number in range(1, len(described["hidden"]) + 2):
+            weights, biases = (
+                _integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")
+            )
+            layers.append(Layer.of(weights, biases))
+        with np.errstate(over="ignore"):
+            return NeighbourHead(
+                layers=tuple(layers),
+                sigma=described["sigma"],
+                low=described["low"],
+                high=described["high"],
+                cross=described["cross"],
+            )
+    except (InputError, OverflowError) as error:
+        raise DamagedFileError(f"the head of a plain file is damaged: {error}") from error
+
+
+def _integers(array: StoredArray) -> tuple[npt.NDArray[np.int8], float]:
+    """The whole numbers of an array of weights or biases, and their unit."""
+    scale = float(array.attributes["scale"])
+    with np.errstate(over="ignore", invalid="ignore"):
+        numbers = array.read().astype(np.float64) / scale
+        whole = np.abs(numbers - np.rint(numbers)) <= MAX_FRACTION
+    if not whole.all() or np.abs(numbers).max() > 127:
+        raise DamagedFileError(f"array {array.name} has numbers that are no multiples of its scale")
+    return np.rint(numbers).astype(np.int8), scale
+
+
+class PlainArray:
+    """The values of a plain file, read as those of the coded array of a compact file."""
+
+    masked = False
+
+    def __init__(self, model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
+        self._model, self._arrays = model, arrays
+        self._table = arrays["tables/level_1"]
+        self._corrections = arrays.get("corrections")
+        self.shape = self._table.shape[:4]
+        self.chunk_shape = tuple(model["tile"])
+        self.dtype = np.dtype(model["values"])
+        self._tile = lru_cache(maxsize=CACHED_TILES)(self._decode_tile)
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return len(self._model["levels"])
+
+    @cached_property
+    def head(self) -> NeighbourHead | None:
+        """The head of the file."""
+        return head_of(self._model, self._arrays)
+
+    def read(self, region: Region) -> npt.NDArray[Any]:
+        """Return the values of a region, slices (t, z, y, x) with explicit ends."""
+        if self.head is None:  # no value depends on others of its tile
+            return self._decode(region)
+        result = np.empty([along.stop - along.start for along in region], self.dtype)
+        bounds = [(along.start, along.stop) for along in region]
+        tiles = zip(region, self.chunk_shape, strict=True)
+        for index in product(*(range(a.start // n, -(-a.stop // n)) for a, n in tiles)):
+            target, source = common_part(index, self.chunk_shape, bounds)
+            result[target] = self._tile(index)[source]
+        return result
+
+    def _decode_tile(self, index: tuple[int, ...]) -> npt.NDArray[Any]:
+        """The values of a tile, as far as the array reaches."""
+        return self._decode(chunk_region(index, self.chunk_shape, self.shape))
+
+    def _decode(self, region: Region) -> npt.NDArray[Any]:
+        """The values of a region that is one tile, or any region where there is no head."""
+        base = predicted(self._table.read((*region, slice(0, 1)))[..., 0], self.head, self.dtype)
+        if self._corrections is None:
+            return base
+        corrections = self._corrections.read(region)
+        whole = base.dtype.kind != "f"
+        sound = np.abs(corrections) <= 2.0**63 if whole else np.isfinite(corrections)
+        if not sound.all():
+            raise DamagedFileError("array corrections has numbers beyond the type of the values")
+        return corrected(base, corrections)
+
 
 Positions = npt.NDArray[np.float64]
 """Coordinates of some points along one axis."""

@@ -9,10 +9,18 @@ from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Any
 
-from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
-from fhash_codec.compact.choices.estimate import estimated_size, estimated_step
-from fhash_codec.compact.choices.head import HeadHistory
-from fhash_codec.compact.choices.labels import (
+from fhash_codec.compact.attempt import (
+    Attempt,
+    GainLog,
+    PlanTask,
+    Tiling,
+    cheap_tiling,
+    first_tile,
+    parse_tile,
+)
+from fhash_codec.compact.goal import Goal, integer_goal
+from fhash_codec.compact.head import HeadHistory
+from fhash_codec.compact.labels import (
     LabelTrial,
     ends_trials,
     has_labels,
@@ -21,9 +29,7 @@ from fhash_codec.compact.choices.labels import (
     tiled_labels,
     with_step_of,
 )
-from fhash_codec.compact.choices.step import with_step
-from fhash_codec.compact.choices.transform import usual_transform
-from fhash_codec.compact.goal import Goal, integer_goal
+from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
     choose_step,
     choose_tiles,
@@ -34,20 +40,16 @@ from fhash_codec.compact.stages import (
     try_head,
     try_predictor,
 )
-from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import first_tile, parse_tile
+from fhash_codec.compact.step import with_step
+from fhash_codec.compact.tiles import Blocks, Coding, Outcome
+from fhash_codec.compact.transform import estimated_size, estimated_step, usual_transform
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.features import Feature
+from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.progress import Parts, Progress
-from fhash_codec.stage_clock import stage
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.integers import OFFSETS
-from fhash_formats.transform.tile.sections import Shape
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_codec.progress import Parts, Progress, stage
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.encoding import OFFSETS
+from fhash_formats.transform.tile_format import Shape, TileSettings
 
 __all__ = ["CodingPlan", "plan"]
 

@@ -13,31 +13,33 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
-from fhash_codec.compact.choices.estimate import tile_costs
-from fhash_codec.compact.choices.labels import LabelTrial, has_labels, look_at_labels
-from fhash_codec.compact.choices.predictor import TRIAL_ROWS, IntegerTile, fit_weights
-from fhash_codec.compact.choices.step import find_step
-from fhash_codec.compact.choices.transform import likely_transform, usual_transform
+from fhash_codec.compact.attempt import (
+    Attempt,
+    GainLog,
+    PlanTask,
+    cheap_tiling,
+    even_tile,
+    first_tile,
+    parse_tile,
+)
 from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.labels import LabelTrial, has_labels, look_at_labels
+from fhash_codec.compact.predictor import TRIAL_ROWS, IntegerTile, fit_weights
+from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import first_guess, first_settings
-from fhash_codec.compact.tiles.access import cheap_tiling
-from fhash_codec.compact.tiles.blocks import Blocks, Tile
-from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
-from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile
+from fhash_codec.compact.step import find_step
+from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, total
+from fhash_codec.compact.transform import likely_transform, tile_costs, usual_transform
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import FeatureSelection, select_features
-from fhash_codec.measure.bulk import find_bulk
+from fhash_codec.features.selection import FeatureSelection, select_features
+from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import measure_quality
 from fhash_codec.measure.ssim import BUDGET
-from fhash_codec.progress import silent
-from fhash_codec.stage_clock import recording
+from fhash_codec.progress import recording, silent
 from fhash_formats.series import Series
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.transform.tile.decoding import decode_tile
-from fhash_formats.transform.tile.sections import Shape
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.tile_format import Shape, TileSettings
 
 __all__ = ["Look", "Rates", "coded_tiles", "look_at", "now", "probe_rates", "search_coding"]
 
@@ -335,8 +337,7 @@ def _predicting(sample: Sample, settings: TileSettings, count: int) -> tuple[flo
 
     count: tiles of the series, from each of which the fit takes some values.
     """
-    from fhash_formats.transform.entropy.predict import encode_predicted
-    from fhash_formats.transform.entropy.predictor import Predictor
+    from fhash_formats.transform.predict import Predictor, encode_predicted
 
     step = settings.quantum or settings.step
     with np.errstate(all="ignore"):

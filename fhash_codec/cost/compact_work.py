@@ -10,36 +10,33 @@ import math
 from dataclasses import dataclass
 from math import prod
 
-from fhash_codec.compact.choices.coarser_bases import LEAST
-from fhash_codec.compact.choices.head import (
+from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
+from fhash_codec.compact.goal import EXCHANGE
+from fhash_codec.compact.head import (
+    EFFORTS,
     MIN_BYTES,
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
-)
-from fhash_codec.compact.choices.head_prospects import (
-    EFFORTS,
     TRIAL_BUDGET,
     TRIAL_HEAD,
     Budget,
     expected_gain,
     likely_heads,
 )
-from fhash_codec.compact.choices.labels import ends_trials
-from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
-from fhash_codec.compact.choices.quantiser import allows_trellis
-from fhash_codec.compact.choices.search import EXCHANGE
-from fhash_codec.compact.choices.tiling_trials import PICKED_VERTICES
-from fhash_codec.compact.choices.tilings import largest_tile
-from fhash_codec.compact.choices.transform import basis_bytes, count_trials
+from fhash_codec.compact.labels import ends_trials
+from fhash_codec.compact.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.stages import (
     LARGE,
+    LEAST,
     MAX_SEARCHED_VERTICES,
     MIN_HEAD_EFFORT,
     SAMPLE_VERTICES,
     TRIAL_VERTICES,
 )
-from fhash_codec.compact.tiles.access import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
+from fhash_codec.compact.step import allows_trellis
+from fhash_codec.compact.tilings import PICKED_VERTICES, largest_tile
+from fhash_codec.compact.transform import basis_bytes, count_trials
 from fhash_codec.comparison import ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import Look, Rates
@@ -47,8 +44,8 @@ from fhash_codec.cost.head_probe import HeadProbe, updates_of
 from fhash_codec.encoding import DECODED_AGAIN
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.transform.head.inputs import CROSS
-from fhash_formats.transform.tile.sections import Shape
+from fhash_formats.transform.head import CROSS
+from fhash_formats.transform.tile_format import Shape
 
 __all__ = ["stage_seconds"]
 
@@ -233,7 +230,7 @@ def _choices(work: _Work) -> dict[str, float]:
 
 
 def _tiles(work: _Work) -> float:
-    """Seconds of the trials of tilings, see fhash_codec/compact/choices/tilings.py."""
+    """Seconds of the trials of tilings, see fhash_codec/compact/tilings.py."""
     look, rates = work.look, work.rates
     shape = look.shape
     whole = work.vertices <= MAX_WHOLE_VERTICES

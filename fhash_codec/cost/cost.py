@@ -10,7 +10,6 @@ from typing import Any
 
 from fhash_codec.bench.machine import machine
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.cost.advice import advise
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.crop import cropped, described
@@ -22,6 +21,7 @@ from fhash_codec.cost.plan import PEERS, wishes
 from fhash_codec.cost.prediction import predictor
 from fhash_codec.cost.reads import measure_reads
 from fhash_codec.cost.results import CostReport, Picture, Read
+from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 from fhash_formats.series import Series
 
 MIN_STEPS = 8

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import prod
 
-from fhash_codec.coreset.scan import scan
-from fhash_codec.measure.bulk import find_bulk
-from fhash_codec.measure.errors import Errors
+from fhash_codec.features.scan import scan
+from fhash_codec.measure.errors import Errors, find_bulk
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.series import Series

@@ -11,7 +11,7 @@ from fhash_codec.cost.page import json_text, page, require_plotly
 from fhash_codec.cost.plot import plot
 from fhash_codec.cost.results import CostReport
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
-from fhash_formats.support.atomic import check_output, explained, replacing_all
+from fhash_formats.support.files import check_output, explained, replacing_all
 
 __all__ = ["NAMES", "check_folder", "write_report"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from fhash_codec.compact.choices.head import training_pairs
-from fhash_codec.compact.choices.head_samples import BATCH_VOXELS
-from fhash_codec.compact.choices.head_training import (
+from fhash_codec.compact.head import training_pairs
+from fhash_codec.compact.head_training import (
+    BATCH_VOXELS,
     CHOSEN_AT,
     MEASUREMENTS,
     STARTS,

@@ -15,9 +15,9 @@ from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.plan import EPOCHS, Wish, paper_config
 from fhash_codec.cost.prediction import Prediction
 from fhash_codec.cost.results import Curve, Encoded
+from fhash_codec.devices import need_torch
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
-from fhash_codec.training.devices import need_torch
 from fhash_formats.errors import (
     FhashError,
     FhashWarning,
@@ -237,7 +237,7 @@ def _predicted(wish: Wish, prediction: Prediction | None) -> Encoded:
 
 
 def encoded_of(report: Mapping[str, Any], point: Encoded, *, missed: bool) -> Encoded:
-    """A point with the figures of an encoding's report (`fhash_codec.report`)."""
+    """A point with the figures of an encoding's report (`fhash_codec.comparison`)."""
     return replace(
         point,
         seconds=report["seconds"],

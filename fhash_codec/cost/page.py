@@ -17,7 +17,7 @@ from fhash_codec.cost.pictures import NOTHING
 from fhash_codec.cost.results import CostReport
 from fhash_codec.cost.tables import Table, tables
 from fhash_formats.errors import MissingDependencyError
-from fhash_formats.support.plain_json import plain_json
+from fhash_formats.support.values import plain_json
 
 __all__ = ["json_text", "page", "require_plotly"]
 

@@ -15,8 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.bricks import BRICK_BITS
 from fhash_codec.encoding import encode
+from fhash_codec.features.bricks import BRICK_BITS
 from fhash_formats.errors import FhashWarning, QualityError
 from fhash_formats.series import Series
 
@@ -51,7 +51,7 @@ class PaperProbe:
     def stage_seconds(self, config: EncodeConfig) -> dict[str, float]:
         """Return the predicted seconds of each stage, for settings that differ in epochs alone."""
         # torch takes seconds to import, and only a training needs it.
-        from fhash_codec.paper.training.train import HISTORY_POINTS, usual_batches, usual_epochs
+        from fhash_codec.paper.train import HISTORY_POINTS, usual_batches, usual_epochs
 
         batches = usual_batches(self.samples, self.bricks, config.batch)
         epochs = config.epochs or usual_epochs(batches)
@@ -79,7 +79,7 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     domain = prod(part.shape[1:]) * len(report["key_frames"])
     samples = max(1, round(report["coreset_fraction"] * domain / share))
     first, last = (point["seconds"] for point in (report["curve"][0], report["curve"][-1]))
-    from fhash_codec.paper.training.train import usual_batches
+    from fhash_codec.paper.train import usual_batches
 
     bricks = max(1, round(vertices / share) >> sum(BRICK_BITS))
     batches_here = usual_batches(

@@ -26,7 +26,7 @@ from fhash_codec.cost.facts import Facts
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.results import Encoded
 from fhash_codec.progress import Progress
-from fhash_codec.value_type import decoded_type
+from fhash_codec.volume import decoded_type
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import Series
 

@@ -18,11 +18,12 @@ from fhash_codec.cost.own import KeptFile
 from fhash_codec.cost.reads import LEVELS
 from fhash_codec.cost.results import Picture
 from fhash_codec.progress import Progress
+from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.march_task import Frame, Units, complete, warped
+from fhash_codec.rendering.plan import Plan
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
-from fhash_codec.rendering.scene.scene import (
+from fhash_codec.rendering.scenes import (
     AmbientOcclusion,
     AttenuatedMaximum,
     Effects,
@@ -32,9 +33,6 @@ from fhash_codec.rendering.scene.scene import (
     Shading,
     Shadows,
 )
-from fhash_codec.rendering.task.task import Frame, complete
-from fhash_codec.rendering.task.units import Units
-from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series

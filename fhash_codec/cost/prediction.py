@@ -16,7 +16,7 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.choices.search import EXCHANGE
+from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.stages import MIN_HEAD_EFFORT
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import (
@@ -62,7 +62,7 @@ class Prediction:
         bytes: of the file; None where nothing tells them.
         psnr: in dB over the coreset; None where nothing tells it, and for exact values.
         basis: what the prediction rests on, and how uncertain it is, as one line of text.
-        stages: seconds of each stage, by the names of `fhash_codec.stage_clock`.
+        stages: seconds of each stage, by the names of `fhash_codec.progress`.
     """
 
     seconds: float

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.facts import Facts
 from fhash_codec.cost.own import KeptFile

@@ -133,7 +133,7 @@ class Picture:
         setting: its value in words.
         milliseconds: median of some runs, of marching and lighting a frame that is decoded already,
             except for the group "first picture".
-        counters: see `fhash_codec.rendering.task.task.COUNTERS`.
+        counters: see `fhash_codec.rendering.march_task.COUNTERS`.
         psnr, ssim: of the picture against the best one of its group; None where the group has none,
             psnr also where nothing differs.
         best: whether the others are compared with this one.

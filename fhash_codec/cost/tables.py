@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fhash_codec.cost.results import CostReport, Encoded
-from fhash_codec.rendering.task.task import COUNTERS
+from fhash_codec.rendering.march_task import COUNTERS
 
 __all__ = ["Table", "tables"]
 

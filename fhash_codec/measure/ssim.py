@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.measure.sums import range_and_sum
+from fhash_codec.measure.errors import range_and_sum
 from fhash_codec.measure.value_range import pieces, power_of_two
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import share_out, usable_threads

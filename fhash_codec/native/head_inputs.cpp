@@ -1,4 +1,4 @@
-// Inputs of the neighbourhood head for voxels drawn from a tile. compact/choices/head_samples.py
+// Inputs of the neighbourhood head for voxels drawn from a tile. compact/head_training.py
 // states where they go; they are the numbers that head.cpp of fhash_formats computes.
 #include <algorithm>
 #include <cmath>

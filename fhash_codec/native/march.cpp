@@ -9,7 +9,7 @@
 // Compositing is front to back. Within BLOCK samples the opacity is summed in float32, and not the
 // transparency: 1 - 1e-9 is 1 in float32. Blocks are joined in float64, so that thin fog does not
 // vanish in rounding. The code is built for speed, not for the same bits everywhere: pictures agree
-// with those of fhash_codec/rendering/stream/stream.py within rounding.
+// with those of fhash_codec/rendering/stream_march.py within rounding.
 #if defined(__GNUC__) && !defined(__clang__)
 // It makes branches of the loops below, and loops with branches are not vectorised.
 #pragma GCC optimize("no-tree-pre")

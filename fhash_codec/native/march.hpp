@@ -15,7 +15,7 @@ constexpr int FHASH_BRICK = 4;      // cells along a brick's side
 constexpr int FHASH_PLANES = 6;     // planes that clip a picture, at most
 constexpr int FHASH_GRADES = 1024;  // intervals of the table of factors by gradient
 
-// Mirrored field by field in fhash_codec/rendering/native/structure.py. All places and directions
+// Mirrored field by field in fhash_codec/rendering/march.py. All places and directions
 // are in vertices of the frame, x, y, z.
 extern "C" struct FhashMarch {
     // The frame.

@@ -1,5 +1,5 @@
 // Training of the neighbourhood head: Adam on the squared errors of batches of voxels.
-// compact/choices/head_network.py states the arithmetic.
+// compact/head_training.py states the arithmetic.
 #include "train_head.hpp"
 
 #include "guard.hpp"

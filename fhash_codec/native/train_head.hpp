@@ -1,5 +1,5 @@
 // The network of the neighbourhood head in training: its integers, and the sums over blocks of
-// voxels. compact/choices/head_network.py states the arithmetic.
+// voxels. compact/head_training.py states the arithmetic.
 //
 // All sums are of integers held in doubles. Their limits keep every sum below 2^53, so it is exact
 // in whatever order it is formed, fused or not. All other operations are rounded one by one, in the

@@ -1,7 +1,8 @@
-"""Encoding by the profile paper: select the coreset, train the model, write both."""
+"""Encoding in the profile paper: selection, training, tables."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -9,18 +10,75 @@ from typing import Any
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick
+from fhash_codec.features.features import Feature
+from fhash_codec.features.scan import Scan
+from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
-from fhash_codec.paper.architecture import parameter_count
-from fhash_codec.paper.selection import Selection, select
+from fhash_codec.paper.fit import Goal, TrainedModel, train_model
+from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_codec.paper.storage import write_model, write_tables
-from fhash_codec.paper.training.fit import TrainedModel, train_model
-from fhash_codec.paper.training.rounds import Goal
-from fhash_codec.progress import Progress
-from fhash_codec.stage_clock import stage
+from fhash_codec.progress import Progress, stage
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.header import CORESET, FRINGE, SPARSE, SPARSE_FEATURE
 from fhash_formats.series import Series
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Training samples that the settings select from a series, and the model to fit to them.
+
+    Attributes:
+        scanned: value range and missing values of the series.
+        features: the features of interest.
+        coreset: the samples at the key frames.
+        architecture: the sizes of the model.
+    """
+
+    scanned: Scan
+    features: tuple[Feature, ...]
+    coreset: Coreset
+    architecture: Architecture
+
+
+def select(
+    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
+) -> Selection:
+    """Find the features of a series at its key frames and gather the coreset for training.
+
+    Args:
+        series: the series.
+        config: the settings.
+        progress: called with each step of the work.
+        mask: booleans (t, z, y, x) or (z, y, x), one more feature. It replaces 'all' where the
+            settings name no other feature.
+
+    Raises:
+        InputError: the settings do not fit the series, or they select nothing.
+    """
+    brick = parse_brick(config.brick)
+    scanned, key_frames, features = resolve_selection(series, config, progress, mask)
+    with stage("coreset", "samples at the key frames, for the training"):
+        coreset = build_coreset(
+            series,
+            scanned,
+            key_frames,
+            features,
+            config.dilation,
+            progress,
+            fringe=config.fringe == "trained",
+            brick=brick,
+        )
+    architecture = Architecture.for_box(
+        coreset.box.shape,
+        len(key_frames),
+        fold=config.model_fold,
+        embedding_size=config.model_embedding_size,
+        hidden_layers=config.hidden_layers,
+        width=config.model_width,
+    )
+    return Selection(scanned=scanned, features=features, coreset=coreset, architecture=architecture)
+
 
 SPARSE_BELOW = 0.5
 """Share of samples in their box below which tables have needed vertices alone.
@@ -147,7 +205,7 @@ def _write_coded_tables(
 ) -> float:
     """Write the tables through the coder of the profile compact; return the PSNR lost, in dB."""
     # Only `--tables transform` needs these modules.
-    from fhash_codec.paper.tables.step import write_coded
+    from fhash_codec.paper.table_step import write_coded
 
     return write_coded(
         writer,

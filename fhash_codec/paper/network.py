@@ -1,28 +1,318 @@
-"""A trained network as plain numbers: the tables of all levels and the dense layers. numpy only.
-
-A level's table is an array (t, z, y, x, embedding). Its first and last vertices coincide with those
-of the box: vertex i of an axis with S vertices lies at i (R - 1) / (S - 1) among the R vertices of
-the level, at 0 where S is 1. Time follows the same rule, from the key index, which is fractional
-between key frames. The inputs of the dense layers at a point are the embeddings of all levels,
-interpolated linearly along the four axes. Input level * embedding_size + e is embedding e of a
-level; the finest level comes first.
-"""
+"""Network of the paper: architecture, levels, ranks of vertices, MLP, and types of its numbers."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite, prod
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.architecture import Resolution
-from fhash_codec.paper.tables.ranked import SparseFrame
 from fhash_formats.errors import DamagedFileError, InputError
 
+Resolution = tuple[int, int, int, int]
+"""Vertices per axis of one level, (t, z, y, x)."""
+
+
+def ceil_log(n: int, base: int) -> int:
+    """Return the smallest L with base**L >= n, for n >= 1 and base >= 2 (paper, equation 5).
+
+    The result is exact. A floating-point logarithm is not, for example for n = 216 and base = 6.
+    """
+    exponent, power = 0, 1
+    while power < n:
+        power *= base
+        exponent += 1
+    return exponent
+
+
+def axis_resolutions(size: int, fold: int, levels: int) -> list[int]:
+    """Return the vertices of one axis at each level, finest first (paper, equations 4, 7 and 8).
+
+    Each level divides the one before by `fold`, rounding up, down to a tail of levels with 2
+    vertices. An axis of a single vertex has 1 at every level.
+    """
+    if size == 1:
+        return [1] * levels
+    resolutions = [size]
+    while len(resolutions) < levels:
+        previous = resolutions[-1]
+        resolutions.append(-(-previous // fold) if previous > fold else 2)
+    return resolutions
+
+
+def level_resolutions(box: Sequence[int], key_frames: int, fold: int) -> tuple[Resolution, ...]:
+    """Return the resolution of each level, finest first.
+
+    The number of levels is the largest ceil(log_fold S) over the three spatial axes (paper,
+    equations 5 and 6), and at least 1. Time follows the same rule as the spatial axes, from the
+    number of key frames (paper, section 3.2.2).
+
+    Args:
+        box: vertices (z, y, x) of the feature bounding box.
+        key_frames: number of key frames.
+        fold: ratio between neighbouring levels, at least 2.
+    """
+    levels = max(1, *(ceil_log(size, fold) for size in box))
+    columns = [axis_resolutions(size, fold, levels) for size in (key_frames, *box)]
+    return tuple(zip(*columns, strict=True))
+
+
+def parameter_count(levels: Sequence[Resolution], embedding_size: int) -> int:
+    """Return the number of trained numbers in the tables of all levels, without the network."""
+    return embedding_size * sum(prod(level) for level in levels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Architecture:
+    """Sizes of the tables of all levels, and of the MLP that turns their embeddings into a value.
+
+    Attributes:
+        levels: vertices (t, z, y, x) of each table, finest first.
+        embedding_size: numbers at each vertex of a table.
+        hidden_layers: hidden layers of the MLP, with ReLU; 0 makes it a linear readout.
+        width: neurons of each hidden layer.
+        box_size: vertices (z, y, x) of the feature bounding box.
+        key_frames: number of key frames.
+    """
+
+    levels: tuple[Resolution, ...]
+    embedding_size: int
+    hidden_layers: int
+    width: int
+    box_size: tuple[int, int, int]
+    key_frames: int
+
+    @classmethod
+    def for_box(
+        cls,
+        box_size: tuple[int, int, int],
+        key_frames: int,
+        *,
+        fold: int = 2,
+        embedding_size: int = 2,
+        hidden_layers: int = 2,
+        width: int = 64,
+    ) -> Architecture:
+        """Return the paper's model of a feature bounding box and a number of key frames.
+
+        The defaults are the paper's (section 4.2): fold 2, embeddings of 2 numbers, and an MLP of 2
+        layers with 64 neurons. The layers are hidden ones: the paper's counts of parameters for
+        tiny-cuda-nn, which is configured in the same words, come out with two hidden layers only.
+        """
+        levels = level_resolutions(box_size, key_frames, fold)
+        return cls(
+            levels=levels,
+            embedding_size=embedding_size,
+            hidden_layers=hidden_layers,
+            width=width,
+            box_size=box_size,
+            key_frames=key_frames,
+        )
+
+    @property
+    def sizes(self) -> Resolution:
+        """Vertices (t, z, y, x) of the lattice of samples: key frames and box.
+
+        They equal the resolution of the finest level (paper, equation 4).
+        """
+        return (self.key_frames, *self.box_size)
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the MLP for one point: the embeddings of all levels, concatenated."""
+        return len(self.levels) * self.embedding_size
+
+    @property
+    def layer_shapes(self) -> Sequence[tuple[int, int]]:
+        """(outputs, inputs) of each linear layer."""
+        widths = [self.inputs, *[self.width] * self.hidden_layers, 1]
+        return [(outputs, inputs) for inputs, outputs in itertools.pairwise(widths)]
+
+    @property
+    def parameters(self) -> int:
+        """Number of all trained numbers, in the tables and the MLP."""
+        return self.parameters_of(parameter_count(self.levels, 1))
+
+    def parameters_of(self, vertices: int) -> int:
+        """Return the number of trained numbers of the MLP and of tables of so many vertices."""
+        return vertices * self.embedding_size + sum(
+            outputs * (inputs + 1) for outputs, inputs in self.layer_shapes
+        )
+
+
 Floats = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+
+BLOCK_WORDS = 4
+"""Words of a block: ones before a word in its block fit in one byte."""
+MAX_COUNT = 2**32 - 1
+"""Largest number of ones in a bitmap."""
+
+
+@dataclass(frozen=True, eq=False)
+class RankedBits:
+    """A bitmap, and for each of its ones the number of ones before it.
+
+    Attributes:
+        words: uint64 (n,); position p is bit p % 64, 0 the lowest, of word p // 64.
+        blocks: uint32 (ceil(n / 4) + 1,), ones before each block of 4 words; the last is the
+            number of all ones.
+        within: uint8 (n,), ones before each word in its block.
+    """
+
+    words: npt.NDArray[np.uint64]
+    blocks: npt.NDArray[np.uint32]
+    within: npt.NDArray[np.uint8]
+
+    @classmethod
+    def of_octets(cls, octets: npt.NDArray[np.uint8]) -> RankedBits:
+        """Return the bitmap of bytes; position p is bit p % 8, 0 the lowest, of byte p // 8."""
+        filled = np.zeros(-(-len(octets) // 8) * 8, np.uint8)
+        filled[: len(octets)] = octets
+        return cls.of_words(filled.view("<u8").astype(np.uint64, copy=False))
+
+    @classmethod
+    def of_words(cls, words: npt.NDArray[np.uint64]) -> RankedBits:
+        """Return the bitmap of words; position p is bit p % 64, 0 the lowest, of word p // 64."""
+        counts = np.zeros((-(-len(words) // BLOCK_WORDS), BLOCK_WORDS), np.uint8)
+        counts.reshape(-1)[: len(words)] = np.bitwise_count(words)
+        # Up to 3 words of 64 ones come before the last word of a block: 192 fit in a byte.
+        before = np.cumsum(counts[:, :-1], axis=1, dtype=np.uint8)
+        within = np.concatenate([np.zeros_like(before[:, :1]), before], axis=1).reshape(-1)
+        blocks = np.zeros(len(counts) + 1, np.int64)
+        np.cumsum(counts.sum(axis=1, dtype=np.int64), out=blocks[1:])
+        if blocks[-1] > MAX_COUNT:
+            raise InputError(
+                f"a level needs {blocks[-1]} vertices at one time; at most {MAX_COUNT} are allowed"
+            )
+        return cls(words, blocks.astype(np.uint32), within[: len(words)])
+
+    @property
+    def count(self) -> int:
+        """Number of ones."""
+        return int(self.blocks[-1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the bitmap and its counts."""
+        return self.words.nbytes + self.blocks.nbytes + self.within.nbytes
+
+    def lookup(self, positions: Integers) -> Integers:
+        """Return the place of each position among the ones, `count` where its bit is 0.
+
+        Args:
+            positions: int64 of any shape, in 0 .. 64 n - 1.
+        """
+        word = positions >> 6
+        # The bit moves to the top of its word, and all that come after it fall out.
+        upto = self.words[word] << (~positions & 63).view(np.uint64)
+        ranks = self.blocks[word >> 2] + self.within[word] + np.bitwise_count(upto)
+        return np.where(upto.view(np.int64) < 0, ranks.astype(np.int64) - 1, self.count)
+
+    def before(self, position: int) -> int:
+        """Return the number of ones before a position in 0 .. 64 n."""
+        word, bit = divmod(position, 64)
+        block = word - word % BLOCK_WORDS
+        whole = int(np.bitwise_count(self.words[block:word]).sum())
+        part = int(self.words[word]) & ((1 << bit) - 1) if bit else 0
+        return int(self.blocks[block // BLOCK_WORDS]) + whole + part.bit_count()
+
+    @property
+    def octets(self) -> npt.NDArray[np.uint8]:
+        """The bitmap as bytes, in the order of `of_octets`, filled up to whole words."""
+        return self.words.astype("<u8", copy=False).view(np.uint8)
+
+    def positions(self) -> Integers:
+        """Return the positions of all ones, ascending."""
+        return np.flatnonzero(np.unpackbits(self.octets, bitorder="little"))
+
+
+@dataclass(frozen=True, eq=False)
+class SparseFrame:
+    """The embeddings of a level at one time, at the vertices that it holds; 0 at all others.
+
+    Attributes:
+        shape: vertices (z, y, x) of the level.
+        bits: which vertices are held. Rows along x are filled up to whole bytes of bits.
+        values: embeddings (bits.count + 1, E) of the held vertices in C order over (z, y, x),
+            float16 or float32. The last row is 0: `bits.lookup` gives it for other vertices.
+    """
+
+    shape: tuple[int, int, int]
+    bits: RankedBits
+    values: npt.NDArray[Any]
+
+    @classmethod
+    def of(cls, mask: Mask, held: npt.NDArray[Any]) -> SparseFrame:
+        """Return a frame of the embeddings (held vertices, E) of a mask (z, y, x)."""
+        z, y, x = mask.shape
+        rows = np.packbits(mask, axis=2, bitorder="little")
+        return cls._with((z, y, x), RankedBits.of_octets(rows.reshape(-1)), held)
+
+    @classmethod
+    def _with(
+        cls, shape: tuple[int, int, int], bits: RankedBits, held: npt.NDArray[Any]
+    ) -> SparseFrame:
+        nothing = np.zeros((1, held.shape[1]), held.dtype)
+        return cls(shape, bits, np.concatenate([held, nothing]))
+
+    @property
+    def row(self) -> int:
+        """Bits of a row along x; vertex (z, y, x) has bit (z * shape[1] + y) * row + x."""
+        return row_bits(self.shape[2])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return self.bits.nbytes + self.values.nbytes
+
+    def take(self, z: Integers, y: Integers, x: Integers) -> npt.NDArray[Any]:
+        """Return the embeddings (..., E) of vertices, whose indices broadcast to (...)."""
+        positions = (z * self.shape[1] + y) * self.row + x
+        return self.values.take(self.bits.lookup(positions), axis=0)
+
+    def read(self, box: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Return the embeddings (z, y, x, E) of a region: 3 slices with explicit ends."""
+        z, y, x = box
+        octets = self.bits.octets[: prod(self.shape[:2]) * self.row // 8]
+        rows = octets.reshape(*self.shape[:2], -1)[z, y, x.start // 8 : -(-x.stop // 8)]
+        bits = np.unpackbits(rows, axis=2, bitorder="little").view(np.bool_)
+        held = bits[:, :, x.start % 8 : x.start % 8 + x.stop - x.start]
+        result = np.zeros((*held.shape, self.values.shape[1]), self.values.dtype)
+        if (y.start, y.stop, x.start, x.stop) == (0, self.shape[1], 0, self.shape[2]):
+            # The embeddings of whole planes lie together.
+            first = self.bits.before(z.start * self.shape[1] * self.row)
+            result[held] = self.values[first : first + np.count_nonzero(held)]
+        else:
+            at = held.nonzero()
+            result[at] = self.take(*(i + axis.start for i, axis in zip(at, box, strict=True)))
+        return result
+
+
+def row_bits(vertices: int) -> int:
+    """Return the bits of a row of vertices along x, filled up to whole bytes."""
+    return -(-vertices // 8) * 8
+
+
+def between(before: SparseFrame, after: SparseFrame, after_weight: np.float32) -> SparseFrame:
+    """Return the frame between two frames of a level, linear in time, float32.
+
+    It holds the vertices that either of them holds. Each embedding is that of dense frames, bit for
+    bit: before * (1 - after_weight) + after * after_weight.
+    """
+    bits = RankedBits.of_words(before.bits.words | after.bits.words)
+    positions = bits.positions()
+    mixed: Floats = before.values[before.bits.lookup(positions)] * np.float32(1 - after_weight)
+    mixed += after.values[after.bits.lookup(positions)] * after_weight
+    return SparseFrame._with(before.shape, bits, mixed)
+
+
 Layer = tuple[Floats, Floats]
 """Weight (out, in) and bias (out,)."""
 
@@ -186,3 +476,61 @@ def _check_finite(values: npt.NDArray[Any], level: int) -> None:
             f"the table of level {level + 1} holds numbers that are not finite; "
             "the training diverged or the file is damaged"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NumberType:
+    """The numbers of a file that embeddings are stored as.
+
+    Attributes:
+        dtype: type of the numbers, floating or unsigned.
+        scale, offset: an embedding stored as an unsigned number is offset + scale * number.
+    """
+
+    dtype: np.dtype[Any]
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def of(cls, values: Floats, kind: str) -> NumberType:
+        """Return the number type named `kind` with the scale and offset that fit some embeddings.
+
+        Raises InputError where the embeddings are not finite or do not fit in the type.
+        """
+        dtype = np.dtype(kind)
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        if not (isfinite(low) and isfinite(high)):
+            raise InputError(
+                "embeddings are not finite: the training diverged; set a lower --learning-rate"
+            )
+        if dtype.kind == "u":
+            # The range includes 0, so that the 0 of untrained vertices costs little.
+            low, high = min(low, 0.0), max(high, 0.0)
+        reached = high - low if dtype.kind == "u" else max(-low, high)
+        if reached > float(np.finfo(np.float32 if dtype.kind == "u" else dtype).max):
+            raise InputError(
+                f"embeddings reach {reached:g}, more than {kind} holds; use --tables float32"
+            )
+        if dtype.kind == "f":
+            return cls(dtype=dtype)
+        # float32 holds numbers below its `tiny` with fewer digits. A scale that small would not
+        # give back the embeddings.
+        scale = (
+            max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny))
+            if high > low
+            else 1.0
+        )
+        return cls(dtype=dtype, scale=scale, offset=low)
+
+    def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
+        """Return embeddings as numbers of the type, of the same shape."""
+        if self.dtype.kind == "f":
+            return embeddings.astype(self.dtype)
+        return np.asarray(
+            np.rint(embeddings / self.scale - self.offset / self.scale).astype(self.dtype)
+        )
+
+    @property
+    def attributes(self) -> dict[str, float]:
+        """The attributes by which a reader finds the embeddings again."""
+        return {"offset": self.offset, "scale": self.scale} if self.dtype.kind == "u" else {}

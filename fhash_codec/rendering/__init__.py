@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from fhash_codec.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from fhash_codec.rendering.picture.image import Image
-    from fhash_codec.rendering.scene.scene import Scene
+    from fhash_codec.rendering.image import Image
+    from fhash_codec.rendering.scenes import Scene
     from fhash_codec.volume import Volume
 
 __all__ = ["render"]

@@ -1,18 +1,586 @@
-"""Marching rays through a frame of values, natively in packets."""
+"""Marching in packets of rays through a frame, by the native library (native/march.cpp)."""
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32
+from dataclasses import dataclass
+from itertools import count, product
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.rendering.native.march import MAX_SURFACES, march_native
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame, Marched, Task
+from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
+from fhash_codec.rendering.light import flatness, slope_scale, smoothing
+from fhash_codec.rendering.march_task import (
+    GRADES,
+    MAX_VALUES,
+    Frame,
+    Lighting,
+    Marched,
+    Table,
+    Task,
+    complete,
+    extinctions_in,
+)
 from fhash_formats.errors import InputError
+from fhash_formats.support.threads import in_threads, usable_threads
 
-__all__ = ["march"]
+MAX_SURFACES = 64
+"""Surfaces of a picture, at most: FHASH_SURFACES."""
+MAX_PLANES = 6
+"""Planes that clip a picture, at most: FHASH_PLANES."""
+POWERS = 1024
+"""Intervals of the table of highlights: FHASH_POWERS."""
+TILE = 16
+"""Pixels along a tile's side: TILE of march_packet.hpp."""
+SHADED = 1
+"""Flag of `fhash_march`: the volume is lit by its gradients."""
+LIT = 2
+"""Flag of `fhash_march`: the volume has a light grid."""
+MAXIMUM = 4
+"""Flag of `fhash_march`: the largest value along each ray is drawn."""
+
+MINIMUM = 32
+"""Flag of `fhash_march`, with MAXIMUM: the smallest value along each ray is drawn."""
+AVERAGE = 64
+"""Flag of `fhash_march`: the mean along each ray is drawn."""
+ATTENUATED = 128
+"""Flag of `fhash_march`: the attenuated maximum along each ray is drawn."""
+GRADED = 256
+"""Flag of `fhash_march`, with SHADED: the gradients decide on the opacity, too."""
+
+_Three = c_double * 3
+_Pair = c_double * 2
+_Box = _Pair * 3
+_Surface = c_double * 5
+_Plane = c_double * 4
+
+
+class March(ctypes.Structure):
+    """`FhashMarch` of march.hpp, field by field.
+
+    Pointers are given as contiguous arrays, or None for null. The structure keeps them alive.
+    """
+
+    _fields_ = (
+        ("values", POINTER(c_float)),
+        ("shape", c_int64 * 3),
+        ("distance", POINTER(c_int32)),
+        ("cells", POINTER(c_uint32)),
+        ("highest", POINTER(c_float)),
+        ("bricks", c_int64 * 3),
+        ("table", POINTER(c_float)),
+        ("extinction", POINTER(c_double)),
+        ("entries", c_int64),
+        ("low", c_double),
+        ("scale", c_double),
+        ("light", POINTER(c_float)),
+        ("light_shape", c_int64 * 3),
+        ("light_offset", _Three),
+        ("light_scale", c_double),
+        ("eye", _Three),
+        ("right", _Three),
+        ("up", _Three),
+        ("forward", _Three),
+        ("box", _Box),
+        ("seen", _Box),
+        ("spacing", _Three),
+        ("width", c_int64),
+        ("height", c_int64),
+        ("parallel", c_int64),
+        ("rays", c_int64),
+        ("step", c_double),
+        ("threshold", c_double),
+        ("jitter", c_int64),
+        ("lamp", _Three),
+        ("ambient", c_double),
+        ("diffuse", c_double),
+        ("specular", c_double),
+        ("steep", c_double),
+        ("gradient", _Three),
+        ("floor", c_double),
+        ("powers", POINTER(c_float)),
+        ("surfaces", c_int64),
+        ("surface", _Surface * MAX_SURFACES),
+        ("out", POINTER(c_float)),
+        ("depth", POINTER(c_float)),
+        ("normal", POINTER(c_float)),
+        ("central", c_int64),
+        ("path", c_int64),
+        ("planes", c_int64),
+        ("plane", _Plane * MAX_PLANES),
+        ("grading", POINTER(c_float)),
+        ("grade_scale", c_double),
+        ("unlit", c_int64),
+        ("smooth", POINTER(c_float)),
+    )
+
+    def __init__(self, **fields: Any) -> None:
+        arrays = {name: field for name, field in fields.items() if isinstance(field, np.ndarray)}
+        kinds: dict[str, Any] = dict(self._fields_)
+        for name, array in arrays.items():
+            assert array.flags.c_contiguous, f"{name} is not contiguous"
+            assert np.ctypeslib.as_ctypes_type(array.dtype) is kinds[name]._type_, (
+                f"{name} is {array.dtype}"
+            )
+            fields[name] = array.ctypes.data_as(kinds[name])
+        # A pointer in a structure does not refer to its array.
+        self._arrays = tuple(arrays.values())
+        super().__init__(**fields)
+
+
+def numbers(values: npt.ArrayLike) -> ctypes.Array[c_double]:
+    """Three numbers, x, y, z."""
+    return _Three(*np.asarray(values))
+
+
+def box(ends: npt.NDArray[np.float64]) -> ctypes.Array[Any]:
+    """A box (3, 2), x, y, z."""
+    return _Box(*(_Pair(*pair) for pair in ends))
+
+
+def surface(level: float, colour: npt.ArrayLike, opacity: float) -> ctypes.Array[c_double]:
+    """An isosurface: its value, red, green, blue and opacity."""
+    return _Surface(level, *np.asarray(colour), opacity)
+
+
+def plane(normal_and_distance: npt.ArrayLike) -> ctypes.Array[c_double]:
+    """A plane: its normal x, y, z, and the product with it from which on places are kept."""
+    return _Plane(*np.asarray(normal_and_distance))
+
+
+Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+
+MAX_MAGNITUDE = 1e36
+"""Largest magnitude of values that float32 can compute with; larger values are scaled."""
+MIN_RANGE = 1e-28
+"""Smallest range of a table that float32 can compute with; values of a smaller one are scaled."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MarchInput:
+    """The numbers of a task in the units of the native marcher.
+
+    All places and directions are in vertices of the frame, x, y, z.
+
+    Attributes:
+        values: float32 (z, y, x), scaled where float32 could not compute with them.
+        low, high: values of the table's ends, scaled likewise.
+        levels: values of the surfaces, scaled likewise.
+        eye, right, up, forward: camera of the rays, each (3,).
+        box: (3, 2), the drawn box as it is clipped, in which steps are counted.
+        seen: (3, 2), the part of the box in which the frame has values.
+        planes: (n, 4), planes that cut the box, as `Body` has them.
+        spacing: (3,), length of one vertex spacing in the coordinates.
+        gradient: (3,), factors from differences between vertices to the gradients of shading.
+        steepness: a gradient of shading of 1, in marched units per unit of the coordinates.
+        floor: gradient at which shading has faded by half.
+        smoothing: deviation of the Gaussian by which values are smoothed before shading, in
+            vertices; 0 for none.
+        error: largest error of a value, scaled likewise; smoothed values stay within it.
+        light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
+    """
+
+    values: Single
+    low: float
+    high: float
+    levels: tuple[float, ...]
+    eye: Floats
+    right: Floats
+    up: Floats
+    forward: Floats
+    box: Floats
+    seen: Floats
+    planes: Floats
+    spacing: Floats
+    gradient: Floats
+    steepness: float
+    floor: float
+    smoothing: float
+    error: float
+    light_offset: Floats
+    light_scale: float
+
+    @classmethod
+    def of(cls, frame: Frame, task: Task, bricks: Bricks) -> MarchInput:
+        """The input for a task and a frame with its bricks."""
+        grid, stride = task.rays.grid, float(frame.stride)
+        first = np.array(frame.first[::-1], dtype=np.float64)
+        least, most = bricks.value_range
+        low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
+        scaling = _Scaling.of(low, high, max(abs(least), abs(most)))
+        low, high, least, most = map(scaling.number, (low, high, least, most))
+        span, floor = flatness(low, high, least, most, scaling.width(task.noise))
+        light = task.light
+        box, planes = task.bounds, task.planes
+        within = frame.bounds(grid)
+        seen = np.stack(
+            [np.maximum(within[:, 0], box[:, 0]), np.minimum(within[:, 1], box[:, 1])], axis=-1
+        )
+        seen[:, 1] = np.maximum(seen[:, 1], seen[:, 0])  # nothing, and no box that is turned over
+        return cls(
+            values=scaling.array(bricks.values),
+            low=low,
+            high=high if high > low else low + span,
+            levels=tuple(scaling.number(surface.value) for surface in task.surfaces),
+            eye=(task.rays.eye - first) / stride,
+            right=task.rays.right / stride,
+            up=task.rays.up / stride,
+            forward=task.rays.forward / stride,
+            box=(box - first[:, None]) / stride,
+            seen=(seen - first[:, None]) / stride,
+            planes=np.column_stack(
+                [planes[:, :3], (planes[:, 3] - planes[:, :3] @ first) / stride]
+            ),
+            spacing=grid.spacing * stride,
+            gradient=slope_scale(grid, span, least, most),
+            steepness=span * scaling.unit / (stride * grid.vertex_spacing),
+            floor=floor,
+            smoothing=smoothing(span, scaling.width(task.noise)),
+            error=scaling.width(task.error),
+            light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
+            light_scale=1.0 if light is None else stride / light.cell,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scaling:
+    """Values as value / unit - middle / unit, so that float32 can compute with them."""
+
+    middle: float = 0.0
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, low: float, high: float, magnitude: float) -> _Scaling:
+        """The scaling for a table from `low` to `high` and values of at most a magnitude."""
+        largest = max(magnitude, abs(low), abs(high))
+        if largest <= MAX_MAGNITUDE and not 0 < high - low < MIN_RANGE:
+            return cls()
+        return cls(middle=low / 2 + high / 2, unit=max(high / 2 - low / 2, largest * 1e-30, 5e-324))
+
+    def number(self, value: float) -> float:
+        """Scale a value."""
+        return value / self.unit - self.middle / self.unit
+
+    def width(self, difference: float) -> float:
+        """Scale a difference of two values."""
+        return difference / self.unit
+
+    def array(self, values: Single) -> Single:
+        """Scale values, clipped to MAX_MAGNITUDE; without scaling the result is the same array."""
+        if self == _Scaling():
+            return values
+        with np.errstate(over="ignore"):
+            scaled = values.astype(np.float64) / self.unit - self.middle / self.unit
+            return scaled.clip(-MAX_MAGNITUDE, MAX_MAGNITUDE).astype(np.float32)
+
+
+def empty_table(low: float, high: float) -> Table:
+    """A table of nothing, for surfaces alone."""
+    return Table(
+        low=low, high=high, colours=np.zeros((2, 3), dtype=np.float32), extinctions=np.zeros(2)
+    )
+
+
+ENTRIES = 4000
+"""Entries of a table of a step, at least. So close together, opacity is linear between them as
+extinction is.
+"""
+GROUP = 8
+"""Tiles that a thread takes at a time."""
+MIN_SKIPPED = 0.4
+"""Smallest share of invisible bricks for which leaping over them pays; below it the test costs more
+than it saves.
+"""
+SHARPEST = 16
+"""Exponent of highlights above which their table is stretched over the cosines next to 1."""
+PROJECTIONS = {
+    "maximum": MAXIMUM,
+    "minimum": MAXIMUM | MINIMUM,
+    "average": AVERAGE,
+    "attenuated": ATTENUATED,
+}
+"""Flags of the values that rays show instead of the volume."""
+COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks")
+"""Names of the counters of `fhash_march`, in its order."""
+
+
+def march_native(
+    library: ctypes.CDLL,
+    frame: Frame,
+    task: Task,
+    bricks: Bricks,
+    threads: int | None = None,
+    *,
+    path: int = 0,
+) -> Marched:
+    """The picture of a task, as `march` describes it.
+
+    path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
+    every processor has. The pictures agree within rounding.
+    """
+    assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
+    task = task.marched
+    given = MarchInput.of(frame, task, bricks)
+    buffers = _Buffers.of(task)
+    skipping = _skipping(library, given, task, bricks)
+    structure = March(
+        values=given.values,
+        shape=given.values.shape,
+        bricks=bricks.low.shape,
+        distance=skipping.distance,
+        cells=skipping.cells,
+        highest=skipping.highest,
+        **_table_fields(given, task),
+        **_light_fields(given, task),
+        **_ray_fields(given, task),
+        **_lighting_fields(task.lighting),
+        gradient=numbers(given.gradient),
+        floor=given.floor,
+        smooth=_smooth(given, task, bricks),
+        **_grading_fields(given, task),
+        planes=len(given.planes),
+        plane=(ctypes.c_double * 4 * MAX_PLANES)(*map(plane, given.planes)),
+        surfaces=0 if task.projection else len(task.surfaces),
+        surface=_surfaces(given, task),
+        out=buffers.rgba,
+        depth=buffers.depth,
+        normal=buffers.normal,
+        path=path,
+    )
+    counters = _march(library, structure, task, threads)
+    return Marched(
+        rgba=buffers.rgba,
+        depth=buffers.depth if task.depth else None,
+        normal=buffers.normal,
+        counters=counters,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Buffers:
+    """The pictures that rays are added to: rgba (H, W, 4), depth (H, W) and normal (H, W, 3).
+
+    Normals need the depth, to keep that of the nearest of several rays.
+    """
+
+    rgba: Single
+    depth: Single | None
+    normal: Single | None
+
+    @classmethod
+    def of(cls, task: Task) -> _Buffers:
+        width, height = task.rays.size
+        return cls(
+            rgba=np.zeros((height, width, 4), dtype=np.float32),
+            depth=np.full((height, width), np.inf, dtype=np.float32)
+            if task.depth or task.normal
+            else None,
+            normal=np.zeros((height, width, 3), dtype=np.float32) if task.normal else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Skipping:
+    """Bricks and cells that rays may pass over; None where all of a frame is looked at.
+
+    Attributes:
+        distance: int32 (z, y, x), as `Bricks.distance` has it.
+        cells: uint32 (z, y, x, 2), as `cells_of` has it.
+        highest: float32 (z, y, x) of bricks, the largest value, for the maximum along a ray, or the
+            smallest times -1 for the minimum.
+    """
+
+    distance: npt.NDArray[np.int32] | None = None
+    cells: npt.NDArray[np.uint32] | None = None
+    highest: Single | None = None
+
+
+def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks) -> _Skipping:
+    """The parts of a frame that a task's rays may pass over."""
+    if not task.skipping:
+        return _Skipping()
+    if task.projection in ("maximum", "minimum"):
+        # Scaled values have other extremes than the bricks.
+        if given.values is not bricks.values:
+            return _Skipping()
+        return _Skipping(highest=bricks.high if task.projection == "maximum" else -bricks.low)
+    shortest = float(np.abs(given.spacing).min())
+    # A step longer than a brick could pass through one in which a surface lies, on its way from one
+    # in which nothing is visible to another.
+    if task.surfaces and task.step / shortest > SIDE:
+        return _Skipping()
+    distance = bricks.distance(task)
+    # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
+    by_cells = not (task.surfaces and task.step > 0.99 * shortest)
+    cells = (
+        bricks.remembered(
+            "cells", task.visibility, lambda: cells_of(library, bricks, task, distance)
+        )
+        if by_cells
+        else None
+    )
+    if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
+        return _Skipping()
+    return _Skipping(distance=distance, cells=cells)
+
+
+def _table_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the transfer function."""
+    entries, extinctions = _entries(task.table or empty_table(given.low, given.high), task.step)
+    return {
+        "table": entries,
+        "extinction": extinctions,
+        "entries": len(entries) - 1,
+        "low": given.low,
+        "scale": (len(entries) - 2) / (given.high - given.low),
+    }
+
+
+def _entries(table: Table, step: float) -> tuple[Single, npt.NDArray[np.float64]]:
+    """Colours and opacities (n + 1, 4) and extinctions (n + 1,) of a step; the last entry twice."""
+    last = len(table.extinctions) - 1
+    places = np.append(np.linspace(0, last, last * -(-ENTRIES // last) + 1), last)
+    columns = [np.interp(places, np.arange(last + 1), column) for column in table.colours.T]
+    extinctions = extinctions_in(np.interp(places, np.arange(last + 1), table.extinctions), step)
+    return np.stack([*columns, -np.expm1(-extinctions)], axis=-1).astype(np.float32), extinctions
+
+
+def _light_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the light grid."""
+    light = task.light
+    shares = None if light is None else np.ascontiguousarray(light.shares, dtype=np.float32)
+    return {
+        "light": shares,
+        "light_shape": (0, 0, 0) if shares is None else shares.shape[:3],
+        "light_offset": numbers(given.light_offset),
+        "light_scale": given.light_scale,
+    }
+
+
+def _ray_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the rays and their steps."""
+    width, height = task.rays.size
+    return {
+        "eye": numbers(given.eye),
+        "right": numbers(given.right),
+        "up": numbers(given.up),
+        "forward": numbers(given.forward),
+        "box": box(given.box),
+        "seen": box(given.seen),
+        "spacing": numbers(given.spacing),
+        "width": width,
+        "height": height,
+        "parallel": task.rays.parallel,
+        "rays": task.antialiasing,
+        "step": task.step,
+        "threshold": task.threshold,
+        "jitter": task.jitter,
+    }
+
+
+def _smooth(given: MarchInput, task: Task, bricks: Bricks) -> Single | None:
+    """The smoothed values that what is lit is shaded by; None where those of the frame do."""
+    if not given.smoothing or not (task.shaded or task.surfaces):
+        return None
+    if given.values is not bricks.values:  # scaled for this task alone
+        return smoothed(given.values, given.smoothing, given.error)
+    return bricks.smoothed(given.smoothing, given.error)
+
+
+def _grading_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the opacity by gradient."""
+    grading = task.grading
+    if grading is None:
+        return {"grading": None, "grade_scale": 0.0, "unlit": 0}
+    factors = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
+    return {
+        "grading": factors,
+        "grade_scale": GRADES * given.steepness / grading.top,
+        "unlit": not task.shaded,
+    }
+
+
+def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
+    """The fields of Phong's model; without one only ambient light of strength 1."""
+    if lighting is None:
+        lighting = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
+    steep = max(1.0, lighting.specular_power / SHARPEST)
+    cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
+    return {
+        "lamp": numbers((0.0, 0.0, 0.0) if lighting.lamp is None else lighting.lamp),
+        "ambient": lighting.ambient,
+        "diffuse": lighting.diffuse,
+        "specular": lighting.specular,
+        "steep": steep,
+        "powers": (cosines**lighting.specular_power).astype(np.float32),
+        "central": lighting.central,
+    }
+
+
+def _surfaces(given: MarchInput, task: Task) -> ctypes.Array[ctypes.Array[ctypes.c_double]]:
+    surfaces = zip(given.levels, task.surfaces, strict=True)
+    rows = (surface(level, each.colour, each.opacity) for level, each in surfaces)
+    return (ctypes.c_double * 5 * MAX_SURFACES)(*rows)
+
+
+def _march(
+    library: ctypes.CDLL, structure: March, task: Task, threads: int | None
+) -> dict[str, int]:
+    """March all rays in several threads, into the buffers of a structure; the counters."""
+    flags = SHADED * task.shaded | LIT * (task.light is not None)
+    if task.grading is not None:
+        flags |= SHADED | GRADED
+    if task.projection:
+        flags = PROJECTIONS[task.projection]
+    spans = _spans(task)
+    groups = count()
+
+    def work(_: int) -> npt.NDArray[np.int64]:
+        counters = np.zeros(len(COUNTED), dtype=np.int64)
+        while (group := next(groups)) < len(spans):
+            first, stop = spans[group]
+            failed = library.fhash_march(
+                ctypes.byref(structure), flags, first, stop, counters.ctypes.data
+            )
+            assert not failed
+        return counters
+
+    workers = max(1, min(threads or usable_threads(), len(spans)))
+    if workers == 1:
+        total = work(0)
+    else:
+        total = sum(in_threads(work, range(workers)), np.zeros(len(COUNTED), dtype=np.int64))
+    return complete(dict(zip(COUNTED, total.tolist(), strict=True)))
+
+
+def _spans(task: Task) -> list[tuple[int, int]]:
+    """Tiles (first, stop) in rows of the picture, in the rectangle around the drawn box.
+
+    All other rays miss the box.
+    """
+    width, height = task.rays.size
+    across, down = -(-width // TILE), -(-height // TILE)
+    with np.errstate(all="ignore"):
+        pixels, depth = task.rays.project(np.array(list(product(*task.bounds))))
+    left, top, right, bottom = 0, 0, across, down
+    if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
+        # Rounding is far below a pixel.
+        left, top = _tiles(np.floor((pixels.min(axis=0) - 1) / TILE), (across, down))
+        right, bottom = _tiles(np.ceil((pixels.max(axis=0) + 1) / TILE), (across, down))
+    rows = (range(row * across + left, row * across + right, GROUP) for row in range(top, bottom))
+    return [(first, min(first + GROUP, row.stop)) for row in rows for first in row]
+
+
+def _tiles(ends: npt.NDArray[np.float64], limits: tuple[int, int]) -> tuple[int, int]:
+    """Numbers of tiles (x, y), clipped to 0..limits."""
+    x, y = (int(min(max(end, 0), limit)) for end, limit in zip(ends, limits, strict=True))
+    return x, y
 
 
 def march(

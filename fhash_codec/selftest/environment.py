@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from fhash_codec.training.devices import choose_device, has_torch
+from fhash_codec.devices import choose_device, has_torch
 from fhash_formats.support.threads import usable_threads
 
 __all__ = ["describe_machine", "environment"]

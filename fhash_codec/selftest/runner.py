@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.devices import has_torch
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import RUN_THREADS, Case, Check, Finding, Run
 from fhash_codec.selftest.checks.properties import COMMON_CHECKS
 from fhash_codec.selftest.environment import environment
 from fhash_codec.selftest.results import CaseResult
-from fhash_codec.training.devices import has_torch
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, QualityError
 from fhash_formats.series import Series

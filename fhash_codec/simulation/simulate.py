@@ -1,18 +1,9 @@
-"""Simulation of a scene: every value from its place and time alone, frame by frame.
-
-The value at a vertex is the background and what each body adds there. The flows say from where the
-medium at the vertex came: the time from 0 to a step is cut into equal parts, and in each, from the
-last to the first, every flow carries the place back (Lie splitting of the characteristics). Bodies
-are looked at there. So no error adds up from step to step, every value lies between bounds that the
-bodies give, and a step costs the same memory however many there are.
-
-A surface is as wide as its own width, what diffusion adds, and a part of the way that the medium of
-one vertex had to that of the next: sheets thinner than the lattice fade into their mean value.
-"""
+"""Simulation of a scene: every value from its position and time alone, and what was computed."""
 
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,15 +12,93 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.simulation.effects.effect import Array, Body, Place, Surface, Vector
-from fhash_codec.simulation.scene import SimulatedScene, scene_of
-from fhash_codec.simulation.terms import Terms, terms_of
+from fhash_codec.simulation.effect import Array, Bend, Body, Effect, Flow, Place, Surface, Vector
+from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
-from fhash_formats.support.fork_lock import ForkLock
-from fhash_formats.support.threads import in_threads
+from fhash_formats.support.threads import ForkLock, in_threads
 
-__all__ = ["BLOCK_VERTICES", "MAX_FRAME_VERTICES", "Counters", "Simulation", "simulate"]
+
+@dataclass(kw_only=True)
+class Terms:
+    """The terms of a scene, each with the number of its effect in the scene's list.
+
+    Attributes:
+        flows: what carries the medium, in the order of the scene.
+        bodies: what has a surface.
+        bends: what moves surfaces outwards.
+        diffusivity: sum of the diffusivities in m^2/s.
+        spreads: numbers of the effects that the diffusivity comes from.
+        idle: number of each effect without a term, and why it has none.
+        spacing: metres between vertices along z, y and x, 0 along an axis of one vertex.
+    """
+
+    flows: list[tuple[int, Flow]] = field(default_factory=list)
+    bodies: list[tuple[int, Body]] = field(default_factory=list)
+    bends: list[tuple[int, Bend]] = field(default_factory=list)
+    diffusivity: float = 0.0
+    spreads: list[int] = field(default_factory=list)
+    idle: dict[int, str] = field(default_factory=dict)
+    spacing: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def sheared(self) -> bool:
+        """Whether a flow changes distances."""
+        return not all(flow.rigid for _, flow in self.flows)
+
+    @property
+    def stretched(self) -> bool:
+        """Whether distances to a surface may differ from those in the box."""
+        return bool(self.bends) or self.sheared
+
+    @property
+    def exact(self) -> bool:
+        """Whether one part of the time gives what many would: no flow, or one that is exact."""
+        return not self.flows or (len(self.flows) == 1 and self.flows[0][1].exact)
+
+
+def spacing_of(scene: SimulatedScene) -> Vector:
+    """Metres between vertices along z, y and x, 0 along an axis of one vertex."""
+    z, y, x = (
+        length / count if count > 1 else 0.0
+        for length, count in zip(scene.size, scene.shape, strict=True)
+    )
+    return z, y, x
+
+
+def terms_of(scene: SimulatedScene, seed: int) -> Terms:
+    """Make the terms of a scene.
+
+    An effect draws its random numbers from the seed, its kind and its number among the effects of
+    this kind that are computed. So an effect of strength 0 changes those of no other.
+    """
+    terms = Terms(spacing=spacing_of(scene))
+    bodies = any(effect.role == "body" and not effect.idle for effect in scene.effects)
+    counts: dict[str, int] = {}
+    for number, effect in enumerate(scene.effects):
+        reason = effect.idle or ("" if bodies else "the scene has no body, so nothing shows it")
+        if reason:
+            terms.idle[number] = reason
+            continue
+        counts[effect.kind] = counts.get(effect.kind, 0) + 1
+        key = [seed, zlib.crc32(effect.kind.encode()), counts[effect.kind]]
+        _add(terms, number, effect, np.random.default_rng(key))
+    return terms
+
+
+def _add(terms: Terms, number: int, effect: Effect, generator: np.random.Generator) -> None:
+    """Make the term of one effect."""
+    term = effect.term(generator, terms.spacing)
+    if isinstance(term, Flow):
+        terms.flows.append((number, term))
+    elif isinstance(term, Body):
+        terms.bodies.append((number, term))
+    elif isinstance(term, float):
+        terms.diffusivity += term
+        terms.spreads.append(number)
+    else:
+        terms.bends.append((number, term))
+
 
 Block = tuple[slice, slice, slice]
 Shifts = dict[tuple[int, Vector | None], Array]
@@ -327,3 +396,85 @@ def _coordinates(scene: SimulatedScene) -> dict[str, Coordinate]:
         )
         for axis, values in positions.items()
     }
+
+
+ROLES = {
+    "flow": "carries the medium",
+    "body": "adds its value inside its surface",
+    "bend": "moves the surfaces of all bodies",
+    "spread": "widens the surfaces of all bodies",
+}
+"""Work of the effects of each role."""
+
+
+def reasons(simulation: Simulation) -> list[tuple[str, str]]:
+    """Explain a simulation: (topic, what is computed and why), effects in the scene's order."""
+    scene, terms = simulation.scene, simulation.terms
+    notes = {number: flow.note for number, flow in terms.flows}
+    lines = [("effects", f"{_counted(len(scene.effects), 'effect')} named, one line each")]
+    for number, effect in enumerate(scene.effects):
+        if number in terms.idle:
+            text = f"not computed: {terms.idle[number]}"
+        else:
+            note = f", {notes[number]}" if notes.get(number) else ""
+            text = f"computed: {ROLES[effect.role]}{note}"
+        lines.append((f"{number + 1} {effect.kind}", text))
+    kinds = {effect.kind for effect in scene.effects}
+    unnamed = [kind for kind in EFFECTS if kind not in kinds]
+    if unnamed:
+        lines.append(("not named", f"{', '.join(unnamed)}: never made, cost nothing"))
+    lines.append(("time", _time_text(simulation)))
+    lines.append(("surfaces", _surface_text(simulation)))
+    if scene.background:
+        lines.append(("background", f"{scene.background:g} {scene.units}".removesuffix(" 1")))
+    return lines
+
+
+def counts(simulation: Simulation) -> dict[str, Any]:
+    """Counters of a simulation as JSON values; each kind of effect is there, 0 if not named.
+
+    `made` is the number of terms, and `places` for how many places they were computed.
+    """
+    counters, terms = simulation.counters, simulation.terms
+    kinds = {kind: {"made": 0, "places": 0} for kind in EFFECTS}
+    for number, effect in enumerate(simulation.scene.effects):
+        kinds[effect.kind]["made"] += number not in terms.idle
+        kinds[effect.kind]["places"] += counters.evaluations.get(number, 0)
+    return {
+        "frames": counters.frames,
+        "vertices": counters.vertices,
+        "places": counters.places,
+        "parts": counters.parts,
+        "stretches": counters.stretches,
+        "effects": kinds,
+    }
+
+
+def _time_text(simulation: Simulation) -> str:
+    """The parts into which the time to a step is cut for the flows."""
+    terms = simulation.terms
+    if not terms.flows:
+        return "nothing is carried: a step needs none of the times before it"
+    if terms.exact:
+        return "one flow, whose motion is known for any time: the time to a step is one part"
+    return (
+        f"the time to a step is cut into {simulation.scene.splits} parts (splits),"
+        " in each of which every flow acts in turn"
+    )
+
+
+def _surface_text(simulation: Simulation) -> str:
+    """The width of surfaces."""
+    terms = simulation.terms
+    if not terms.bodies:
+        return "none: the value is the background everywhere"
+    if not terms.stretched:
+        return "nothing bends them or draws them out: their width is the same everywhere"
+    causes = (["flows draw them out"] if terms.sheared else []) + (
+        ["fingers bend them"] if terms.bends else []
+    )
+    return f"{' and '.join(causes)}: their width follows from the change between vertices"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -34,7 +34,7 @@ from fhash_codec.cost.results import (
 from fhash_codec.cost.results import Stage as StageOfCost
 from fhash_codec.selftest.case import Finding
 from fhash_codec.selftest.results import CaseResult, Summary
-from fhash_codec.zarr_view.server import Server
+from fhash_codec.views.server import Server
 
 Fhash = Callable[..., Result]
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "json.md"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
-from fhash_cli.main import COMMANDS
+from fhash_cli.main import COMMANDS, program
 
 Fhash = Callable[..., Result]
 MAIN = [sys.executable, "-m", "fhash_cli.main"]
@@ -32,7 +31,7 @@ def test_help_lists_every_command(fhash: Fhash) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_its_file_and_help(fhash: Fhash, name: str) -> None:
-    command = importlib.import_module(f"fhash_cli.commands.{name}").command
+    command = program.get_command(click.Context(program), name)
     assert isinstance(command, click.Command)
     assert command.name == name
     result = fhash(name, "--help")

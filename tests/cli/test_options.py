@@ -1,9 +1,9 @@
-"""Values on the command line: their forms, and an option for every setting of an encoding."""
+"""Options that commands share, and their types."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
@@ -13,8 +13,226 @@ from click.testing import CliRunner, Result
 
 import fhash_codec
 from fhash_cli.commands.encode import command as encode
-from fhash_cli.options import RealRange
+from fhash_cli.main import COMMANDS, program
+from fhash_cli.options import (
+    GROUPS,
+    LAST,
+    OTHERS,
+    BaseCommand,
+    DurationType,
+    IntervalsType,
+    RealRange,
+    SliceType,
+    group_of,
+    parse_slice,
+    written,
+)
 from fhash_codec.config import EncodeConfig
+
+WHOLE = (None, None)
+LATTICE = np.arange(4 * 5 * 6).reshape(4, 5, 6)
+
+
+@pytest.mark.parametrize(
+    "text", ["0", "4", "-1", "-3", "2:5", ":", "::2", "1::3", ":-2", "-4:-1", " 1 : 4 "]
+)
+def test_slice_means_what_it_means_in_python(text: str) -> None:
+    numbers = list(range(7))
+    picked = eval(f"numbers[{text}]")
+    assert numbers[parse_slice(text)] == (picked if isinstance(picked, list) else [picked])
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "is empty"),
+        ("a", "a is no number"),
+        ("1.5", "1.5 is between two"),
+        ("1:2:3:4", "more than three parts"),
+        ("::0", "the step 0, and steps go upwards"),
+        ("::-1", "the step -1, and steps go upwards"),
+        ("1,2", "1,2 is no number"),
+    ],
+)
+def test_slice_of_another_form_says_why_and_the_form(text: str, reason: str) -> None:
+    with pytest.raises(click.BadParameter, match="half-open range A:B") as refused:
+        SliceType().convert(text, None, None)
+    assert reason in refused.value.message
+
+
+@pytest.mark.parametrize(
+    "text", ["1,2,3", "0,-1", "2", "1:3", "1:3,2", ":,:,-2:", "...,3", "1,...,2:4", "...", "-2:,1:"]
+)
+def test_a_region_of_indices_is_that_of_numpy_with_every_axis_kept(text: str) -> None:
+    spans = IntervalsType(int).convert(text, None, None)
+    picked = LATTICE[tuple(slice(*span) for span in spans)]
+    assert picked.ndim == 3
+    assert picked.ravel().tolist() == np.ravel(eval(f"LATTICE[{text}]")).tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.5:1e3, :2 ,-1:", ((0.5, 1000.0), (None, 2.0), (-1.0, None))),
+        ("0.5:1", ((0.5, 1.0), WHOLE, WHOLE)),
+        ("...,2:2", (WHOLE, WHOLE, (2.0, 2.0))),
+    ],
+)
+def test_a_box_of_positions(text: str, expected: tuple[object, ...]) -> None:
+    assert IntervalsType(float).convert(text, None, None) == expected
+
+
+@pytest.mark.parametrize(
+    ("number", "text", "reason"),
+    [
+        (int, "", "an interval is empty"),
+        (int, "1:2,,3:4", "an interval is empty"),
+        (int, "1:2,3:4,5:6,7:8", "4 intervals, and a region has 3 axes"),
+        (int, "...,1,...", "stands there twice"),
+        (int, "::2,:,:", "has a step, which a region has not"),
+        (int, "0.5:1,:,:", "0.5 is between two"),
+        (int, "a:b,:,:", "a is no number"),
+        (int, "1:2:3:4", "more than three parts"),
+        (float, "1,2,3", "'1' is one position, and an interval has two ends"),
+        (float, "1:2:3", "more than two ends"),
+        (float, "3:1,:,:", "'3:1' ends before it begins"),
+        (float, "nan:1", "'nan' is no position"),
+        (float, "a:1", "'a' is no position"),
+    ],
+)
+def test_intervals_of_another_form_say_why_and_the_form(
+    number: type[int] | type[float], text: str, reason: str
+) -> None:
+    with pytest.raises(click.BadParameter, match="write z0:z1,y0:y1,x0:x1") as refused:
+        IntervalsType(number).convert(text, None, None)
+    assert reason in refused.value.message
+
+
+@pytest.mark.parametrize("text", ["5", "-3", "-1", "2:4", ":", "2:", ":-1"])
+def test_a_range_is_written_as_it_was_given(text: str) -> None:
+    chosen = parse_slice(text)
+    assert written(chosen.start, chosen.stop) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90s", 90), ("2m", 120), ("1.5h", 5400), ("45", 45), (" 3 m", 180)]
+)
+def test_a_time_is_a_number_of_seconds(text: str, seconds: float) -> None:
+    assert DurationType().convert(text, None, None) == seconds
+
+
+@pytest.mark.parametrize("text", ["soon", "2d", "-3s", "0s", "48h", ""])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(click.BadParameter, match=r"is no time|allowed: 1s to 24h"):
+        DurationType().convert(text, None, None)
+
+
+Fhash = Callable[..., Result]
+
+
+def commands() -> Iterator[click.Command]:
+    """Every command, with those of the benches."""
+    for name in COMMANDS:
+        command = program.get_command(click.Context(program), name)
+        assert command is not None
+        if isinstance(command, click.Group):
+            yield from command.commands.values()
+        else:
+            yield command
+
+
+def sections(fhash: Fhash, command: str) -> dict[str, str]:
+    """The help of a command by the headings of its groups."""
+    text = fhash(*command.split(), "--help").stdout
+    parts = [part.partition(":\n") for part in text.split("\n\n")]
+    return {title.strip(): rows for title, _, rows in parts if rows.startswith("  -")}
+
+
+@pytest.mark.parametrize("command", tuple(commands()), ids=lambda command: str(command.name))
+def test_every_command_is_of_this_kind_and_names_each_option_once(command: click.Command) -> None:
+    assert isinstance(command, BaseCommand)
+    with click.Context(command) as context:
+        formatter = click.HelpFormatter(width=10_000)
+        command.format_options(context, formatter)
+        lines = [
+            line.split()[0].rstrip(",")
+            for line in formatter.getvalue().splitlines()
+            if line.startswith("  -")
+        ]
+        options = [
+            option for option in command.get_params(context) if isinstance(option, click.Option)
+        ]
+    assert sorted(lines) == sorted(min(option.opts, key=len) for option in options)
+
+
+def test_the_help_of_encode_has_the_groups_of_its_options(fhash: Fhash) -> None:
+    groups = sections(fhash, "encode")
+    order = ["Input", "Quality, one of", "Feature", "Profile compact", "Profile paper"]
+    assert [title for title in groups if title in order] == order
+    assert tuple(groups)[-2:] == LAST
+    for title, option in {
+        "Input": "--var", "Quality, one of": "--max-error", "Feature": "--feature",
+        "Profile compact": "--effort", "Profile paper": "--epochs", "Output": "-o",
+        "Run": "--quiet",
+    }.items():  # fmt: skip
+        assert f"{option} " in groups[title], option
+
+
+@pytest.mark.parametrize(
+    ("command", "title", "option"),
+    [
+        ("decode", "Steps and region", "--t "),
+        ("decode", "Output", "--isosurface "),
+        ("diff", "Quality, gates", "--min-psnr "),
+        ("render", "Camera", "--azimuth "),
+        ("render", "Animation", "--fps "),
+        ("bench rate", "Comparison", "--target "),
+    ],
+)
+def test_options_mean_what_their_command_makes_of_them(
+    fhash: Fhash, command: str, title: str, option: str
+) -> None:
+    assert option in sections(fhash, command)[title]
+
+
+def test_a_new_option_is_shown_without_being_named_here() -> None:
+    assert group_of("encode", click.Option(["--never-heard-of"])) == OTHERS
+
+
+def test_no_option_is_in_two_groups() -> None:
+    names = [name for members in GROUPS.values() for name in members]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (["encode", "a", "-o", "b", "-o", "c"], "-o"),
+        (["encode", "a", "-o", "b", "--var", "u", "--var", "v"], "--var"),
+        (["encode", "a", "-o", "b", "--psnr", "40", "--psnr=50"], "--psnr"),
+        (["encode", "a", "-o", "b", "--timings", "--no-timings"], "--timings/--no-timings"),
+        (["decode", "a", "--roi", "1", "--roi", "2"], "--roi"),
+        (["diff", "a", "b", "--t", "1", "--t", "2"], "--t"),
+        (["render", "a", "--zoom", "1", "--zoom", "2"], "--zoom"),
+        (["bench", "rate", "a", "--effort", "1", "--effort", "2"], "--effort"),
+        (["bench", "render", "a", "--size", "16", "--size", "32"], "--size"),
+        (["selftest", "--processes", "1", "--processes", "2"], "--processes"),
+        (["demo", "--scene", "front", "--scene", "vortex"], "--scene"),
+    ],
+    ids=" ".join,
+)
+def test_a_single_value_that_is_given_twice_is_refused(
+    refused: Callable[..., str], words: list[str], option: str
+) -> None:
+    advice = "a file RUN.fhz holds one variable" if option == "--var" else "give it once"
+    assert refused(2, *words).startswith(f"{option} is given more than once; {advice}")
+
+
+def test_flags_may_be_repeated_and_lists_as_well(fhash: Fhash, run: str) -> None:
+    assert fhash("verify", run, "-q", "-q").exit_code == 0
+    result = fhash("decode", run, "--time", "0", "--time", "1", "-q", "--json", "--json")
+    assert result.exit_code == 0, result.output
+
 
 SMALL = ["--effort", "1", "--quiet"]
 

@@ -6,7 +6,7 @@ import torch
 from readable_paper import NaiveEngine
 from torch import Tensor
 
-from fhash_codec.paper.engines.initial import Parameters
+from fhash_codec.paper.engines.parameters import Parameters
 
 RATE = 0.01
 """Learning rate of the trainings."""

@@ -10,14 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.stream.fields import CORNERS, _of_cells, central_slopes
-from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.task.arrays import NUMPY, Array, Arrays
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.palette import Palette
-from fhash_codec.rendering.task.slopes import flatness, smoothing
-from fhash_codec.rendering.task.task import Frame, Marched, Task
+from fhash_codec.rendering.bricks import Bricks, Palette
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.light import flatness, smoothing
+from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Marched, Task
+from fhash_codec.rendering.stream_fields import CORNERS, _of_cells, central_slopes
+from fhash_codec.rendering.stream_march import stream
 
 
 class FrameField:

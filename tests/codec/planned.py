@@ -11,11 +11,11 @@ import numpy.typing as npt
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.attempt import GainLog, PlanTask
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.coreset.selection import select_features
+from fhash_codec.compact.tiles import Blocks
+from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
-from fhash_formats.transform.tile.sections import Shape
+from fhash_formats.transform.tile_format import Shape
 
 
 def waves(shape: tuple[int, ...]) -> npt.NDArray[Any]:

@@ -18,11 +18,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture, Resolution
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import Parameters, initial_parameters
-from fhash_codec.training.adam import BETA1, BETA2, EPSILON
+from fhash_codec.paper.engines.parameters import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    Parameters,
+    initial_parameters,
+)
+from fhash_codec.paper.network import Architecture, Resolution
 
 
 def bucket_index(corner: Tensor, resolution: Resolution) -> Tensor:

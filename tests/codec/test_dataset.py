@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,10 +10,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from cf_files import smooth
 
 import fhash_codec
 from fhash_codec import Dataset, EncodeConfig, InputError, Volume
+from fhash_codec import dataset as shared_volumes
+from fhash_codec.dataset import acquire, place_of, release, volumes_of
 from fhash_codec.volume import open as open_volume
+from fhash_formats.errors import InputError as InputError_shared_volumes
+from fhash_formats.errors import MissingInputError
 
 Arrays = dict[str, npt.NDArray[np.float32]]
 
@@ -102,3 +108,73 @@ def test_what_is_told_of_a_variable_is_its_own(run: tuple[Arrays, Path]) -> None
         assert "v" in infos["v"]["arrays"]
         assert "a_u" in infos["a/u"]["arrays"]
         assert dataset["a/u"].describe()["tables"][0]["path"] == "a_u"
+
+
+QUICK = EncodeConfig(effort=1, psnr=30, without=("ssim",))
+
+
+@pytest.fixture(scope="module")
+def run_shared_volumes(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("shared") / "run.fhz"
+    fhash_codec.encode(smooth(2, 4, 5, 6), path, QUICK)
+    return path
+
+
+def test_a_file_is_opened_once(run_shared_volumes: Path) -> None:
+    first, second = acquire(str(run_shared_volumes)), acquire(str(run_shared_volumes))
+    assert first is second
+    assert list(first.volumes) == ["values"]
+    assert first.is_of_this_process()
+    with volumes_of(str(run_shared_volumes))["values"] as other:
+        assert other is not first.volumes["values"]
+
+
+def test_the_last_user_closes_it(run_shared_volumes: Path) -> None:
+    handle = acquire(str(run_shared_volumes))
+    volume = handle.volumes["values"]
+    release(handle)
+    volume.read(0)
+    del handle
+    with pytest.raises(InputError_shared_volumes, match="closed"):
+        volume.container.verify()
+
+
+def test_another_state_of_the_file_is_another_volume(
+    tmp_path: Path, run_shared_volumes: Path
+) -> None:
+    path = tmp_path / "run.fhz"
+    path.write_bytes(run_shared_volumes.read_bytes())
+    handle = acquire(str(path))
+    assert acquire(str(path), None, handle.digest) is handle
+    fhash_codec.encode(smooth(3, 4, 5, 6), path, QUICK, force=True)
+    assert acquire(str(path)).volumes["values"].shape == (3, 4, 5, 6)
+    with pytest.raises(InputError_shared_volumes, match="another file"):
+        acquire(str(path), None, handle.digest)
+
+
+def test_few_files_stay_open(run_shared_volumes: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(shared_volumes, "KEPT", 2)
+    for number in range(4):
+        path = tmp_path / f"{number}.fhz"
+        path.write_bytes(run_shared_volumes.read_bytes())
+        acquire(str(path))
+    assert len(shared_volumes._kept) == 2
+    assert len(shared_volumes._open) <= 3
+
+
+def test_a_forked_process_opens_the_file_again(run_shared_volumes: Path, monkeypatch) -> None:
+    handle = acquire(str(run_shared_volumes))
+    parent = os.getpid()
+    monkeypatch.setattr(os, "getpid", lambda: parent + 1)
+    assert not handle.is_of_this_process()
+    assert acquire(str(run_shared_volumes)) is not handle
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(MissingInputError):
+        acquire(str(tmp_path / "none.fhz"))
+
+
+def test_a_place_is_absolute_or_a_url() -> None:
+    assert place_of("a.fhz") == os.path.join(os.getcwd(), "a.fhz")
+    assert place_of("https://host/a.fhz") == "https://host/a.fhz"

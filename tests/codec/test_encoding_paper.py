@@ -58,7 +58,7 @@ def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         network = load_network(volume.container)
-        from fhash_codec.paper.architecture import Architecture
+        from fhash_codec.paper.network import Architecture
 
         architecture = Architecture.for_box((8, 10, 18), 3, width=16)
         assert network.levels == architecture.levels
@@ -175,7 +175,7 @@ def test_going_on_after_a_restart_gives_the_same_bytes(field, tmp_path) -> None:
 def test_a_training_that_diverges_at_every_rate_writes_nothing(
     field, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr("fhash_codec.paper.training.train.DIVERGED", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.train.DIVERGED", 0.0)
     with pytest.raises(TrainingError, match="diverged"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
     assert not list(tmp_path.iterdir())
@@ -215,7 +215,7 @@ def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypa
 
 
 def test_a_failure_after_the_training_leaves_its_checkpoint(field, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("fhash_codec.paper.training.fit.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.fit.KEEP_SECONDS", 0.0)
     config = EncodeConfig(profile="paper", epochs=2, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     trained = []
@@ -242,8 +242,8 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(
     def full(*args):
         raise OutputError("no space left")
 
-    monkeypatch.setattr("fhash_codec.paper.training.fit.KEEP_SECONDS", 0.0)
-    monkeypatch.setattr("fhash_codec.paper.training.checkpoint.save_checkpoint", full)
+    monkeypatch.setattr("fhash_codec.paper.fit.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.train.save_checkpoint", full)
     with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
     assert decoded(tmp_path / "a.fhz").shape == field().shape

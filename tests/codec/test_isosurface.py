@@ -10,7 +10,7 @@ import pytest
 from fhash_codec.isosurface import isosurface
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import Coordinate
-from fhash_formats.writers.mesh import Mesh
+from fhash_formats.writers.vtk import Mesh
 
 
 def coords(turned: str = "") -> dict[str, Coordinate]:

@@ -16,7 +16,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.plain import export_plain
 from fhash_formats.container import Container, validate_header
-from fhash_formats.container.expected_arrays import check_arrays
+from fhash_formats.container.reader import check_arrays
 from fhash_formats.errors import DamagedFileError, OutputExistsError
 
 HERE = Path(__file__).resolve().parent

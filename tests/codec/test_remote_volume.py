@@ -83,7 +83,7 @@ def test_both_profiles_equal_the_file_at_hand(encoded, path, range_server, profi
 
 
 def test_failures_that_pass_do_not_show(path, url, range_server, monkeypatch) -> None:
-    from fhash_formats.container.fsspec_file import FsspecFile
+    from fhash_formats.container.remote import FsspecFile
 
     paused: list[float] = []
     monkeypatch.setattr(FsspecFile.__init__, "__kwdefaults__", {"pause": paused.append})
@@ -152,7 +152,7 @@ def test_pictures_name_no_secrets(path, range_server, tmp_path) -> None:
 
 
 def test_a_process_that_draws_opens_the_url_itself(url) -> None:
-    from fhash_codec.rendering.animation import workers
+    from fhash_codec.rendering import film as workers
 
     scene = fhash_codec.Scene(size=(8, 8))
     with fhash_codec.open(url) as volume:

@@ -1,17 +1,296 @@
-"""A container read like an array."""
+"""Features apart: a volume with some features of its file, decoded and drawn."""
 
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError
-from fhash_codec.value_type import decoded_type
+from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError, Scene
+from fhash_codec.boxes import Box
+from fhash_codec.features.features import dilate
+from fhash_codec.rendering.tracking import parse_tracked, tracking_scene
+from fhash_codec.volume import (
+    decoded_type,
+    feature_names,
+    holds,
+    holds_features_apart,
+    only_features,
+    placed,
+    rounded,
+)
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate
+
+LOW, HIGH = "interval:0:0.2", "interval:0.8:1"
+KEY_FRAMES = (0, 2, 3)
+
+
+def ramp() -> np.ndarray:
+    """Values that rise along x from 0 to 1, and fall along y a little with time."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 6, 24)), indexing="ij")
+    return np.clip(x - 0.05 * t * y + 0 * z, 0, 1).astype(np.float32)
+
+
+@pytest.fixture(scope="module", params=["float16", "transform", "plain"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with plain tables, one with coded tables, and that one in plain numbers."""
+    path = tmp_path_factory.mktemp("apart") / "two.fhz"
+    config = EncodeConfig(
+        profile="paper",
+        features=(LOW, HIGH),
+        key_frames="0,2,3",
+        epochs=2,
+        width=8,
+        tables="float16" if request.param == "float16" else "transform",
+    )
+    fhash_codec.encode(ramp(), path, config)
+    if request.param == "plain":
+        fhash_codec.export_plain(path, path.with_name("plain.fhz"))
+        return path.with_name("plain.fhz")
+    return path
+
+
+@pytest.mark.parametrize("feature", [LOW, HIGH])
+def test_a_feature_alone_has_its_own_coreset_and_the_same_values(run, feature) -> None:
+    low, high = (np.float32(end) for end in feature.split(":")[1:])
+    source = ramp()
+    masks = [dilate((source[step] >= low) & (source[step] <= high), 1) for step in range(4)]
+    with fhash_codec.open(run) as volume:
+        alone = only_features(volume, [feature])
+        assert holds_features_apart(volume)
+        assert feature_names(alone) == [feature]
+        for step in KEY_FRAMES:
+            np.testing.assert_array_equal(alone.occupancy(step), masks[step])
+            expected = np.where(masks[step], volume.read(step), np.float32(np.nan))
+            np.testing.assert_array_equal(alone.read(step), expected)
+        np.testing.assert_array_equal(alone.occupancy(1), masks[0] | masks[2])
+        again = pickle.loads(pickle.dumps(alone))
+        np.testing.assert_array_equal(again.read(2), alone.read(2))
+        again.close()
+
+
+def test_all_features_together_are_the_volume_itself(run) -> None:
+    with fhash_codec.open(run) as volume:
+        assert only_features(volume, [HIGH, LOW]) is volume
+        for step in range(4):
+            apart = [only_features(volume, [name]).occupancy(step) for name in (LOW, HIGH)]
+            np.testing.assert_array_equal(apart[0] | apart[1], volume.occupancy(step))
+
+
+def test_features_that_a_file_lacks_or_has_merged_are_refused(run, tmp_path) -> None:
+    with fhash_codec.open(run) as volume, pytest.raises(InputError, match="is none of its feat"):
+        only_features(volume, ["interval:0:0.3"])
+    path = tmp_path / "merged.fhz"
+    fhash_codec.encode(ramp(), path, EncodeConfig(features=(LOW, HIGH), effort=1))
+    with fhash_codec.open(path) as volume, pytest.raises(InputError, match="are merged"):
+        only_features(volume, [LOW])
+
+
+@pytest.mark.parametrize("count", [8, 9])
+def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
+    """The numbers of the mask have 8 bits; more features have bits."""
+    features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(count))
+    config = EncodeConfig(
+        profile="paper", features=features, epochs=1, width=4, dilation=0, tables="transform"
+    )
+    path, plain = tmp_path / "many.fhz", tmp_path / "plain.fhz"
+    fhash_codec.encode(ramp(), path, config)
+    fhash_codec.export_plain(path, plain)
+    for name in (path, plain):
+        with fhash_codec.open(name) as volume:
+            masked = "occupancy/mask" in volume.container.arrays
+            assert masked == (count == 8 and name == path)
+            assert masked != ("occupancy/bits" in volume.container.arrays)
+            source = ramp()[2]
+            for feature in (features[0], features[-1]):
+                low, high = (np.float32(end) for end in feature.split(":")[1:])
+                np.testing.assert_array_equal(
+                    only_features(volume, [feature]).occupancy(2),
+                    (source >= low) & (source <= high),
+                )
+
+
+def test_the_card_names_the_features_apart(run) -> None:
+    with fhash_codec.open(run) as volume:
+        occupancy = volume.describe()["occupancy"]
+        assert occupancy["apart"] == [LOW, HIGH]
+        stored = volume.container.arrays
+        assert occupancy["bytes"] == sum(
+            array.nbytes_stored for name, array in stored.items() if "occupancy/" in name
+        )
+
+
+def test_a_picture_of_one_feature_skips_the_other(run) -> None:
+    opaque = {"opacity": [[0, 0.5], [1, 0.5]]}
+    scene = Scene.from_dict({"size": [24, 24], "transfer_function": opaque})
+    with fhash_codec.open(run) as volume:
+        renderer = fhash_codec.Renderer(volume)
+        both = renderer.render(scene)
+        one = renderer.render(Scene.from_dict({**scene.to_dict(), "features": [LOW]}))
+        assert 0 < one.counters["samples"] < both.counters["samples"]
+        assert one.scene["features"] == [LOW]
+        np.testing.assert_array_equal(renderer.render(scene).rgba, both.rgba)
+
+
+def test_tracking_one_feature_of_several_leaves_out_the_rest(run) -> None:
+    with fhash_codec.open(run) as volume:
+        shown = {}
+        for texts in ([LOW], [LOW, HIGH], ["interval:0:0.1"], ["interval:0:0.1", LOW]):
+            tracked = parse_tracked(texts, volume)
+            shown[len(shown)] = tracking_scene(Scene(), tracked, volume).features
+    assert shown == {0: (LOW,), 1: (), 2: (), 3: ()}
+
+
+QUICK = {"effort": 1, "timings": False}
+
+
+def labels(dtype: str = "i2") -> np.ndarray:
+    """Four labels in blocks that move along x."""
+    x = (np.arange(12) + np.arange(3)[:, None, None, None]) // 3
+    return np.broadcast_to(x * 7 + np.arange(5)[:, None] // 2, (3, 4, 5, 12)).astype(dtype)
+
+
+class Holed(ArraySeries):
+    """Integers with missing values, as a reader gives them: floats, NaN where the fill was."""
+
+    def __init__(self, values: np.ndarray, fill: int | None) -> None:
+        holes = np.zeros(values.shape, bool)
+        holes[:, 1, 2:4, 3:6] = True
+        super().__init__(np.where(holes, np.nan, values).astype(decoded_type(values.dtype)))
+        self.source_dtype, self.fill = values.dtype, fill
+        self.stored = np.where(holes, -1 if fill is None else fill, values).astype(values.dtype)
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u2", "i4", "i8", "u8"])
+@pytest.mark.parametrize("promise", [{"max_error": 0.0}, {"max_error": 0.49}, {"max_error": 0.9}])
+def test_a_bound_below_one_keeps_integers_exactly(tmp_path, dtype, promise) -> None:
+    values = labels(dtype)
+    if values.dtype.itemsize == 8:
+        values += np.array(2**60 + 1, dtype)
+    figures = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(**promise, **QUICK))
+    assert figures["max_abs_error"] == 0
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (volume.dtype, volume.fill) == (values.dtype, 0)
+        np.testing.assert_array_equal(volume[...], values)
+        np.testing.assert_array_equal(volume[1, :, ::-2, 3], values[1, :, ::-2, 3])
+        assert volume[...].dtype == np.asarray(volume).dtype == values.dtype
+        assert volume.read(1).dtype == volume.read_lod(1, 1).dtype == decoded_type(values.dtype)
+        assert volume.values(0.5).dtype == decoded_type(values.dtype)
+
+
+@pytest.mark.parametrize("promise", [{"psnr": 40.0}, {"max_error": 2.5}, {"psnr": 15.0}])
+def test_other_promises_keep_the_type_as_well(tmp_path, promise) -> None:
+    fhash_codec.encode(labels(), tmp_path / "a.fhz", EncodeConfig(**promise, **QUICK))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume[0].dtype == np.int16
+        np.testing.assert_array_equal(volume[...], [volume.read(t) for t in range(3)])
+        if "max_error" in promise:
+            assert np.abs(volume[...] - labels()).max() <= 2
+
+
+def test_vertices_without_a_value_need_a_fill_value(tmp_path) -> None:
+    config = EncodeConfig(max_error=0.0, features=("interval:7:15",), dilation=0, **QUICK)
+    fhash_codec.encode(labels(), tmp_path / "a.fhz", config)
+    inside = (labels() >= 7) & (labels() <= 15)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (volume.dtype, volume.fill) == (np.float32, None)
+        np.testing.assert_array_equal(volume[...], np.where(inside, labels(), np.nan))
+    with fhash_codec.open(tmp_path / "a.fhz", fill=-5) as volume:
+        assert (volume.dtype, volume.fill) == (np.int16, -5)
+        np.testing.assert_array_equal(volume[...], np.where(inside, labels(), -5))
+        background = volume.values(0, outside="background")
+        assert set(background[~inside[0]].tolist()) == {round(volume.background)}
+    with fhash_codec.open(tmp_path / "a.fhz", fill=0.5) as volume:
+        assert (volume.dtype, volume.fill) == (np.float32, 0.5)
+        np.testing.assert_array_equal(volume[...], np.where(inside, labels(), 0.5))
+
+
+@pytest.mark.parametrize("promise", [{"max_error": 0.0}, {"max_error": 3.0}, {"psnr": 30.0}])
+@pytest.mark.parametrize("fill", [-100, None])
+def test_missing_integers_come_back_as_the_fill_value_of_the_source(
+    tmp_path, promise, fill
+) -> None:
+    series = Holed(labels("i1"), fill)
+    figures = fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(**promise, **QUICK))
+    assert figures["raw_bytes"] == labels("i1").nbytes
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert "missing/bits" not in volume.container.arrays
+        assert volume.dtype == (np.float32 if fill is None else np.int8)
+        gaps = np.isnan(volume.read(0))
+        np.testing.assert_array_equal(gaps, np.isnan(series.read(0)))
+        np.testing.assert_array_equal(np.isnan(volume.read(0, outside="background")), gaps)
+        if fill is not None:
+            assert (volume[0][gaps] == fill).all()
+        if promise == {"max_error": 0.0} and fill is not None:
+            np.testing.assert_array_equal(volume[...], series.stored)
+
+
+def test_floats_have_nan_unless_a_fill_value_is_asked_for(tmp_path) -> None:
+    series = ArraySeries(np.where(labels() == 7, np.nan, labels()).astype("f4"))
+    series.fill = 1e20
+    fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(max_error=0.5, **QUICK))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.info["variable"]["fill"] == 1e20
+        assert np.isnan(volume[...]).any()
+        assert volume.fill is None
+    with fhash_codec.open(tmp_path / "a.fhz", fill=-1) as volume:
+        np.testing.assert_array_equal(volume[...] == -1, np.isnan(series.values))
+        assert volume[...].dtype == np.float32
+        assert (volume.values(0.5) == -1).sum() >= (volume[0] == -1).sum()
+
+
+def test_values_between_those_of_a_network_stay_floats(tmp_path) -> None:
+    config = EncodeConfig(profile="paper", epochs=1, width=4, timings=False)
+    fhash_codec.encode(labels(), tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume[...].dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("dtype", "number", "held"),
+    [
+        ("i1", 127, True),
+        ("i1", 128, False),
+        ("u1", -1, False),
+        ("i2", 1.5, False),
+        ("i2", 2.0, True),
+        ("i4", float("nan"), False),
+        ("f4", float("nan"), True),
+        ("f4", 1e39, False),
+        ("u8", 2**64 - 1, True),
+    ],
+)
+def test_numbers_that_a_type_holds(dtype, number, held) -> None:
+    assert holds(np.dtype(dtype), number) is held
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u1", "i4", "i8", "u8"])
+def test_rounding_stays_within_the_type(dtype) -> None:
+    limits = np.iinfo(dtype)
+    ends = np.array([float(limits.min), float(limits.max), np.nan, 2.4, 1e300, -1e300])
+    whole = rounded(ends, np.dtype(dtype))
+    assert whole.dtype == np.dtype(dtype)
+    assert whole[0] == whole[5] == limits.min
+    assert int(whole[1]) == int(whole[4]) >= limits.max - 2 ** max(limits.bits - 53, 0)
+    assert whole[2:4].tolist() == [0, 2]
+
+
+def test_values_are_placed_where_the_mask_says_and_nan_elsewhere() -> None:
+    values = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    mask = values != 3
+    box = Box.of(((1, 3), (0, 2), (2, 4)))
+    result = placed(values, mask, box, (3, 2, 5))
+    assert result.dtype == np.float32
+    assert result.shape == (3, 2, 5)
+    assert np.isnan(result).sum() == 30 - 7
+    np.testing.assert_array_equal(result[1:, :, 2:4][mask], values[mask])
+    whole = Box.of_shape((2, 2, 2))
+    assert placed(values, np.ones_like(mask), whole, (2, 2, 2)) is values
+    assert np.isnan(placed(values, mask, whole, (2, 2, 2))[0, 1, 1])
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The engine `fhash` gives what xarray gives of the source, but for the stated error."""
+"""A lazy array has the dimensions of the source in their order, whatever is asked for."""
 
 from __future__ import annotations
 
@@ -6,20 +6,234 @@ import pickle
 import tomllib
 from functools import partial
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
 from cf_files import KINDS, Kind, smooth
+from xarray.core import indexing
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.coreset.labelled import labelled_series
-from fhash_codec.xarray_backend import FhashBackend
+from fhash_codec.features.selection import labelled_series
+from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide, shown_names
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
+
+DIMENSIONS = {"lon": "x", "one": "", "time": "t", "lat": "y"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> tuple[Path, np.ndarray]:
+    """A container of one level, and its values as (x, 1, t, y)."""
+    path = tmp_path_factory.mktemp("lazy") / "run.fhz"
+    config = EncodeConfig(effort=1, psnr=30, without=("ssim",), tile="2x1x4x4")
+    fhash_codec.encode(smooth(4, 1, 9, 7), path, config)
+    with fhash_codec.open(path) as volume:
+        return path, volume[:, 0].transpose(2, 0, 1)[:, None]
+
+
+def array(path: Path, **form: Any) -> FhashArray:
+    options = {"dimensions": DIMENSIONS, "lod": None, "outside": "nan", **form}
+    return FhashArray(str(path), "values", Form(**options), None)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        (slice(None),) * 4,
+        (3, 0, -1, 2),
+        (slice(6, 1, -2), 0, slice(1, 3), slice(None)),
+        (slice(2, 5), slice(None), 1, slice(8, None)),
+        (slice(0, 0), slice(0, 0), 0, slice(None)),
+        (5, slice(None, None, -1), slice(3, None, -3), 0),
+    ],
+)
+def test_keys_are_those_of_numpy(run, key: tuple[Any, ...]) -> None:
+    path, whole = run
+    lazy = array(path)
+    assert (lazy.shape, lazy.dtype) == (whole.shape, whole.dtype)
+    np.testing.assert_array_equal(lazy[indexing.BasicIndexer(key)], whole[key])
+
+
+def test_arrays_of_indices_are_taken(run) -> None:
+    path, whole = run
+    variable = xr.Variable(tuple(DIMENSIONS), indexing.LazilyIndexedArray(array(path)))
+    found = variable[[6, 0, 3], 0, :, [1, 1]].values
+    np.testing.assert_array_equal(found, whole[[6, 0, 3], 0][:, :, [1, 1]])
+
+
+def test_chunks_are_the_tiles_of_the_dimensions(run) -> None:
+    path, _ = run
+    with fhash_codec.open(path) as volume:
+        form = Form(dimensions=DIMENSIONS, lod=None, outside="nan")
+        t, _, y, x = volume.chunks
+        assert form.chunks(volume) == {"lon": x, "one": 1, "time": t, "lat": y}
+        coarse = Form(dimensions=DIMENSIONS, lod=1, outside="nan")
+        assert coarse.sizes(volume) == {"lon": 4, "one": 1, "time": 4, "lat": 5}
+        assert coarse.chunks(volume)["lon"] == x // 2
+
+
+def test_a_released_array_reads_on(run) -> None:
+    path, whole = run
+    lazy = array(path)
+    lazy.release()
+    lazy.release()
+    np.testing.assert_array_equal(lazy[indexing.BasicIndexer((0, 0, 0, 0))], whole[0, 0, 0, 0])
+
+
+CONFIG = EncodeConfig(max_error=0.01, effort=1, timings=False)
+SHAPE = (3, 1, 5, 6)
+
+
+def values(seed: int, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+
+
+def opened(sources: dict[str, Any], path: Path) -> xr.Dataset:
+    fhash_codec.encode_dataset(sources, path, CONFIG)
+    return xr.open_dataset(path, engine="fhash")
+
+
+def along(**sizes: int) -> xr.Variable:
+    return xr.Variable(tuple(sizes), np.zeros(tuple(sizes.values())))
+
+
+def test_variables_of_one_name_in_their_sources_are_all_there(tmp_path: Path) -> None:
+    sources = {f"{group}/u": ArraySeries(values(n), name="u") for n, group in enumerate("gh")}
+    with opened(sources, tmp_path / "a.fhz") as dataset:
+        for number, name in enumerate(sources):
+            np.testing.assert_allclose(dataset[name], values(number), atol=0.01)
+
+
+def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
+    half = {"x": Coordinate(name="x", values=np.arange(6) + 0.5)}
+    sources = {
+        "u": ArraySeries(values(0), name="u"),
+        "v": ArraySeries(values(1), name="v", coords=half),
+        "w": ArraySeries(values(2, (3, 1, 5, 7)), name="w"),
+        "p": ArraySeries(values(3), name="p", coords=half),
+    }
+    with opened(sources, tmp_path / "a.fhz") as dataset:
+        dimensions = {name: dataset[name].dims[-1] for name in sources}
+        assert dimensions == {"u": "x", "v": "x_2", "w": "x_3", "p": "x_2"}
+        assert dataset["v"].dims[:3] == dataset["u"].dims[:3]
+        assert dataset["x_2"].values.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
+        assert dataset.sizes["x_3"] == 7
+
+
+def with_latitudes(number: int) -> ArraySeries:
+    series = ArraySeries(values(number), name=f"u{number}")
+    latitudes = np.full((5, 6), 10.0 * number)
+    series.metadata = SourceMetadata(
+        dimensions={"time": "t", "y": "y", "x": "x"},
+        variable_attributes={"coordinates": "lat"},
+        variables=(
+            SourceVariable(name="lat", dimensions=("y", "x"), values=latitudes, is_coordinate=True),
+        ),
+    )
+    return series
+
+
+def test_arrays_beside_of_one_name_do_not_take_the_place_of_others(tmp_path: Path) -> None:
+    sources = {"u0": with_latitudes(0), "u1": with_latitudes(1)}
+    with opened(sources, tmp_path / "a.fhz") as dataset:
+        assert set(dataset.coords) == {"lat", "lat_2"}
+        assert (dataset["lat"] == 0).all()
+        assert (dataset["lat_2"] == 10).all()
+    with xr.open_dataset(tmp_path / "a.fhz", engine="fhash", decode_coords=False) as raw:
+        assert raw["u0"].attrs["coordinates"] == "lat"
+        assert raw["u1"].attrs["coordinates"] == "lat_2"
+
+
+def test_a_coordinate_has_not_the_name_of_a_variable() -> None:
+    joined = SideBySide({"u": "x", "x": "x"})
+    assert joined.add("u", along(x=3), {"x": along(x=3)}) == {"x": "x_2"}
+    joined.add("x", along(x=3), {"x": along(x=3)})
+    assert {name: v.dims for name, v in joined.variables.items()} == {
+        "x_2": ("x_2",),
+        "u": ("x_2",),
+        "x": ("x_2",),
+    }
+
+
+def test_the_values_of_a_variable_are_not_there_again_beside_another() -> None:
+    joined = SideBySide({"u": ("t", "x"), "mask": ("t", "x"), "height": ("t", "x")})
+    found = joined.add("u", along(t=2, x=3), {"mask": along(x=3, t=2), "height": along()})
+    assert found == {"mask": "mask", "height": "height_2"}
+    assert set(joined.variables) == {"u", "height_2"}
+
+
+def test_a_dimension_without_positions_is_shared() -> None:
+    joined = SideBySide({"u": "x", "v": "x", "w": "x"})
+    joined.add("u", along(x=3), {})
+    joined.add("v", along(x=3), {"x": along(x=3)})
+    joined.add("w", along(x=3), {"x": along(x=3) + 1})
+    assert joined.variables["v"].dims == ("x",)
+    assert joined.variables["w"].dims == ("x_2",)
+
+
+def test_a_variable_alone_keeps_the_names_of_its_source() -> None:
+    joined = SideBySide({"x": "x"})
+    joined.add("x", along(x=3), {})
+    assert joined.variables["x"].dims == ("x",)
+
+
+def test_names_are_those_of_the_sources_where_these_differ() -> None:
+    assert shown_names({"a/u": "u", "b/v": "v"}) == {"a/u": "u", "b/v": "v"}
+    assert shown_names({"a": "u", "b": "u", "c": "b"}) == {"a": "a", "b": "b", "c": "c"}
+
+
+def vector_file(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """A vector whose components have the names of the axes; their values."""
+    arrays = {name: values(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
+    with h5py.File(path, "w") as file:
+        for step, (name, array) in product((0, 1), arrays.items()):
+            place = f"data/{step}/meshes/B/{name}" if kind == "openpmd" else f"velocity/{name}"
+            if kind == "openpmd":
+                file.require_group(f"data/{step}").attrs["time"] = float(step)
+                file.require_group(f"data/{step}/meshes/B").attrs["axisLabels"] = list("xyz")
+                file[place] = array[step]
+            elif not step:
+                file[place] = array
+    return arrays
+
+
+@pytest.mark.parametrize("kind", ["openpmd", "groups", "arrays"])
+def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> None:
+    source, path = tmp_path / "run.h5", tmp_path / "run.fhz"
+    arrays = vector_file(source, kind)
+    word = {"openpmd": "B", "groups": "velocity", "arrays": "values"}[kind]
+    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, CONFIG)
+    with xr.open_dataset(path, engine="fhash") as found:
+        assert set(found.data_vars) == {f"{word}_{name}" for name in "xyz"}
+        assert sum(each**2 for each in found.data_vars.values()).dims == ("time", "z", "y", "x")
+        assert found.sizes.keys() == {"time", "z", "y", "x"}
+    with fhash_codec.open(path) as dataset:
+        assert dataset["y"].name == f"{word}_y"
+        assert "y" in dataset
+        assert "w" not in dataset
+        with pytest.raises(KeyError, match="no variable 'w'"):
+            dataset["w"]
+    with fhash_codec.open(path, variable="z") as volume:
+        assert volume.name == f"{word}_z"
+
+
+def test_a_last_part_of_several_names_is_refused(tmp_path: Path) -> None:
+    arrays = {name: values(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
+    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", CONFIG)
+    with fhash_codec.open(tmp_path / "run.fhz") as dataset:
+        assert [dataset[name].name for name in ("E/x", "B_x", "rho")] == ["E_x", "B_x", "B/rho"]
+        with pytest.raises(KeyError, match="2 variables named 'x'"):
+            dataset["x"]
+    with pytest.raises(InputError, match="2 variables named 'x'"):
+        fhash_codec.open(tmp_path / "run.fhz", variable="x")
+
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,7 +260,7 @@ def plain(tmp_path_factory) -> Path:
     return path
 
 
-def opened(path: Path, **options: Any) -> xr.Dataset:
+def opened_xarray_backend(path: Path, **options: Any) -> xr.Dataset:
     return xr.open_dataset(path, engine=FhashBackend, **options)
 
 
@@ -68,7 +282,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
     name = kind.variable
     with (
         xr.open_dataset(source, decode_coords=coords) as whole,
-        opened(container, decode_coords=coords) as stored,
+        opened_xarray_backend(container, decode_coords=coords) as stored,
     ):
         wanted, found = whole.isel(kind.select), stored
         if not coords:
@@ -92,7 +306,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
 
 def test_the_file_says_where_it_comes_from(made) -> None:
     container = made[2]
-    with opened(container) as stored:
+    with opened_xarray_backend(container) as stored:
         *before, line = stored.attrs["history"].split("\n")
         assert "fhash encode source.nc --psnr 45 --effort 1 --without ssim" in line
         assert line.startswith("fhash ")  # no date without timings
@@ -112,7 +326,7 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
             original(self, steps, *args, **kw),
         )[1],
     )
-    with opened(plain) as stored:
+    with opened_xarray_backend(plain) as stored:
         part = stored["values"].isel(time=slice(3, None, -2), z=4)
         assert read == []
         assert part.shape == (2, 20, 24)
@@ -130,14 +344,14 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
     ],
 )
 def test_indices_are_those_of_numpy(plain, key: tuple[Any, ...]) -> None:
-    with fhash_codec.open(plain) as volume, opened(plain) as stored:
+    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
         whole = xr.Variable(volume.dims, volume[...])
         np.testing.assert_array_equal(stored["values"][key].values, whole[key].values)
 
 
 def test_points_are_picked_one_by_one(plain) -> None:
     places = xr.DataArray([0, 3, 3], dims="point")
-    with fhash_codec.open(plain) as volume, opened(plain) as stored:
+    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
         found = stored["values"].isel(time=places, x=places + 5).values
         whole = volume[...]
     np.testing.assert_array_equal(found, np.stack([whole[n, :, :, n + 5] for n in (0, 3, 3)]))
@@ -147,7 +361,7 @@ def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
     with fhash_codec.open(plain) as volume:
         whole = volume[...]
         tile = volume.chunks
-    with opened(plain, chunks={}) as stored:
+    with opened_xarray_backend(plain, chunks={}) as stored:
         lazy = stored["values"]
         assert tuple(along[0] for along in lazy.chunks) == tile
         for scheduler in ("synchronous", "threads", "processes"):
@@ -157,7 +371,7 @@ def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
 
 
 def test_a_dataset_is_pickled_by_its_path(plain) -> None:
-    with opened(plain) as stored:
+    with opened_xarray_backend(plain) as stored:
         data = pickle.dumps(stored)
         assert len(data) < 20_000
         other = pickle.loads(data)
@@ -167,7 +381,7 @@ def test_a_dataset_is_pickled_by_its_path(plain) -> None:
 def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
     path = tmp_path / "run.fhz"
     path.write_bytes(plain.read_bytes())
-    with opened(path) as stored:
+    with opened_xarray_backend(path) as stored:
         data = pickle.dumps(stored)
     path.unlink()
     fhash_codec.encode(smooth(5, 12, 20, 24), path, QUICK)
@@ -176,14 +390,14 @@ def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
 
 
 def test_a_closed_dataset_opens_its_file_again(plain) -> None:
-    stored = opened(plain)
+    stored = opened_xarray_backend(plain)
     before = stored["values"][0].values
     stored.close()
     np.testing.assert_array_equal(stored["values"][0].values, before)
 
 
 def test_levels_of_detail_have_every_other_vertex(plain) -> None:
-    with fhash_codec.open(plain) as volume, opened(plain, lod=1) as stored:
+    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain, lod=1) as stored:
         z, y, x = volume.lod_vertices(1)
         assert stored["values"].shape == (5, len(z), len(y), len(x))
         np.testing.assert_array_equal(stored["x"], list(x))
@@ -194,7 +408,10 @@ def test_levels_of_detail_have_every_other_vertex(plain) -> None:
 
 
 def test_the_background_stands_outside(plain) -> None:
-    with fhash_codec.open(plain) as volume, opened(plain, outside="background") as stored:
+    with (
+        fhash_codec.open(plain) as volume,
+        opened_xarray_backend(plain, outside="background") as stored,
+    ):
         assert np.isnan(volume[0]).any()
         np.testing.assert_array_equal(
             stored["values"][0].values, volume.read(0, outside="background")
@@ -206,7 +423,7 @@ def test_the_background_stands_outside(plain) -> None:
 )
 def test_other_options_are_refused(plain, options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        opened(plain, **options)
+        opened_xarray_backend(plain, **options)
 
 
 def test_a_container_is_known_by_its_end(plain, tmp_path) -> None:
@@ -229,7 +446,7 @@ def test_a_dataset_is_encoded_by_its_accessor(tmp_path) -> None:
     kind = KINDS["rotated"]()
     source = xr.decode_cf(kind.dataset, decode_coords="all")
     source.fhash.encode(tmp_path / "run.fhz", effort=1, psnr=45.0)
-    with opened(tmp_path / "run.fhz", decode_coords="all") as stored:
+    with opened_xarray_backend(tmp_path / "run.fhz", decode_coords="all") as stored:
         same = stored.assign(tas=stored["tas"].copy(data=source["tas"].values))
         xr.testing.assert_identical(without_own(source), without_own(same))
     with pytest.raises(InputError, match="unknown setting"):
@@ -247,7 +464,10 @@ def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None
     encoding = kind.encoding | {"pr": {"_FillValue": None}}
     data.to_netcdf(tmp_path / "two.nc", engine="h5netcdf", encoding=encoding)
     fhash_codec.encode_dataset(tmp_path / "two.nc", tmp_path / "run.fhz", QUICK)
-    with xr.open_dataset(tmp_path / "two.nc") as whole, opened(tmp_path / "run.fhz") as found:
+    with (
+        xr.open_dataset(tmp_path / "two.nc") as whole,
+        opened_xarray_backend(tmp_path / "run.fhz") as found,
+    ):
         same = found
         for name in ("tas", "pr"):
             error = np.abs(whole[name].values - found[name].values).max()
@@ -299,7 +519,7 @@ def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: st
             fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
     else:
         fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
-    with opened(tmp_path / "run.fhz") as stored:
+    with opened_xarray_backend(tmp_path / "run.fhz") as stored:
         error = stored["t2m"].attrs["fhash_max_error"]
         assert "valid_min" not in stored["t2m"].attrs
         stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")

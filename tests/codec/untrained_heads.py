@@ -11,8 +11,8 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.tiles_to_promise import code_series
-from fhash_formats.transform.head.head import Layer, NeighbourHead
+from fhash_codec.compact.encode import code_series
+from fhash_formats.transform.head import Layer, NeighbourHead
 
 
 def field(steps: int = 2) -> np.ndarray:

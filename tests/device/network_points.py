@@ -25,9 +25,9 @@ def measured_points(
     """
     import torch
 
-    from fhash_codec.paper.engines.fused.start import start_points
-    from fhash_codec.rendering.stream.fields import HostInference
-    from fhash_codec.rendering.task.torch_arrays import TorchArrays
+    from fhash_codec.paper.engines.fused.engine import start_points
+    from fhash_codec.rendering.stream_fields import HostInference
+    from fhash_codec.rendering.torch_arrays import TorchArrays
 
     there, results = torch.device(device), []
     wait = torch.cuda.synchronize if device == "cuda" else (lambda: None)
@@ -79,9 +79,7 @@ def measured_points(
 
 def random_network(shape: tuple[int, ...], layers: int, sparse: bool) -> Any:
     """Return a network of random numbers, 64 wide; a sparse one holds a tenth of its vertices."""
-    from fhash_codec.paper.architecture import Architecture
-    from fhash_codec.paper.network import ArrayTable, Network
-    from fhash_codec.paper.tables.ranked import SparseFrame
+    from fhash_codec.paper.network import Architecture, ArrayTable, Network, SparseFrame
 
     class Held(ArrayTable):
         def frame(self, node: int) -> SparseFrame:

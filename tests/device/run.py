@@ -127,8 +127,7 @@ def machine(device: str) -> dict[str, Any]:
         "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
     }
     if device == "cuda":
-        from fhash_codec.paper.engines.fused.nvrtc import find_nvrtc
-        from fhash_codec.paper.engines.fused.source import Unavailable
+        from fhash_codec.paper.engines.fused.program import Unavailable, find_nvrtc
 
         try:
             nvrtc = find_nvrtc()
@@ -147,7 +146,7 @@ def engine_names(device: str) -> tuple[str, ...]:
 def gather(series: Any, feature: str = "all", **model: int) -> tuple[Any, Any]:
     """Return coreset and architecture of all key frames of a series."""
     from fhash_codec.config import EncodeConfig
-    from fhash_codec.paper.selection import select
+    from fhash_codec.paper.encode import select
     from fhash_codec.progress import silent
 
     config = EncodeConfig(profile="paper", features=(feature,), **model)
@@ -210,7 +209,7 @@ def speed(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str
     import torch
 
     from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.training.train import plan_training
+    from fhash_codec.paper.train import plan_training
     from fhash_codec.simulation.simulate import simulate
 
     series, results = simulate("front", sizes.shape), []
@@ -279,7 +278,7 @@ def curve(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str
     import torch
 
     from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.training.train import TrainingProgress, plan_training, train
+    from fhash_codec.paper.train import TrainingProgress, plan_training, train
     from fhash_codec.simulation.simulate import simulate
 
     series, results = simulate("front", sizes.shape), []

@@ -12,8 +12,7 @@ import numpy.typing as npt
 import fhash_codec
 from fhash_codec import EncodeConfig, Writer
 from fhash_codec.appending.parts import Part, encode_part
-from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.source_metadata import SourceMetadata, SourceVariable
+from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 
 SHAPE = (5, 3, 6, 8)
 TIME = Coordinate(

@@ -18,10 +18,9 @@ from grouped import WRITERS
 import fhash_codec
 from fhash_codec import Dataset, EncodeConfig, encoding
 from fhash_codec.compact import encode as compact
-from fhash_codec.compact.coded_table import CodedTable
-from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.source_metadata import SourceMetadata, SourceVariable
-from fhash_formats.transform.head.head import Layer, NeighbourHead
+from fhash_codec.compact.encode import CodedTable
+from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
+from fhash_formats.transform.head import Layer, NeighbourHead
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 HERE = Path(__file__).parent

@@ -5,17 +5,17 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable
 
-from fhash_formats.container.coding import crc32c
-from fhash_formats.container.source import Source
 from fhash_formats.container.zip_file import (
     END,
     Member,
+    Source,
     comment,
     ending,
     local_header,
     read_member,
     read_members,
 )
+from fhash_formats.native import crc32c
 
 Parts = list[tuple[str, bytes]]
 """Name and inflated data of each member, in the order of the file."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fhash_formats.container.header import POSITIONS, TABLE
-from fhash_formats.container.variables import part_place
+from fhash_formats.container.hierarchy import part_place
 
 DOCUMENT = "zarr.json"
 """End of the names of metadata documents; alone, the name of the root's."""

@@ -16,7 +16,6 @@ from typing import Any
 
 import injections
 
-import fhash_cli.animation_options
 import fhash_cli.commands.decode
 import fhash_cli.commands.encode
 import fhash_cli.commands.render  # noqa: F401 - imported for the forks
@@ -24,15 +23,15 @@ from fhash_cli.main import main
 
 OWN = (
     "fhash_codec",
-    "fhash_codec.appending.merging",
+    "fhash_codec.appending.parts",
     "fhash_codec.appending.writer",
-    "fhash_codec.dataset_encoding",
     "fhash_codec.encoding",
-    "fhash_codec.compact.tiles_to_promise",
+    "fhash_codec.encoding",
+    "fhash_codec.compact.encode",
     "fhash_codec.isosurface",
     "fhash_codec.paper.engines.slab",
-    "fhash_codec.paper.training.checkpoint",
-    "fhash_codec.paper.training.train",
+    "fhash_codec.paper.train",
+    "fhash_codec.paper.train",
     "fhash_codec.rendering.renderer",
     "fhash_formats.container",
 )

@@ -15,7 +15,7 @@ import zarr
 
 import fhash_codec
 from fhash_codec import Volume, zarr_store
-from fhash_codec.side_by_side import shown_names
+from fhash_codec.xarray_backend import shown_names
 from fhash_formats.series import ArraySeries
 
 FEW = 1 << 14

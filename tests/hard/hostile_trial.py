@@ -38,8 +38,7 @@ from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import FhashError, FhashWarning
-from fhash_formats.transform.tile.sections import PREDICTED, TRANSFORMED, parse_stream
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.tile_format import PREDICTED, TRANSFORMED, TileSettings, parse_stream
 
 MEMORY = 512 << 20
 """Bytes that the process may allocate beyond what it has before; larger allocations fail."""

@@ -178,10 +178,10 @@ def eager_checkpoints() -> None:
     """Let a training save its checkpoint as often as it can."""
     import functools
 
-    import fhash_codec.paper.training.train
+    import fhash_codec.paper.train
 
-    fhash_codec.paper.training.train.train = functools.partial(
-        fhash_codec.paper.training.train.train, save_seconds=0.0
+    fhash_codec.paper.train.train = functools.partial(
+        fhash_codec.paper.train.train, save_seconds=0.0
     )
 
 

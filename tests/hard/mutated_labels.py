@@ -30,9 +30,9 @@ from mutated_payload import (
 
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import InputError
-from fhash_formats.support.number_types import DTYPES
-from fhash_formats.transform.entropy.labels import MAX_LABELS
-from fhash_formats.transform.tile.sections import (
+from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.coder import MAX_LABELS
+from fhash_formats.transform.tile_format import (
     KIND,
     LABELS,
     MASKED,
@@ -41,9 +41,10 @@ from fhash_formats.transform.tile.sections import (
     RESIDUAL,
     pack_planes,
     parse_stream,
+    read_varint,
     seal,
+    varint,
 )
-from fhash_formats.transform.tile.settings import read_varint, varint
 
 
 def _labelled(parts: Parts) -> list[tuple[str, int]]:

@@ -16,7 +16,7 @@ from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, rep
 from mutated_plain import array_of_zeros
 from numcodecs.zstd import compress, decompress
 
-from fhash_formats.container.variables import part_place
+from fhash_formats.container.hierarchy import part_place
 
 ERRORS = "parts/0.steps.errors"
 TABLE = "tables/level_1"

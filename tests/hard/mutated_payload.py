@@ -18,19 +18,18 @@ from containers import Parts, with_crc
 from documents import DOCUMENT
 from numcodecs.zstd import compress, decompress
 
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.sharding import Sharding, pack_index, parse_index
+from fhash_formats.container.array import ArrayMetadata, Sharding, pack_index, parse_index
 from fhash_formats.native import crc32c
-from fhash_formats.transform.tile.sections import (
+from fhash_formats.transform.tile_format import (
     KIND,
     MASKED,
     RESIDUAL,
     TRANSFORMED,
+    TileSettings,
     TileStream,
     parse_stream,
     seal,
 )
-from fhash_formats.transform.tile.settings import TileSettings
 
 Change = Callable[[random.Random, bytes], bytes]
 

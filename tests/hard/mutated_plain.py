@@ -17,7 +17,7 @@ from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, rep
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.header import KNOWN_FEATURES
-from fhash_formats.support.number_types import DTYPES
+from fhash_formats.support.values import DTYPES
 
 CORRECTIONS = "parts/0.corrections"
 """Path of the corrections."""

@@ -36,26 +36,27 @@ from mutated_payload import (
     values_changed,
 )
 
+from fhash_formats.container.array import Sharding
 from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE, TABLE
-from fhash_formats.container.sharding import Sharding
 from fhash_formats.errors import InputError
-from fhash_formats.support.number_types import DTYPES
-from fhash_formats.transform.axes.basis import Basis
-from fhash_formats.transform.axes.candidates import NO_TRANSFORM
-from fhash_formats.transform.entropy.predictor import passes_of
-from fhash_formats.transform.head.head import Layer, NeighbourHead, layer_inputs
-from fhash_formats.transform.tile.sections import (
+from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.chunk import NO_TRANSFORM
+from fhash_formats.transform.head import Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.predict import passes_of
+from fhash_formats.transform.spec import Basis
+from fhash_formats.transform.tile_format import (
     EMPTY,
     LABELS,
     MASKED,
     OWN,
     PREDICTED,
     TRANSFORMED,
+    TileSettings,
     pack_planes,
     parse_stream,
     seal,
+    varint,
 )
-from fhash_formats.transform.tile.settings import TileSettings, varint
 
 PLAIN = TileSettings(transform=NO_TRANSFORM, step=1.0, center=0.5, low=0.0, high=1.0)
 """Settings of tiles that have none."""

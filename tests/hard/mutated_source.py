@@ -15,7 +15,7 @@ from documents import DOCUMENT, LARGE, OTHERS, dumped, hostile, places
 from mutated_payload import NothingFitsError, replaced
 from mutated_plain import array_of_zeros
 
-from fhash_formats.container.variables import part_place
+from fhash_formats.container.hierarchy import part_place
 
 TYPES = (
     *("int8", "int16", "uint64", "float16", "float32", "float64", "text", "bytes1", "bytes65536"),

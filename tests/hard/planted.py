@@ -33,7 +33,7 @@ TESTS = {
     NATIVE: FORMAT_TESTS,
     "fhash_codec/native/": "tests/codec/native tests/codec/measure tests/codec/rendering",
     "fhash_codec/compact/": "tests/codec/compact tests/codec/test_volume.py",
-    "fhash_codec/indexing.py": "tests/codec/test_indexing.py tests/cli/commands/test_decode.py",
+    "fhash_codec/boxes.py": "tests/codec/test_boxes.py tests/cli/commands/test_decode.py",
     "cli/fhash_cli/": "tests/cli",
 }
 """Tests of the files below a folder; of others, those of the room of the same name."""
@@ -53,19 +53,19 @@ zip-gap formats/fhash_formats/container/zip_file.py
 if member.offset != position or member.end => if member.end
 zip-crc formats/fhash_formats/container/zip_file.py
 zlib.crc32(data) != member.crc => False
-shard-present formats/fhash_formats/container/sharding.py
+shard-present formats/fhash_formats/container/array.py
 np.arange(count) < -(-n // chunk) - s * count => np.arange(count) <= -(-n // chunk) - s * count
-shard-beyond formats/fhash_formats/container/sharding.py
+shard-beyond formats/fhash_formats/container/array.py
 np.any(table[~present] != ABSENT) => False
 layer-rounding formats/fhash_formats/container/growing.py
 tuple(-(-n // length) for n => tuple(max(n // length, 1) for n
-lost-sync formats/fhash_formats/support/atomic.py
+lost-sync formats/fhash_formats/support/files.py
 _sync(output.temporary) => pass
-band-axis formats/fhash_formats/transform/axes/bands.py
+band-axis formats/fhash_formats/transform/lifting.py
 (0, int(key.z > 1), 0, 0) => (int(key.z > 1), 0, 0, 0)
-final-clip formats/fhash_formats/transform/tile/decoding.py
+final-clip formats/fhash_formats/transform/decoding.py
 clipped(decoded, settings.low, settings.high) if settings.clip else decoded => decoded
-axes-back formats/fhash_formats/transform/array_axes.py
+axes-back formats/fhash_formats/transform/stream.py
 ordered.transpose(np.argsort(self._order)) => ordered.transpose(self._order)
 coder-sign formats/fhash_formats/native/coder.cpp
 plane[x] + 2 * left + left2; => plane[x] + 2 * left - left2;
@@ -79,33 +79,33 @@ last-step fhash_codec/native/march_sample.hpp
 if (!on[l] || k[l] != last[l] || !(alpha[l] > 0)) continue; => continue;
 bulk-end fhash_codec/native/quality.cpp
 ((double)one <= high) => ((double)one < high)
-morton-axis fhash_codec/coreset/occupancy.py
+morton-axis fhash_codec/features/occupancy.py
 for axis in (2, 1, 0) if bit => for axis in (0, 1, 2) if bit
-dilate-sign fhash_codec/coreset/features.py
+dilate-sign fhash_codec/features/features.py
 out[:-shift] |= lines[shift:] => out[shift:] |= lines[:-shift]
 integer-bound fhash_codec/compact/goal.py
 error=math.floor(error) + 0.5 => error=math.floor(error) + 1.5
-promise-order fhash_codec/compact/tiles_to_promise.py
+promise-order fhash_codec/compact/encode.py
 min(psnr, other_psnr) < self => max(psnr, other_psnr) < self
 step-weight fhash_codec/compact/model.py
 weights = [p - i for p, i => weights = [i - p for p, i
-level-of-two fhash_codec/paper/architecture.py
+level-of-two fhash_codec/paper/network.py
 if previous > fold else 2 => if previous >= fold else 2
-needed-corner fhash_codec/paper/tables/needed.py
+needed-corner fhash_codec/paper/storage.py
 result[last] |= layer => pass
-pixel-middle fhash_codec/rendering/camera/camera.py
+pixel-middle fhash_codec/rendering/cameras.py
 (np.arange(height) + 0.5) / height => (np.arange(height) + 1) / height
-part-in-view fhash_codec/rendering/camera/view.py
+part-in-view fhash_codec/rendering/view.py
 int(np.ceil(high)) + 1 + margin => int(np.ceil(high)) + margin
-unpacked-sign formats/fhash_formats/readers/common/cf_packing.py
+unpacked-sign formats/fhash_formats/readers/common/cf.py
 values += self.offset => values -= self.offset
 picked-index formats/fhash_formats/readers/common/layout.py
 slice(self.picked[place], self.picked[place] + 1) => slice(0, 1)
-spacing-count formats/fhash_formats/writers/common/spacing.py
+spacing-count formats/fhash_formats/writers/common.py
 extent / (len(values) - 1) => extent / len(values)
-merge-end fhash_codec/appending/merging.py
+merge-end fhash_codec/appending/parts.py
 if end != first.steps: => if end > first.steps:
-coarse-start fhash_codec/indexing.py
+coarse-start fhash_codec/boxes.py
 -(-max(low - first, 0) // every) * every => max(low - first, 0) // every * every
 box-end cli/fhash_cli/selection.py
 & (positions <= end) => & (positions < end)

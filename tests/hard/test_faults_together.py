@@ -161,21 +161,21 @@ def test_a_source_that_may_not_be_read_is_said_in_one_line(
 
 
 PLACES = [
-    ("encode compact", "fhash_codec.coreset.scan", "range_and_sum"),
-    ("encode compact", "fhash_formats.transform.tile.integers", "encode_integers"),
-    ("encode compact", "fhash_codec.compact.tiles_to_promise", "code"),
+    ("encode compact", "fhash_codec.features.scan", "range_and_sum"),
+    ("encode compact", "fhash_formats.transform.encoding", "encode_integers"),
+    ("encode compact", "fhash_codec.compact.encode", "code"),
     ("encode compact", "fhash_codec.encoding", "measure"),
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
-    ("encode paper", "fhash_codec.paper.training.checkpoint", "load_checkpoint"),
-    ("encode paper", "fhash_codec.paper.training.train", "train"),
+    ("encode paper", "fhash_codec.paper.train", "load_checkpoint"),
+    ("encode paper", "fhash_codec.paper.train", "train"),
     ("encode paper", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read_steps"),
-    ("decode h5", "fhash_formats.writers.hdf5", "_create"),
-    ("decode zarr", "fhash_formats.writers.zarr_store", "flush"),
+    ("decode h5", "fhash_formats.writers.labelled", "_create_hdf5"),
+    ("decode zarr", "fhash_formats.writers.labelled", "flush"),
     ("decode nc", "fhash_formats.container.reader", "Container.open"),
     ("decode vtp", "fhash_codec.isosurface", "isosurface"),
     ("render png", "fhash_codec.rendering.renderer", "Renderer.render"),
-    ("render gif", "fhash_codec.rendering.picture.image", "Image.to_uint8"),
+    ("render gif", "fhash_codec.rendering.image", "Image.to_uint8"),
 ]
 
 

@@ -19,7 +19,7 @@ from test_faults_together import PLACES
 
 import fhash_cli.main
 from fhash_cli.output import Progress
-from fhash_codec.paper.training.train import train
+from fhash_codec.paper.train import train
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -70,8 +70,8 @@ def places() -> Iterator[list[Path]]:
 
 def write(path: Path, extra: Any, **changes: Any) -> None:
     """Write a container with additional arrays, which `extra` writes."""
-    from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-    from fhash_formats.transform.tile.settings import TileSettings
+    from fhash_formats.transform.spec import AxisTransform, TransformSpec
+    from fhash_formats.transform.tile_format import TileSettings
 
     spec = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
     settings = TileSettings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)

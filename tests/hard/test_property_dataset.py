@@ -20,8 +20,7 @@ from properties import Draw, looking, same
 import fhash_codec
 from fhash_codec import Dataset, EncodeConfig, FhashError, Volume, Writer
 from fhash_codec.appending.parts import Part, encode_part
-from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.source_metadata import SourceMetadata, SourceVariable
+from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 
 Shape = tuple[int, int, int, int]
 NAMES = (

@@ -20,10 +20,10 @@ import fhash_codec
 from fhash_cli.output import emit
 from fhash_codec import EncodeConfig, FhashWarning
 from fhash_codec.header import brief_history, brief_quality, history_points
-from fhash_formats.container import ContainerWriter, strict_json
+from fhash_formats.container import ContainerWriter
+from fhash_formats.container import record as strict_json
 from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.support.attributes import json_attributes
-from fhash_formats.support.plain_json import plain_json
+from fhash_formats.support.values import json_attributes, plain_json
 
 TEXT = st.text(st.characters(codec=None), max_size=8)
 """Text with lone surrogates."""

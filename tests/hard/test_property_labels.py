@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import NUMBERS, Draw, looking
 
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels, encode_labels
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
-from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.labelled import labelled_stream
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.coder import MAX_LABELS, MaskLevels, decode_labels, encode_labels
+from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile_format import TileSettings, labelled_stream
 
 _T, _Z, _Y, _X = (AxisTransform(kind="5/3", depth=1) for _ in range(4))
 SPEC = TransformSpec(axes=(_T, _Z, _Y, _X))

@@ -21,9 +21,9 @@ from properties import looking, one_line
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume
-from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.scene.record import Record
-from fhash_codec.rendering.scene.scene import Scene, Shading
+from fhash_codec.records import Record
+from fhash_codec.rendering.image import Image
+from fhash_codec.rendering.scenes import Scene, Shading
 from fhash_formats.errors import FhashError, InputError, RegionError
 
 COLOURS = st.sampled_from(["#000000", "#ff8000", "white", "red", "transparent", "no colour"])

@@ -12,20 +12,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import Draw, arrays, looking, same
 
-from fhash_formats.transform.axes.bands import band_table
-from fhash_formats.transform.axes.basis import fit_basis
-from fhash_formats.transform.axes.lifting import Transform
-from fhash_formats.transform.axes.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.entropy.coder import (
+from fhash_formats.transform.coder import (
     MAX_INTEGER,
     decode_block,
     decode_integers,
     encode_block,
     encode_integers,
+    single_band,
 )
-from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.lifting import Transform, band_table
 from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
+from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec, fit_basis
 
 
 @st.composite

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.entropy.prior import prior_state
+from fhash_formats.transform.coder import prior_state
 from reference.adaptive import Adaptive, clamp, log16, squashed
 from reference.bands import Band, single_band
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.entropy.mask import mask_prior_state
+from fhash_formats.transform.coder import mask_prior_state
 from reference.adaptive import Adaptive
 
 Levels = npt.NDArray[Any]

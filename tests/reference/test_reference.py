@@ -21,12 +21,12 @@ from specs import MIXES, spec_of
 from fhash_codec import EncodeConfig, FhashError, encode
 from fhash_codec.selftest.cases.catalogue import cases
 from fhash_formats.container.reader import Container
-from fhash_formats.transform.array_axes import ArrayAxes
 from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.decoding import decode_tile_mask
-from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.decoding import decode_tile_mask
+from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.stream import ArrayAxes
+from fhash_formats.transform.tile_format import TileSettings
 from reference.tile import chunk_of, decode_tile
 
 GOLDEN = Path(__file__).parents[1] / "golden"

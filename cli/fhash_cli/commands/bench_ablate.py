@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
+    BaseCommand,
     SourceOptions,
     check_writable,
     force_option,
@@ -80,7 +80,7 @@ def ablate(
     which the bubble is the feature.
     """
     from fhash_codec.bench.ablate.axes import axes_named
-    from fhash_codec.training.devices import need_torch
+    from fhash_codec.devices import need_torch
 
     if any(axis.profile == "paper" for axis in axes_named(names)):
         need_torch("bench ablate")
@@ -107,7 +107,7 @@ def ablate(
         )
     if plot is not None:
         from fhash_codec.bench.ablate.plot import plot as draw
-        from fhash_formats.support.atomic import replacing
+        from fhash_formats.support.files import replacing
 
         with replacing(Path(plot), force=force) as temporary:
             draw(result, temporary)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
+    BaseCommand,
     SourceOptions,
     json_option,
     quiet_option,

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import SourceOptions, json_option, quiet_option, series_options
+from fhash_cli.options import BaseCommand, SourceOptions, json_option, quiet_option, series_options
 from fhash_cli.output import Progress, emit, extent, table
 
 if TYPE_CHECKING:
@@ -152,7 +151,7 @@ def paper(
     if parameters:
         emit(*_parameters(), as_json)
         return
-    from fhash_codec.training.devices import need_torch
+    from fhash_codec.devices import need_torch
 
     need_torch("bench paper")
     if data is None:

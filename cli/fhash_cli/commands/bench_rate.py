@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
+    BaseCommand,
     SourceOptions,
     check_writable,
     force_option,
@@ -124,7 +124,7 @@ def rate(
             progress=progress,
         )
     if plot is not None:
-        from fhash_formats.support.atomic import replacing
+        from fhash_formats.support.files import replacing
 
         with replacing(Path(plot), force=force) as temporary:
             draw(result, temporary)

@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import check_writable, force_option, json_option, quiet_option, run_argument
+from fhash_cli.options import (
+    BaseCommand,
+    check_writable,
+    force_option,
+    json_option,
+    quiet_option,
+    run_argument,
+)
 from fhash_cli.output import Progress, emit, extent, number, table
 
 if TYPE_CHECKING:
@@ -105,7 +111,7 @@ def render(
         from fhash_codec.bench.pictures.plot import plot as draw
         from fhash_codec.bench.pictures.results import PARTS
         from fhash_codec.bench.rate.plot import require_matplotlib
-        from fhash_codec.rendering.scene.scene import Scene
+        from fhash_codec.rendering.scenes import Scene
 
         if plot is not None:
             require_matplotlib()
@@ -120,7 +126,7 @@ def render(
             progress=progress,
         )
     if plot is not None:
-        from fhash_formats.support.atomic import replacing
+        from fhash_formats.support.files import replacing
 
         with replacing(Path(plot), force=force) as temporary:
             draw(result, temporary)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
+    BaseCommand,
     RealRange,
     SourceOptions,
     check_writable,
@@ -126,7 +126,7 @@ def train(
     arithmetic of the network alone over that of the processor's multiply-adds, measured in the same
     run and by the same clock.
     """
-    from fhash_codec.training.devices import need_torch
+    from fhash_codec.devices import need_torch
 
     need_torch("bench train")
     if plot is not None:
@@ -154,7 +154,7 @@ def train(
         )
     if plot is not None:
         from fhash_codec.bench.train.plot import plot as draw
-        from fhash_formats.support.atomic import replacing
+        from fhash_formats.support.files import replacing
 
         with replacing(Path(plot), force=force) as temporary:
             draw(result, temporary)

@@ -7,7 +7,7 @@ import sys
 import click
 from click.shell_completion import get_completion_class
 
-from fhash_cli.base_command import BaseCommand
+from fhash_cli.options import BaseCommand
 from fhash_formats.errors import OutputError
 
 SHELLS = ("bash", "zsh", "fish")

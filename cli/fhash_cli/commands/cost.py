@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.durations import DurationType
 from fhash_cli.options import (
+    BaseCommand,
+    DurationType,
     SourceOptions,
     force_option,
     json_option,

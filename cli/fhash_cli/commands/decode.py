@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.decoding import Selection
-from fhash_cli.frame_statistics import Statistics
-from fhash_cli.intervals import IntervalsType, NumberType, SliceType
 from fhash_cli.options import (
+    BaseCommand,
+    IntervalsType,
+    NumberType,
+    SliceType,
     check_writable,
     feature_option,
     force_option,
@@ -22,15 +22,266 @@ from fhash_cli.options import (
     variables_option,
 )
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, say, spans, table
-from fhash_cli.selection import coordinates, dates_of, metadata, opened_variables
+from fhash_cli.selection import (
+    Span,
+    coordinates,
+    count_inside,
+    dates_of,
+    metadata,
+    opened_variables,
+    region_of,
+    region_of_box,
+    steps_at,
+    steps_of,
+)
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
     import numpy.typing as npt
 
     from fhash_codec import Volume
     from fhash_codec.progress import Progress as Callback
     from fhash_formats import Region
+
+
+def check_fill(kind: np.dtype[Any], fill: float | None) -> None:
+    """Raise InputError for a fill value that a number type cannot hold; None is always held."""
+    from fhash_codec.volume import holds
+
+    if fill is not None and not holds(kind, fill):
+        raise InputError(f"the fill value {fill:g} does not fit {kind}; give another, or --dtype")
+
+
+def convert(
+    frame: npt.NDArray[Any],
+    kind: np.dtype[Any],
+    *,
+    fill: float | None = None,
+    background: bool = False,
+    integers: npt.NDArray[Any] | None = None,
+) -> npt.NDArray[Any]:
+    """Convert a decoded frame to another number type; for integers it is rounded and clipped.
+
+    fill: value in place of NaN; None for NaN itself. background: vertices outside the coreset hold
+    the background's value; NaN means a missing value. integers: the values as integers, where
+    floats have not all of them. Raises InputError where the type cannot hold a value.
+    """
+    import numpy as np
+
+    gaps = np.isnan(frame)
+    frame = frame if integers is None else integers
+    if not gaps.any():
+        return _converted(frame, kind)
+    if fill is None:
+        if kind.kind != "f":
+            what = (
+                "the data have no value (NaN) at some vertices of the region"
+                if background
+                else "the region holds vertices without a value (NaN)"
+            )
+            other = "" if background else "add --outside background, "
+            raise InputError(
+                f"{what}, which {kind} cannot hold; {other}give --fill V, or take a float type"
+            )
+        return _converted(frame, kind)
+    result = _converted(np.where(gaps, 0, frame), kind)
+    result[gaps] = fill
+    return result
+
+
+def _converted(frame: npt.NDArray[Any], kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """A frame without NaN in another number type; `kind` may be a float type for any frame."""
+    import numpy as np
+
+    if kind == frame.dtype:
+        return frame
+    if kind.kind == "f":
+        with np.errstate(over="ignore"):
+            narrow = frame.astype(kind)
+        if np.isinf(narrow).any():
+            raise InputError(
+                f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind};"
+                " choose a wider type"
+            )
+        return narrow
+    limits = np.iinfo(kind)
+    if frame.dtype.kind != "f":
+        own = np.iinfo(frame.dtype)
+        low, high = max(int(limits.min), int(own.min)), min(int(limits.max), int(own.max))
+        return np.asarray(np.clip(frame, low, high).astype(kind))
+    rounded = np.rint(frame.astype(np.float64))
+    # No float64 equals the largest 64-bit integer: the float of the limit lies one above it.
+    clipped = rounded >= float(limits.max)
+    integers = np.where(clipped, 0.0, np.maximum(rounded, float(limits.min))).astype(kind)
+    integers[clipped] = limits.max
+    return np.asarray(integers)
+
+
+class Statistics:
+    """Smallest, largest and mean value, and share inside the coreset, of frames added one by one.
+
+    NaN is left out.
+    """
+
+    def __init__(self) -> None:
+        from fhash_codec.measure.value_range import Mean
+
+        self.low, self.high, self.mean = float("inf"), float("-inf"), Mean()
+        self.inside = self.all = 0
+
+    def add(
+        self, frame: npt.NDArray[Any], inside: int, integers: npt.NDArray[Any] | None = None
+    ) -> None:
+        """Add values of any shape.
+
+        inside: number of their vertices in the coreset. integers: the values as integers, where
+        floats have not all of them.
+        """
+        import numpy as np
+
+        from fhash_codec.measure.value_range import pieces
+        from fhash_formats.support.values import exact_number
+
+        gaps = np.isnan(frame)
+        frame = frame if integers is None else integers
+        values = frame[~gaps] if gaps.any() else frame.reshape(-1)
+        self.all, self.inside = self.all + frame.size, self.inside + inside
+        if values.size:
+            self.low, self.high = (
+                min(self.low, exact_number(values.min().item())),
+                max(self.high, exact_number(values.max().item())),
+            )
+        for piece in pieces(values):
+            self.mean.add(piece)
+
+    def result(self) -> dict[str, float | None]:
+        """JSON values; None where no vertex has a value."""
+        defined = self.mean.count > 0
+        return {
+            "min": self.low if defined else None,
+            "max": self.high if defined else None,
+            "mean": self.mean.value() if defined else None,
+            "inside_fraction": self.inside / self.all,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Frames that the options select of an open container, and how their values are given.
+
+    Attributes:
+        steps: step indices, fractional for times between steps.
+        region: vertices ((z0, z1), (y0, y1), (x0, x1)) of the domain.
+        vertices: vertices of the domain along z, y and x that a frame has.
+        lod: level of detail, None for every vertex.
+        outside: `nan` or `background`, the values outside the coreset.
+        kind: number type of the output.
+        fill: value of vertices that have none; None for NaN.
+    """
+
+    steps: list[float]
+    region: tuple[Span, Span, Span]
+    vertices: tuple[range, range, range]
+    lod: int | None
+    outside: Literal["nan", "background"]
+    kind: np.dtype[Any]
+    fill: float | None
+
+    @classmethod
+    def of(
+        cls,
+        volume: Volume,
+        steps: slice | None,
+        times: tuple[str, ...],
+        roi: Sequence[Sequence[int | None]] | None,
+        box: Sequence[Sequence[float | None]] | None,
+        lod: int | None,
+        outside: Literal["nan", "background"],
+        dtype: str | None,
+        fill: float | None,
+    ) -> Selection:
+        """Resolve the options; raises RegionError where they leave the series or its domain."""
+        import numpy as np
+
+        from fhash_codec.volume import holds
+
+        chosen = steps_at(volume, times) if times else steps_of(volume, steps)
+        region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
+        # A level of detail has its own vertices: those of the feature bounding box in the region.
+        z, y, x = (
+            (range(low, high) for low, high in region)
+            if lod is None
+            else volume.lod_vertices(lod, region)
+        )
+        whole = all(float(step).is_integer() for step in chosen)
+        kind = np.dtype(dtype or (volume.dtype if whole else volume.float_dtype))
+        own = volume.value_type.fill
+        if fill is None and own is not None and kind.kind in "iu" and holds(kind, own):
+            fill = own
+        check_fill(kind, fill)
+        return cls(
+            steps=chosen,
+            region=region,
+            vertices=(z, y, x),
+            lod=lod,
+            outside=outside,
+            kind=kind,
+            fill=fill,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape (t, z, y, x) of the output."""
+        z, y, x = self.vertices
+        return len(self.steps), len(z), len(y), len(x)
+
+    def frames(
+        self, volume: Volume, statistics: Statistics, progress: Callback
+    ) -> Iterator[npt.NDArray[Any]]:
+        """Decode the frames (z, y, x), small ones together; all are added to the statistics."""
+        from fhash_formats.support.values import is_wide_integer
+
+        background, done = self.outside == "background", 0
+        wide = is_wide_integer(volume.dtype) and all(float(t).is_integer() for t in self.steps)
+        for steps, frames in self._decoded(volume):
+            inside = count_inside(volume, steps, self.region, frames, self.outside)
+            # float64 has not every integer of 64 bits.
+            integers = self._integers(volume, steps) if wide else None
+            statistics.add(frames, inside, integers)
+            yield from convert(
+                frames, self.kind, fill=self.fill, background=background, integers=integers
+            )
+            done += len(steps)
+            progress("decoding", done, len(self.steps), "")
+
+    def _integers(self, volume: Volume, steps: Sequence[float]) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of some whole steps as the integers that the file holds."""
+        if self.lod is None:
+            whole = range(int(steps[0]), int(steps[-1]) + 1)
+            return volume.values_of_steps(whole, self.region, outside=self.outside)
+        return volume.decoded_lod(steps[0], self.lod, self.region)[0][None]
+
+    def _decoded(self, volume: Volume) -> Iterator[tuple[Sequence[float], npt.NDArray[Any]]]:
+        """Some steps at a time, and their frames (t, z, y, x)."""
+        import numpy as np
+
+        from fhash_codec.boxes import step_blocks
+
+        first = int(self.steps[0])
+        neighbours = range(first, first + len(self.steps))
+        if self.lod is None and list(neighbours) == self.steps:
+            for _, steps in step_blocks(neighbours, self.shape[1:]):
+                yield steps, volume.read_steps(steps, self.region, outside=self.outside)
+            return
+        for step in self.steps:
+            frame = (
+                volume.read(step, self.region, outside=self.outside)
+                if self.lod is None
+                else volume.read_lod(step, self.lod, self.region)
+            )
+            yield [step], np.expand_dims(frame, 0)
+
 
 INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 TYPES = ("float16", "float32", "float64", *INTEGERS)
@@ -226,7 +477,7 @@ def _check_output(
 ) -> None:
     """Refuse an output before any work."""
     from fhash_codec.isosurface import require_marching_cubes
-    from fhash_formats.writers.mesh import check_mesh_output
+    from fhash_formats.writers.vtk import check_mesh_output
 
     if isosurface is not None:
         if output is None or dtype is not None:
@@ -242,7 +493,7 @@ def _check_output(
 def _save_surface(output: str, isosurface: float, part: Part, force: bool, run: str) -> list[str]:
     """Write the isosurface of the one selected step; the paths written."""
     from fhash_codec.isosurface import isosurface as surface
-    from fhash_formats.writers.mesh import save_mesh
+    from fhash_formats.writers.vtk import save_mesh
 
     steps = part.selection.steps
     if len(steps) != 1:
@@ -282,7 +533,7 @@ def _region(part: Part) -> Region:
 
 
 def _file_rows(paths: list[str], parts: Sequence[Part]) -> list[tuple[str, str]]:
-    from fhash_formats.writers.vtkhdf import needed_by
+    from fhash_formats.writers.vtk import needed_by
 
     return [
         *(("written", path) for path in paths),

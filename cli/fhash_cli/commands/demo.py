@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import check_writable, force_option, json_option, make_folder, quiet_option
+from fhash_cli.options import (
+    BaseCommand,
+    check_writable,
+    force_option,
+    json_option,
+    make_folder,
+    quiet_option,
+)
 from fhash_cli.output import (
     Progress,
     compared,
@@ -136,10 +142,10 @@ def _demonstrate(
     """Simulate, encode, compare and draw; the result as JSON values, and as rows."""
     import fhash_codec
     from fhash_codec.config import EncodeConfig
-    from fhash_codec.coreset.features import parse_feature
+    from fhash_codec.features.features import parse_feature
     from fhash_codec.volume import open as open_volume
     from fhash_formats import open_series
-    from fhash_formats.support.atomic import replacing
+    from fhash_formats.support.files import replacing
 
     data, run, picture = (folder / f"{chosen.name}.{suffix}" for suffix in ("h5", "fhz", "png"))
     parse_feature(simulation.scene.feature)
@@ -177,7 +183,7 @@ def _demonstrate(
 
 def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) -> Image.Image:
     """Draw the slice of constant z with the most of the coreset, at evenly spread steps."""
-    from fhash_codec.demo.comparison_picture import Pair, compare
+    from fhash_codec.gallery import Pair, compare
 
     count = series.shape[0]
     columns = min(COLUMNS, count)

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from fhash_cli.base_command import BaseCommand
 from fhash_cli.commands.cost import check_report_folder
-from fhash_cli.commands.merge import WishedPart, encode_all_or_part
-from fhash_cli.durations import DurationType
+from fhash_cli.commands.parts import WishedPart, encode_all_or_part
 from fhash_cli.options import (
+    BaseCommand,
+    DurationType,
     SourceOptions,
     check_writable,
     force_option,
@@ -190,7 +190,7 @@ def _say_remarks(
     promise_kept: bool,
 ) -> None:
     """Lines on what may be a slip in the command, or decided the size."""
-    from fhash_codec.promises import decided_by_bulk
+    from fhash_codec.compact.goal import decided_by_bulk
 
     for value in source.missing:
         if value == value and value not in series.occurring:
@@ -214,7 +214,7 @@ def _encode_several(
 
     several: how each is opened, by its name.
     """
-    from fhash_codec.dataset_encoding import encode_dataset
+    from fhash_codec.encoding import encode_dataset
 
     before, names = _stamp(output), list(several)
     with Progress(quiet=quiet) as progress:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.card_rows import card_rows
-from fhash_cli.options import SourceOptions, json_option, series_options
+from fhash_cli.options import BaseCommand, SourceOptions, json_option, series_options
 from fhash_cli.output import (
+    apart,
     compared,
     emit,
     extent,
@@ -24,17 +25,247 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_cli.source_listing import (
-    details,
-    details_rows,
-    listing,
-    not_stored_text,
-    positions,
-)
 from fhash_cli.variables import info_table
 
 if TYPE_CHECKING:
     from fhash_codec import Dataset, Volume
+    from fhash_formats.series import Coordinate, Series
+
+
+def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]]:
+    """Rows for people, from what `fhash info --json` prints.
+
+    verbose: every setting, level and layer on a row of its own.
+    """
+    card = info["card"]
+    return [
+        *_config(info, card["config"], verbose=verbose),
+        *_tables(info["model"], card["tables"], verbose=verbose),
+        *_mlp(card["mlp"], verbose=verbose),
+        ("occupancy", _occupancy(card["occupancy"])),
+    ]
+
+
+def _occupancy(part: Mapping[str, Any]) -> str:
+    """The bits, and how many features have their own."""
+    apart = f"; {len(part['apart'])} features apart" if part["apart"] else ""
+    return f"bits {extent(part['shape'])}; {_place(part)}{apart}"
+
+
+def _place(part: Mapping[str, Any]) -> str:
+    """The place of a part in the file, its coding and its bytes."""
+    if not part["path"]:
+        return str(part["coding"])
+    return f"{part['path']}, {part['coding']}, {size(part['bytes'])}"
+
+
+def _config(
+    info: Mapping[str, Any], part: Mapping[str, Any], *, verbose: bool
+) -> list[tuple[str, str]]:
+    """The settings: those that differ from their defaults, or all."""
+    from fhash_codec.config import EncodeConfig
+
+    config, usual = info["config"], EncodeConfig().to_dict()
+    changed = [
+        f"{name} {_shown(value)}"
+        for name, value in config.items()
+        if name == "profile" or name not in usual or value != usual[name]
+    ]
+    text = ", ".join(changed)
+    rows = [("config", f"{part['settings']} settings; {text}; {_place(part)}")]
+    if verbose:
+        rows += [(f"  {name}", _shown(value)) for name, value in config.items()]
+    return rows
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if value is None:
+        return "-"
+    return ", ".join(map(str, value)) if isinstance(value, list) else f"{value}"
+
+
+def _tables(
+    model: Mapping[str, Any], levels: list[dict[str, Any]], *, verbose: bool
+) -> list[tuple[str, str]]:
+    """The levels: number, resolutions and bytes, or each on its own."""
+    total = sum(level["bytes"] for level in levels)
+    stored = [level for level in levels if level["path"]]
+    folded = listed([extent(level["shape"][:4]) for level in levels[:3]])
+    more = ", ..." if len(levels) > 3 else ""
+    first = f"{len(levels)} level{'s' if len(levels) > 1 else ''} of {folded}{more}"
+    vertex = "needed vertex" if "sparse" in model else "vertex"
+    numbers = f"{levels[0]['shape'][4]} at each {vertex}, {levels[0]['dtype']}"
+    paths = stored[0]["path"] + (f" to {stored[-1]['path']}" if len(stored) > 1 else "")
+    parameters = f"{model['parameters']:,} parameters in the model"
+    if not model["parameters"]:
+        parameters = "parameters were not counted"
+    where = f"{paths}, {stored[0]['coding']}, {size(total)}"
+    rows = [("tables", f"{first}; {numbers}; {where}; {parameters}")]
+    if verbose:
+        rows += _each("level", levels)
+    return rows
+
+
+def _mlp(layers: list[dict[str, Any]], *, verbose: bool) -> list[tuple[str, str]]:
+    """The layers: widths and bytes, or each on its own."""
+    if not layers:
+        return [("MLP", "none: the values are those of level 1")]
+    widths = " to ".join(str(width) for width in _widths(layers))
+    # Layers may share an array.
+    stored = list({layer["path"]: layer for layer in layers if layer["path"]}.values())
+    place = _place(layers[0])
+    if len(stored) > 1:
+        total = size(sum(layer["bytes"] for layer in stored))
+        place = f"{stored[0]['path']} to {stored[-1]['path']}, {stored[0]['coding']}, {total}"
+    rows = [("MLP", f"{widths}, {layers[0]['activation']}; {place}")]
+    if verbose:
+        rows += _each("layer", layers)
+    return rows
+
+
+def _each(what: str, parts: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """A row for each level or layer: shape and place."""
+    return [
+        (f"  {what} {part[what]}", f"{extent(part['shape'])}; {_place(part)}") for part in parts
+    ]
+
+
+def _widths(layers: list[dict[str, Any]]) -> list[int]:
+    """Inputs of the first layer, and outputs of every layer."""
+    return [layers[0]["shape"][1], *(layer["shape"][0] for layer in layers)]
+
+
+MIN_DIMENSIONS = 3
+"""Dimensions of an array that may be a variable; others are named in one line."""
+
+UNOPENED = "what cannot be opened"
+"""Beginning of the problem of an array of which nothing is known."""
+
+MAX_NAMES = 8
+"""Names of one line; of more `listed` leaves some out."""
+
+MAX_TEXT = 300
+"""Characters of an attribute that are shown."""
+
+
+def listing(
+    path: str, files: int, variables: Sequence[Mapping[str, Any]], *, named: bool = False
+) -> str:
+    """The variables of a data file, each with its commands; then what cannot be encoded.
+
+    named: whether the user named the only variable that is listed.
+    """
+    good = [variable for variable in variables if not variable["problem"]]
+    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
+    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
+    lines = [f"{path}{many} holds {count} to encode"] if not named else [f"{path}{many}"]
+    for variable in good:
+        units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
+        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
+        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
+        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
+        missing = f", missing where {marks}" if marks else ""
+        dtype = variable["dtype"] + stored
+        lines += ["", f"{variable['name']}: {dtype}, {shape}{units}{missing}"]
+        if len(variable["commands"]) > 1:
+            lines.append("  two readings are likely:")
+        lines += [f"  {text}" for text in variable["commands"]]
+    if len(good) > 1 and all(len(variable["commands"]) == 1 for variable in good):
+        words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
+        lines += ["", "all in one file:", f"  {shlex.join(words)}"]
+    rest = [variable for variable in variables if variable["problem"]]
+    others: list[Mapping[str, Any]] = []
+    small: list[Mapping[str, Any]] = []
+    for variable in rest:
+        known = len(variable["shape"]) < MIN_DIMENSIONS
+        (small if known and not variable["problem"].startswith(UNOPENED) else others).append(
+            variable
+        )
+    if others:
+        lines += ["", "not to be encoded:"]
+        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
+    if small:
+        names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
+        count = f"; {len(names)} in all" if len(names) > MAX_NAMES else ""
+        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}{count}"]
+    return "\n".join(map(one_line, lines))
+
+
+def _dimension(name: str, length: int, axis: str) -> str:
+    """A dimension and what it is: "lev=17 (z)"."""
+    note = {"?": " (?)", "select": " (select one)", name: ""}.get(axis, f" ({axis})")
+    return f"{name}={length}{note}"
+
+
+def details(series: Series) -> dict[str, Any]:
+    """An open series as JSON values: shape, type, units, coordinates and attributes."""
+    from fhash_codec.times import is_dated, time_text
+    from fhash_formats.support.values import json_attributes
+
+    coordinates = []
+    for axis in "tzyx":
+        coordinate = series.coords[axis]
+        ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
+        dated = axis == "t" and is_dated(coordinate)
+        coordinates.append(
+            {
+                "axis": axis,
+                "name": coordinate.name,
+                "first": ends[0],
+                "last": ends[1],
+                "units": str(coordinate.attributes.get("units", "")),
+                "dates": [time_text(coordinate, end) for end in ends] if dated else [],
+            }
+        )
+    return {
+        "name": series.name,
+        "shape": list(series.shape),
+        "dtype": (series.source_dtype or series.dtype).name,
+        "units": series.units,
+        "fill": series.fill,
+        "not_stored": None if series.not_stored is None else series.not_stored.to_dict(),
+        "coordinates": coordinates,
+        "attributes": json_attributes(series.attributes, without=frozenset()),
+    }
+
+
+def details_rows(series: Series) -> list[tuple[str, str]]:
+    """An open series as rows of a table: shape, positions along each axis, and attributes."""
+    from fhash_formats.support.values import json_attributes
+
+    rows = [("t, z, y, x", extent(series.shape))]
+    rows += [(f"  {axis}", positions(series.coords[axis], axis)) for axis in "tzyx"]
+    if series.not_stored is not None:
+        rows.append(("not stored", not_stored_text(series.not_stored.to_dict())))
+    for name, value in json_attributes(series.attributes).items():
+        text = " ".join(str(value).split())
+        rows.append((name, text if len(text) <= MAX_TEXT else text[:MAX_TEXT] + "..."))
+    return rows
+
+
+def not_stored_text(told: Mapping[str, Any]) -> str:
+    """Values that nobody wrote, as a header has them, in words."""
+    from fhash_formats.series import spans_text
+
+    fill = f", read as {told['fill']:.9g}" if "fill" in told else ""
+    return f"{100 * told['share']:.3g} % of the values ({spans_text(told['steps'])}){fill}"
+
+
+def positions(coordinate: Coordinate, axis: str) -> str:
+    """Name, first and last position, and units of an axis; times as dates where they are."""
+    from fhash_codec.times import is_dated, number_text, time_text
+
+    units = coordinate.attributes.get("units", "")
+    ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
+    if axis != "t":
+        return f"{coordinate.name} {' to '.join(apart(*ends))} {units}".rstrip()
+    numbers = " to ".join(number_text(coordinate, time) for time in ends)
+    if not is_dated(coordinate):
+        return f"{coordinate.name} {numbers} {units}".rstrip()
+    dates = " to ".join(time_text(coordinate, time) for time in ends)
+    return f"{coordinate.name} {dates} ({numbers} {units})"
 
 
 @click.command("info", cls=BaseCommand)
@@ -106,7 +337,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
 def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
     from fhash_formats.container import is_container
-    from fhash_formats.support.locations import is_url
+    from fhash_formats.support.files import is_url
 
     if is_url(path):
         return True

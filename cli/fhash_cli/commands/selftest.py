@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import check_writable, force_option, json_option, quiet_option
+from fhash_cli.options import BaseCommand, check_writable, force_option, json_option, quiet_option
 from fhash_cli.output import Progress, emit, table
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def command(
     if report is not None:
         from fhash_codec.selftest.environment import describe_machine
         from fhash_codec.selftest.report import markdown
-        from fhash_formats.support.atomic import replacing
+        from fhash_formats.support.files import replacing
 
         given = "".join(
             [

@@ -25,13 +25,13 @@ from fhash_codec.bench.ablate.points import points_per_second
 from fhash_codec.bench.ablate.results import AblateBench, Run
 from fhash_codec.bench.machine import machine
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.encoding import encode
+from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 __all__ = ["EPOCHS", "MADE", "bench_ablate"]
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_formats.errors import InputError, suggestion
 
 __all__ = ["AXES", "Axis", "axes_named"]
 

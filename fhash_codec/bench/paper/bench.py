@@ -33,9 +33,8 @@ from fhash_codec.bench.paper.training import (
     rank,
     train,
 )
+from fhash_codec.devices import choose_device, threads_for
 from fhash_codec.progress import Progress, silent
-from fhash_codec.training.devices import choose_device
-from fhash_codec.training.threads import threads_for
 from fhash_formats.series import Series
 
 ZSTD_LEVEL = 3

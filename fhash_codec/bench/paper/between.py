@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.paper.data import Data
-from fhash_codec.coreset.key_frames import time_axis
+from fhash_codec.features.key_frames import time_axis
 
 if TYPE_CHECKING:
     from fhash_codec.bench.paper.encodings.trained import TrainedEncoding

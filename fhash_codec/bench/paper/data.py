@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.paper.sets import SCALES, paper_set, scaled
+from fhash_codec.boxes import Sizes, bounding_box
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset import occupancy
-from fhash_codec.coreset.boxes import Sizes, bounding_box
-from fhash_codec.coreset.bricks import Coreset, build_coreset
-from fhash_codec.coreset.features import Everything, Feature, Mask
-from fhash_codec.coreset.scan import Scan
-from fhash_codec.coreset.selection import resolve_selection
+from fhash_codec.features import occupancy
+from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.features import Everything, Feature, Mask
+from fhash_codec.features.scan import Scan
+from fhash_codec.features.selection import resolve_selection
 from fhash_codec.progress import Progress, silent
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.errors import InputError

@@ -21,7 +21,7 @@ from fhash_codec.bench.paper.ratios import (
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 __all__ = ["MAX_BYTES", "files_of"]
 

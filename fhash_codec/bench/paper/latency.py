@@ -19,13 +19,13 @@ import numpy.typing as npt
 
 from fhash_codec.bench.paper.encodings.encoding import Encoding
 from fhash_codec.bench.paper.pictures import view_of_feature
+from fhash_codec.devices import choose_device
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.stream.fields import CoresetField
-from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.task.arrays import Array, Arrays
-from fhash_codec.rendering.task.torch_arrays import TorchArrays
-from fhash_codec.training.devices import choose_device
+from fhash_codec.rendering.march_task import Array, Arrays
+from fhash_codec.rendering.scenes import Camera
+from fhash_codec.rendering.stream_fields import CoresetField
+from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.torch_arrays import TorchArrays
 
 __all__ = ["EncodingField", "measure_latency"]
 

@@ -17,13 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.pictures.likeness import black, picture_psnr, picture_ssim
-from fhash_codec.coreset.features import Interval, Isosurface, Segmentation, parse_feature
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.colour.transfer_function import TransferFunction
+from fhash_codec.features.features import Interval, Isosurface, Segmentation, parse_feature
+from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.scene.scene import Camera, TransferFunctionSpec
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.march_task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.scenes import Camera, TransferFunctionSpec
+from fhash_codec.rendering.transfer_function import TransferFunction
 
 __all__ = ["IDENTICAL", "Likeness", "PictureProbe", "view_of_feature"]
 

@@ -19,7 +19,7 @@ from fhash_codec.bench.paper.protocols import (
 )
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request
-from fhash_codec.training.devices import choose_device
+from fhash_codec.devices import choose_device
 from fhash_formats.series import Series
 
 USUAL_KEY_FRAMES = 10

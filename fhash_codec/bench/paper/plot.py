@@ -12,7 +12,7 @@ from fhash_codec.bench.paper.cell import Cell
 from fhash_codec.bench.paper.groups import Group, by_data, groups
 from fhash_codec.bench.paper.printed import DECIBELS, ENCODINGS, SETS
 from fhash_codec.bench.rate.plot import require_matplotlib
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 __all__ = ["plot_convergence"]
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from fhash_codec.bench.paper.data import Data
 from fhash_codec.bench.paper.sets import BATCH, SETS
-from fhash_codec.coreset.boxes import Sizes
+from fhash_codec.boxes import Sizes
 from fhash_formats.errors import InputError
 
 ENCODINGS = ("dense", "dense-multi", "hash", "tcnn", "fhash")

@@ -12,7 +12,7 @@ from fhash_codec.bench.paper.ratios import FileResult, files_table
 from fhash_codec.bench.paper.table import PaperTable
 from fhash_codec.bench.paper.tables import paper_tables
 from fhash_formats.errors import MissingDependencyError
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 FILENAME = "tables.md"
 """File of the tables in the folder of the cells."""

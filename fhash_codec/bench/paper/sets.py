@@ -8,10 +8,9 @@ from typing import TypeVar
 
 from fhash_codec.bench.paper.printed import SETS as TITLES
 from fhash_codec.bench.paper.printed import TABLE_2
-from fhash_codec.coreset.boxes import Sizes
-from fhash_codec.paper.architecture import level_resolutions, parameter_count
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_codec.boxes import Sizes
+from fhash_codec.paper.network import level_resolutions, parameter_count
+from fhash_formats.errors import InputError, suggestion
 
 Number = TypeVar("Number", int, float)
 

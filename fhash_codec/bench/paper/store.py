@@ -11,7 +11,7 @@ from typing import Any
 
 from fhash_codec.bench.paper.cell import Cell, settings_id
 from fhash_formats.errors import InputError
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 
 @dataclass(frozen=True, kw_only=True)

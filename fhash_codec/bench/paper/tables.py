@@ -28,7 +28,7 @@ from fhash_codec.bench.paper.printed import (
 )
 from fhash_codec.bench.paper.sets import paper_parameters
 from fhash_codec.bench.paper.table import QUOTED, PaperTable, Spread, Value
-from fhash_codec.paper.architecture import level_resolutions, parameter_count
+from fhash_codec.paper.network import level_resolutions, parameter_count
 
 __all__ = ["paper_tables"]
 

@@ -20,10 +20,10 @@ from fhash_codec.bench.pictures.ospray_peer import OsprayPeer
 from fhash_codec.bench.pictures.results import Beside
 from fhash_codec.bench.pictures.vtk_peer import Drawn, VtkPeer, require_vtk
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.camera.camera import Rays
+from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame, Task
+from fhash_codec.rendering.march_task import Frame, Task
 from fhash_formats.errors import MissingDependencyError
 from fhash_formats.support.threads import usable_threads
 

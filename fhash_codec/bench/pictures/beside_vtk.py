@@ -21,15 +21,13 @@ from fhash_codec.bench.pictures.reference import vtk_picture
 from fhash_codec.bench.pictures.results import Against, Exactness, Playback
 from fhash_codec.bench.pictures.vtk_peer import VtkPeer, require_vtk
 from fhash_codec.progress import Progress
-from fhash_codec.rendering.camera.grid import Grid
+from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.march_task import Frame, Units, warped
+from fhash_codec.rendering.plan import Plan
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scene.scene import GRADIENTS, Scene, Shading, TransferFunctionSpec
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame
-from fhash_codec.rendering.task.units import Units
-from fhash_codec.rendering.task.warping import warped
+from fhash_codec.rendering.scenes import GRADIENTS, Scene, Shading, TransferFunctionSpec
 from fhash_codec.volume import Volume
 from fhash_formats.support.threads import usable_threads
 

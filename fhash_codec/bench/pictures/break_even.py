@@ -8,9 +8,9 @@ from statistics import median
 
 from fhash_codec.bench.pictures.results import BreakEven
 from fhash_codec.progress import Progress
-from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.scenes import Scene
 from fhash_codec.volume import Volume
 
 __all__ = ["break_even"]

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.pictures.results import Switch
-from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Table, Task
+from fhash_codec.rendering.march_task import Frame, Lighting, Marched, Table, Task
+from fhash_codec.rendering.scenes import Camera
 
 __all__ = ["orbit", "shell", "view_of_shell"]
 

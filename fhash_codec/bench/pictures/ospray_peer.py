@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.pictures.vtk_peer import Drawn
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.task.task import Table
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import Table
 from fhash_formats.errors import InputError
 
 __all__ = ["OsprayPeer", "find_ospray", "load_ospray"]

@@ -28,9 +28,9 @@ from fhash_codec.bench.pictures.results import (
     Switch,
 )
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scene.scene import (
+from fhash_codec.rendering.scenes import (
     AmbientOcclusion,
     AttenuatedMaximum,
     Effects,

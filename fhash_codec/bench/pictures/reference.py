@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.task.task import Lighting, Task
+from fhash_codec.rendering.march_task import Lighting, Task
 
 __all__ = ["vtk_picture"]
 

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.task.task import Lighting, Table
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import Lighting, Table
 from fhash_formats.errors import MissingDependencyError
 
 __all__ = ["MAPPERS", "VtkPeer", "require_vtk"]

@@ -13,7 +13,7 @@ from typing import Any
 from fhash_codec.bench.rate.measuring import Best
 from fhash_codec.bench.rate.results import Access, Speed, TilePrice
 from fhash_codec.bench.rate.timing import shown_psnr
-from fhash_formats.support.atomic import replacing
+from fhash_formats.support.files import replacing
 
 __all__ = ["RateCell", "Request", "cell_of", "load", "save"]
 

@@ -17,7 +17,7 @@ from fhash_codec.bench.rate.peers import (
     touched_bytes,
 )
 from fhash_codec.bench.rate.programs.program import Coded, ProgramVariant, folder_of
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 __all__ = ["AnyVariant", "PeerFiles", "there_and_back"]
 

@@ -10,9 +10,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, suggestion
 from fhash_formats.series import ArraySeries, Coordinate
-from fhash_formats.support.suggestions import suggestion
 
 __all__ = ["GENERATED", "PREFIX", "generated", "is_generated"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 Values = npt.NDArray[Any]
 Spans = list[tuple[int, int]]

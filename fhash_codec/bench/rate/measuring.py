@@ -30,10 +30,10 @@ from fhash_codec.bench.rate.timing import (
     speed_of,
 )
 from fhash_codec.config import EncodeConfig
-from fhash_codec.measure.metrics import Errors
+from fhash_codec.devices import need_torch
+from fhash_codec.measure.errors import Errors
 from fhash_codec.progress import Progress
-from fhash_codec.training.devices import need_torch
-from fhash_codec.value_type import decoded_type
+from fhash_codec.volume import decoded_type
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
 

@@ -14,9 +14,9 @@ from typing import Any
 import fhash_codec
 from fhash_codec.bench.rate.clock import Spent, spent
 from fhash_codec.bench.rate.search import EXACT, Trial
+from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.measure.metrics import Errors
+from fhash_codec.measure.errors import Errors
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import QualityError
 from fhash_formats.series import Series

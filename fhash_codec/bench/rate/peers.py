@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.bench.rate.layouts import Spans, Values, joined, parts_of, spans_of
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 from fhash_formats.errors import InputError, MissingDependencyError
 
 Filter = Mapping[str, Any]

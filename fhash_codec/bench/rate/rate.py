@@ -16,8 +16,8 @@ from fhash_codec.bench.rate.own import PROFILES, promised
 from fhash_codec.bench.rate.peers import peers
 from fhash_codec.bench.rate.programs.registry import PROGRAMS, programs
 from fhash_codec.bench.rate.results import PEERS, RateBench
-from fhash_codec.coreset.scan import scan
-from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.features.scan import scan
+from fhash_codec.features.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series

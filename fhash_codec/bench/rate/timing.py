@@ -10,7 +10,7 @@ import numpy as np
 from fhash_codec.bench.rate.clock import Spent
 from fhash_codec.bench.rate.results import Access, Speed
 from fhash_codec.bench.rate.search import EXACT, Trial
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 __all__ = [
     "LONG_SECONDS",

@@ -20,16 +20,15 @@ from fhash_codec.bench.train.peak import Peaks
 from fhash_codec.bench.train.points import bench_points
 from fhash_codec.bench.train.run import EngineRun, Variant
 from fhash_codec.config import ENGINES, EncodeConfig
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.devices import choose_device, threads_for
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.features.selection import Source, open_source
 from fhash_codec.native.network import machine_paths
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.encode import select
 from fhash_codec.paper.engines.native import refusal
-from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import plan_training
+from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.train import plan_training
 from fhash_codec.progress import Progress, silent
-from fhash_codec.training.devices import choose_device
-from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from fhash_codec.bench.rate.generated import PREFIX
 from fhash_codec.simulation.simulate import Simulation, simulate
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_formats.errors import InputError, suggestion
 
 __all__ = ["DEFAULT", "MADE", "Made", "is_made", "made_series"]
 

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.train.clock import now
-from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.network import ArrayTable, Layer, Network
-from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.model import sample_points
+from fhash_codec.paper.network import Architecture, ArrayTable, Layer, Network
 
 __all__ = ["bench_points"]
 

@@ -13,12 +13,11 @@ import torch
 from fhash_codec.bench.train.clock import Spent, now, wait
 from fhash_codec.bench.train.curves import GOALS, CurvePoint, seconds_to
 from fhash_codec.bench.train.peak import Peaks
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import Engine, make_engine
 from fhash_codec.paper.engines.native import NativeEngine
-from fhash_codec.paper.training.probe import Probe
-from fhash_codec.paper.training.train import TrainingPlan
+from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.train import Probe, TrainingPlan
 
 __all__ = ["EngineRun", "Variant"]
 

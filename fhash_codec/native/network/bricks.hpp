@@ -89,7 +89,7 @@ extern "C" struct FhashBricks {
 
 namespace {
 
-// Adam's constants: fhash_codec/training/adam.py.
+// Adam's constants: fhash_codec/paper/engines/parameters.py.
 constexpr double BETA1 = 0.9, BETA2 = 0.999, EPSILON = 1e-8;
 constexpr std::int64_t WINDOW = 200;  // missed steps after which a number no longer moves
 

@@ -1,4 +1,4 @@
-// Adam's steps without a gradient in closed form: fhash_codec/training/adam.py has the formulas.
+// Adam's steps without a gradient in closed form: paper/engines/parameters.py has the formulas.
 #pragma once
 
 #include "bricks.hpp"

@@ -28,7 +28,7 @@ struct Axis {
     std::int64_t vertices, first, stride;
 };
 
-// A bitmap of the vertices that a level holds (paper/tables/ranked.py), and the row of zeros behind
+// A bitmap of the vertices that a level holds (paper/network.py), and the row of zeros behind
 // their embeddings. Without words the level holds all vertices.
 struct Held {
     const std::uint64_t* words;

@@ -14,9 +14,9 @@ from fhash_formats.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from fhash_codec.coreset.bricks import Coreset
-    from fhash_codec.paper.architecture import Architecture
-    from fhash_codec.paper.engines.initial import Parameters
+    from fhash_codec.features.bricks import Coreset
+    from fhash_codec.paper.engines.parameters import Parameters
+    from fhash_codec.paper.network import Architecture
 
 Chosen = npt.NDArray[np.int64]
 """Numbers (n,) of some bricks of the coreset, without repetition."""
@@ -87,7 +87,7 @@ def make_engine(
         InputError: the name is unknown, or the engine cannot be had or does not take the model.
     """
     if name == "fused" or (name == "auto" and device.type == "cuda"):
-        from fhash_codec.paper.engines.fused.start import start_fused
+        from fhash_codec.paper.engines.fused.engine import start_fused
 
         fused = start_fused(
             architecture, coreset, rates, seed=seed, device=device, required=name == "fused"

@@ -21,13 +21,19 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.native.network import PATHS, library, machine_paths
-from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import Parameters, check_state, initial_parameters
-from fhash_codec.paper.engines.upsampling import Upsampling, axis_matrices
-from fhash_codec.training.adam import BETA1, BETA2
+from fhash_codec.paper.engines.parameters import (
+    BETA1,
+    BETA2,
+    Parameters,
+    Upsampling,
+    axis_matrices,
+    check_state,
+    initial_parameters,
+)
+from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 
 GROUP = 16

@@ -25,26 +25,25 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.devices import first_line
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import Chosen
-from fhash_codec.paper.engines.initial import (
-    Parameters,
-    check_state,
-    initial_parameters,
-    layer_matrices,
-)
-from fhash_codec.paper.engines.upsampling import Lattices, Upsampling
-from fhash_codec.training.adam import (
+from fhash_codec.paper.engines.parameters import (
     CatchUp,
+    Lattices,
+    Parameters,
+    Upsampling,
     adam_step,
     adam_step_on_device,
     catch_up,
     catch_up_numbers,
+    check_state,
     corrections,
+    initial_parameters,
+    layer_matrices,
+    true_positions,
 )
-from fhash_codec.training.devices import first_line
-from fhash_codec.training.positions import true_positions
+from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import FhashWarning
 
 

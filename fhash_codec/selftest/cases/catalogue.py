@@ -16,8 +16,7 @@ from fhash_codec.selftest.cases import (
     times,
     values,
 )
-from fhash_formats.errors import InputError
-from fhash_formats.support.suggestions import suggestion
+from fhash_formats.errors import InputError, suggestion
 
 __all__ = ["cases", "choose_cases"]
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.compact.goal import promise
 from fhash_codec.selftest.case import Finding, Run
-from fhash_formats.support.number_types import is_wide_integer
+from fhash_formats.support.values import is_wide_integer
 
 __all__ = ["CHECKS", "expected_coreset", "largest_difference"]
 

@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.devices import choose_device
 from fhash_codec.encoding import encode
-from fhash_codec.paper.network import ArrayTable, Network
-from fhash_codec.paper.number_type import NumberType
-from fhash_codec.paper.points import decode_region, sample_points
+from fhash_codec.paper.model import decode_region, sample_points
+from fhash_codec.paper.network import ArrayTable, Network, NumberType
 from fhash_codec.selftest.case import Finding, Run, as_floats
 from fhash_codec.selftest.checks.oracle import Oracle
-from fhash_codec.training.devices import choose_device
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 

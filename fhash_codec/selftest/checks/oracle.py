@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.points import decode_region, sample_points
 from fhash_codec.paper.storage import load_network
 from fhash_codec.selftest.case import Finding, Run
 

@@ -56,6 +56,6 @@ def _step(run: Run) -> float:
 
 def _rendered(run: Run, mode: str) -> npt.NDArray[np.float32]:
     from fhash_codec.rendering import render
-    from fhash_codec.rendering.scene.scene import Marching, Scene
+    from fhash_codec.rendering.scenes import Marching, Scene
 
     return render(run.volume, Scene(size=SIZE, step=_step(run), march=Marching(mode=mode))).rgba

@@ -10,12 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.picture.plan import Plan
-from fhash_codec.rendering.picture.planning import plan_picture
+from fhash_codec.rendering.march_task import Frame, warped
+from fhash_codec.rendering.plan import Plan, plan_picture
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
-from fhash_codec.rendering.scene.scene import Scene
-from fhash_codec.rendering.task.task import Frame
-from fhash_codec.rendering.task.warping import warped
+from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest.case import Check, Finding, Run
 from fhash_codec.selftest.checks.ray_oracle import reference_picture
 

@@ -1,4 +1,4 @@
-"""Pictures in float64, ray by ray, as `fhash_codec.rendering.task.task` defines them.
+"""Pictures in float64, ray by ray, as `fhash_codec.rendering.march_task` defines them.
 
 The oracle has no packets, skips no empty space and ends no ray early.
 """
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.task.task import Frame, Task
+from fhash_codec.rendering.march_task import Frame, Task
 
 __all__ = ["reference_picture"]
 

@@ -33,10 +33,9 @@ The tests prove that the zarr library reads every array equal.
     variables        names and headers of the variables in a file
 """
 
-from fhash_formats.container.coordinates import describe_coordinates
-from fhash_formats.container.header import validate_header
+from fhash_formats.container.array import shard_order, shard_shape
+from fhash_formats.container.header import describe_coordinates, validate_header
 from fhash_formats.container.reader import Container, Location, Place, StorageOptions, is_container
-from fhash_formats.container.sharding import shard_order, shard_shape
 from fhash_formats.container.source_entry import SOURCE, describe_metadata, read_metadata
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter

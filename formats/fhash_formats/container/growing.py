@@ -1,13 +1,4 @@
-"""`GrowingContainer`: a container that takes further layers while it can be read all the time.
-
-Two files take turns. One has the container's name and is complete. The other is hidden, and gets
-the next layer and a new end; it is synced to the disk and takes the name by a rename, which happens
-wholly or not at all. The file that had the name is hidden from then on. It lacks one layer, which
-is copied into it before the next one. So each layer is written twice and never read as a whole, and
-at every moment, also after `kill -9`, a plain complete container has the name: no reader needs to
-know that it grows. A reader that has an older state open can go on, because the arrays that it
-knows stay where they are in both files.
-"""
+"""GrowingContainer: a file that is complete after each layer; a table put together from parts."""
 
 from __future__ import annotations
 
@@ -22,18 +13,79 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import Codec
-from fhash_formats.container.sharding import pack_index, sharding_codecs
+from fhash_formats.container.array import (
+    ArrayMetadata,
+    Codec,
+    pack_index,
+    shard_shape,
+    sharding_codecs,
+    transform_codecs,
+)
+from fhash_formats.container.header import TABLE
 from fhash_formats.container.writer import ContainerWriter, Mark
 from fhash_formats.container.zip_file import Member
 from fhash_formats.errors import FhashError, OutputError
-from fhash_formats.support import leftovers
-from fhash_formats.support.atomic import check_output, explained, replacing, sync_folder
-from fhash_formats.support.interrupts import signals_held
+from fhash_formats.support.files import (
+    PARTIAL,
+    check_output,
+    clear_leftovers,
+    explained,
+    new_stem,
+    remove,
+    replacing,
+    signals_held,
+    sync_folder,
+)
+from fhash_formats.transform.tile_format import TileSettings
 
-__all__ = ["GrowingArray", "GrowingContainer"]
+
+@dataclass(frozen=True, kw_only=True)
+class TableParts:
+    """The tiles of a table, coded.
+
+    Head and masks stay in the codec and in the tiles, so that a library of Zarr that has the codec
+    decodes the table by what the array itself says.
+
+    Attributes:
+        shape: lengths of the axes (t, z, y, x).
+        dtype: type of the values.
+        tile: shape of a tile.
+        settings: settings that all tiles share.
+        streams: stream of each tile, in C order of their grid, masks included.
+        sizes: bytes of each stream, where they are known without reading it.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    tile: tuple[int, ...]
+    settings: TileSettings
+    streams: Sequence[bytes]
+    sizes: npt.NDArray[np.int64] | None = None
+
+    def write(self, writer: ContainerWriter) -> None:
+        """Write the table, an array of a chunk for each tile.
+
+        A single tile needs no shard, whose index and description would take some 120 bytes.
+        """
+        described: dict[str, Any] = {
+            "shape": self.shape,
+            "dtype": self.dtype,
+            "chunk_shape": self.tile,
+            "dimension_names": ("t", "z", "y", "x"),
+            "codecs": transform_codecs(self.settings),
+        }
+        if len(self.streams) == 1:
+            writer.add_array(TABLE, chunks=self.streams, **described)
+            return
+        grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
+        sizes = self.sizes
+        if sizes is None:
+            sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
+        shards = shard_shape(self.tile, grid, sizes)
+        writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(self.streams), **described)
+
 
 PIECE = 8 << 20
 """Bytes that are copied from one file into the other at a time."""
@@ -103,7 +155,7 @@ class GrowingContainer(ContainerWriter):
         self._common = 0
 
     def __enter__(self) -> GrowingContainer:
-        leftovers.clear([self._target])
+        clear_leftovers([self._target])
         check_output(self.path, self._force)
         return self
 
@@ -121,9 +173,9 @@ class GrowingContainer(ContainerWriter):
             if self._awake or self._opening:
                 with suppress(OSError, AttributeError):  # a full disk must not hide the first error
                     self._file.close()
-                leftovers.remove(self._temporary)
+                remove(self._temporary)
             if self._spare is not None:
-                leftovers.remove(self._spare)
+                remove(self._spare)
             self._awake = self._opening = False
             self._spare = None
 
@@ -207,7 +259,7 @@ class GrowingContainer(ContainerWriter):
         """Open the hidden file, with all lasting members in it."""
         if self._awake:
             return
-        fresh = self._target.with_name(leftovers.new_stem(self._target.name) + leftovers.PARTIAL)
+        fresh = self._target.with_name(new_stem(self._target.name) + PARTIAL)
         hidden = self._spare or fresh
         common = 0 if self._spare is None else self._common
         # A signal may come between any two lines: `close` removes the file from here on.
@@ -223,7 +275,7 @@ class GrowingContainer(ContainerWriter):
             except BaseException:
                 file.close()
                 if self._spare is None:
-                    leftovers.remove(hidden)
+                    remove(hidden)
                 raise
         except OSError as error:
             raise self._explained(error) from error
@@ -255,7 +307,7 @@ class GrowingContainer(ContainerWriter):
         """Let the hidden file take the name, and hide the one that had it."""
         with suppress(OSError):  # file systems such as exFAT have no permissions
             shutil.copymode(self._target, self._temporary)
-        spare = self._target.with_name(leftovers.new_stem(self._target.name) + leftovers.PARTIAL)
+        spare = self._target.with_name(new_stem(self._target.name) + PARTIAL)
         with signals_held():
             if self._identity() != self._ours:
                 raise self._taken()
@@ -267,7 +319,7 @@ class GrowingContainer(ContainerWriter):
                 os.replace(self._temporary, self._target)
             except BaseException:
                 if spare is not None:
-                    leftovers.remove(spare)
+                    remove(spare)
                 raise
             self._spare = spare
         sync_folder(self._target.parent)

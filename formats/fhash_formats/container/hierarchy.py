@@ -1,29 +1,226 @@
-"""The Zarr v3 hierarchy in a ZIP: members become a header and arrays.
-
-Every member must have a place in the hierarchy, and every array must have all of its chunks.
-"""
+"""Hierarchy: members of the ZIP become headers and arrays of one or several variables."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from typing import Any
 
-from fhash_formats.container import strict_json
-from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
-from fhash_formats.container.source import Source
-from fhash_formats.container.variables import (
-    CONSOLIDATED,
-    VariablePlaces,
-    consolidated,
-    read_variables,
-    variable_named,
-)
-from fhash_formats.container.zip_file import DOCUMENT, Member, read_member
+from fhash_formats.container import record as strict_json
+from fhash_formats.container.array import TRANSFORM, ArrayMetadata, attributes_of, check_keys
+from fhash_formats.container.header import POSITIONS, TABLE, check_format, complete, validate_header
+from fhash_formats.container.record import Record
+from fhash_formats.container.source_entry import AUXILIARY
+from fhash_formats.container.zip_file import DOCUMENT, Member, Source, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+
+VARIABLES = "variables"
+"""Key of the root's header: the headers of the variables."""
+ARRAY = "array"
+"""Key of a variable's header: name of its table at the root, if it lies there."""
+DIMENSIONS = "dimensions"
+"""Key of a variable's header: names of its axes, and of the arrays with its positions."""
+SHARES = "shares"
+"""Key of a variable's header: arrays beside the data that lie with another variable."""
+PARTS = "parts"
+"""Group of all arrays but tables that show values, and coordinates."""
+COORDINATES = "coords/"
+"""Beginning of the names of coordinates."""
+CONSOLIDATED = "consolidated_metadata"
+"""Key of the root's document with the documents of all others, for libraries that ask for it."""
+NODE = re.compile(r"[A-Za-z0-9_-]{1,100}")
+"""Name of an array at the root."""
+SHOWN_ATTRIBUTES = ("units", "long_name", "standard_name")
+"""Attributes of a variable that its array has for libraries that show it."""
+
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
+_OF_ROOT = ("format", "format_version", "required_features")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VariablePlaces:
+    """A variable of a file.
+
+    Attributes:
+        name: in the file.
+        header: of the variable, with the keys of the root but `variables`, checked.
+        places: path in the hierarchy by name of the array.
+        own: names of the arrays that no other variable has.
+    """
+
+    name: str
+    header: dict[str, Any]
+    places: Mapping[str, str]
+    own: Sequence[str]
+
+
+def part_place(number: int, name: str) -> str:
+    """The path of a variable's array in the group of parts: "parts/0.mlp.weight_1".
+
+    Args:
+        number: of the variable, from 0 in the order of the file.
+        name: the array's name.
+    """
+    return f"{PARTS}/{number}.{name.replace('.', '..').replace('/', '.')}"
+
+
+def free_node(wish: str, taken: Collection[str]) -> str:
+    """A name at the root that nothing has yet, as near as possible to a wish.
+
+    Each run of letters that are not allowed becomes one "_". A name that is taken, or that of the
+    group of parts, gets a number.
+    """
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", wish)[:80]
+    # Zarr keeps names that begin with two underscores for itself.
+    plain = re.sub(r"^__+", "_", plain) or "_"
+    name, number = plain, 1
+    while name in taken or name == PARTS:
+        number += 1
+        name = f"{plain}_{number}"
+    return name
+
+
+def shows_values(table: ArrayMetadata) -> bool:
+    """Whether a library that has the codec of a table finds the values of its variable there.
+
+    In integers, vertices without a value have a number that looks like one.
+    """
+    if table.coding != TRANSFORM:
+        return False
+    # Tiles with settings of their own may have masks of which the codec says nothing.
+    settings = table.coder.settings
+    return table.dtype.kind == "f" or (settings is not None and settings.mask is None)
+
+
+def read_variables(
+    root: Mapping[str, Any], arrays: Collection[str]
+) -> tuple[list[VariablePlaces], list[str]]:
+    """The variables of a root's header, and the arrays that belong to none.
+
+    Args:
+        root: attribute "fhash" of the root.
+        arrays: paths of all arrays in the hierarchy.
+
+    Raises DamagedFileError or UnsupportedFileError for a header that is not sound, and for arrays
+    that contradict it.
+    """
+    headers = _headers(root)
+    names = list(headers)
+    nodes = {header[ARRAY]: name for name, header in headers.items() if ARRAY in header}
+    places: dict[str, dict[str, str]] = {name: {} for name in headers}
+    others = []
+    for array in arrays:
+        if array in nodes:
+            _place(places[nodes[array]], TABLE, array)
+        elif array.startswith(f"{PARTS}/"):
+            number, _, part = array.removeprefix(f"{PARTS}/").partition(".")
+            name = re.sub(r"\.\.|\.", lambda dots: "." if len(dots[0]) == 2 else "/", part)
+            owner = int(number) if _NUMBER.fullmatch(number) else len(names)
+            if owner >= len(names) or part_place(owner, name) != array or not name:
+                raise DamagedFileError(f"array {array} belongs to no variable")
+            if name.startswith(COORDINATES):
+                raise DamagedFileError(f"array {array} is a coordinate, which lies at the root")
+            _place(places[names[owner]], name, array)
+        else:
+            others.append(array)
+    shared = set()
+    free = frozenset(others)
+    own = {name: tuple(found) for name, found in places.items()}
+    for name, header in headers.items():
+        for part, number in header.get(SHARES, {}).items():
+            if part not in own[names[number]]:
+                raise DamagedFileError(f"array {part_place(number, part)} is missing")
+            _place(places[name], part, places[names[number]][part])
+        for axis, dimension in zip(POSITIONS, header[DIMENSIONS], strict=True):
+            if dimension in free:
+                places[name][f"{COORDINATES}{axis}"] = dimension
+                shared.add(dimension)
+    found = [
+        VariablePlaces(name=name, header=header, places=places[name], own=own[name])
+        for name, header in headers.items()
+    ]
+    return found, [array for array in others if array not in shared]
+
+
+def consolidated(documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The value of the key `consolidated_metadata` for the documents by path of their node."""
+    return {"kind": "inline", "must_understand": False, "metadata": dict(documents)}
+
+
+@contextmanager
+def variable_named(name: str, count: int) -> Iterator[None]:
+    """A block whose errors about a file begin with the name of a variable, if it is one of several.
+
+    count: number of the file's variables.
+    """
+    try:
+        yield
+    except DamagedFileError as error:
+        if count == 1:
+            raise
+        raise type(error)(f"variable {name[:80]!a}: {error}") from error
+
+
+def _headers(root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The headers of all variables by name, complete and checked."""
+    top = Record(root, "header key ")
+    check_format(top)
+    of_root = {key: root[key] for key in _OF_ROOT}
+    headers: dict[str, dict[str, Any]] = {}
+    nodes: set[str] = set()
+    entries, records = top.get(VARIABLES), top.records(VARIABLES)
+    top.need(bool(entries), VARIABLES, "at least one variable")
+    for entry, record in zip(entries, records, strict=True):
+        own = record.record("variable").text("name")
+        name = record.text("name") if record.has("name") else own
+        key = "name" if record.has("name") else "variable"
+        record.need(name not in headers, key, "a name that no other has")
+        with variable_named(name, len(entries)):
+            header = complete(entry) | of_root
+            validate_header(header)
+            _check_names(Record(header, "header key "), nodes)
+            nodes.update({header[ARRAY]} if ARRAY in header else ())
+        headers[name] = header
+    for name, header in headers.items():
+        with variable_named(name, len(entries)):
+            checked = Record(header, "header key ")
+            unlike = "four names that no variable has"
+            checked.need(nodes.isdisjoint(header[DIMENSIONS]), DIMENSIONS, unlike)
+            _check_shares(checked, len(headers))
+    return headers
+
+
+def _check_names(header: Record, nodes: Collection[str]) -> None:
+    """Check the names of a variable's table and axes. nodes: those of the variables before."""
+    if header.has(ARRAY):
+        node = header.text(ARRAY)
+        fits = NODE.fullmatch(node) is not None and node != PARTS and node not in nodes
+        header.need(fits, ARRAY, "a name of A-Z a-z 0-9 _ - that no other has")
+    dimensions = header.texts(DIMENSIONS)
+    fits = len(set(dimensions)) == len(dimensions) == len(POSITIONS) and PARTS not in dimensions
+    fits = fits and all(NODE.fullmatch(dimension) for dimension in dimensions)
+    header.need(fits, DIMENSIONS, "four different names of A-Z a-z 0-9 _ -")
+
+
+def _check_shares(header: Record, count: int) -> None:
+    """Check which arrays of a variable lie with another one. count: number of the variables."""
+    if not header.has(SHARES):
+        return
+    header.record(SHARES)
+    for part, number in header.get(SHARES).items():
+        fits = part.startswith(AUXILIARY) and type(number) is int and 0 <= number < count
+        header.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the number of a variable")
+
+
+def _place(places: dict[str, str], name: str, array: str) -> None:
+    """Note the place of a variable's array; raises DamagedFileError where it has another."""
+    if name in places:
+        raise DamagedFileError(f"array {array} is {name}, which {places[name]} is already")
+    places[name] = array
+
 
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}
 """The zarr.json of a group without attributes."""

@@ -19,17 +19,19 @@ import numpy.typing as npt
 from fhash_formats.container.array import MAX_DIMENSIONS
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
-from fhash_formats.source_metadata import (
+from fhash_formats.series import (
+    AXES,
+    AXIS_NAMES,
     NO_AXIS,
+    Coordinate,
     SourceMetadata,
     SourceVariable,
     is_plain_name,
 )
-from fhash_formats.support.number_types import DTYPES
-from fhash_formats.support.plain_json import UnknownValueError
-from fhash_formats.support.typed_values import (
+from fhash_formats.support.values import (
+    DTYPES,
     MAX_BYTES,
+    UnknownValueError,
     attribute_value,
     inline_array,
     inline_values,

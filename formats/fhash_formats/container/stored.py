@@ -16,20 +16,30 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.sharding import (
+from fhash_formats.container.array import (
     ENTRY_BYTES,
+    ArrayMetadata,
     Index,
     Sharding,
     parse_entry,
     parse_index,
 )
-from fhash_formats.container.source import Range, Source, damage_named
-from fhash_formats.container.zip_file import Member, check_member, read_member
+from fhash_formats.container.zip_file import (
+    Member,
+    Range,
+    Source,
+    check_member,
+    damage_named,
+    read_member,
+)
 from fhash_formats.errors import DamagedFileError, FhashError, InputError, RegionError
-from fhash_formats.support.fork_lock import ForkLock
-from fhash_formats.support.slabs import common_part, region_bounds
-from fhash_formats.support.threads import in_threads, usable_threads
+from fhash_formats.support.threads import (
+    ForkLock,
+    common_part,
+    in_threads,
+    region_bounds,
+    usable_threads,
+)
 
 Key = tuple[str, tuple[int, ...], int]
 """Name of the array, index of the chunk and level of detail."""

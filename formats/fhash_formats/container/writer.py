@@ -17,20 +17,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container import strict_json
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import Codec, plain_codecs
+from fhash_formats.container import record as strict_json
+from fhash_formats.container.array import (
+    ArrayMetadata,
+    Codec,
+    Sharding,
+    pack_index,
+    plain_codecs,
+    sharding_codecs,
+)
 from fhash_formats.container.header import FORMAT, POSITIONS, TABLE, brief
-from fhash_formats.container.hierarchy import GROUP
-from fhash_formats.container.reader import Container
-from fhash_formats.container.sharding import Sharding, pack_index, sharding_codecs
-from fhash_formats.container.source import FileSource, PreviewSource
-from fhash_formats.container.source_entry import AUXILIARY
-from fhash_formats.container.variables import (
+from fhash_formats.container.hierarchy import (
     ARRAY,
     CONSOLIDATED,
     COORDINATES,
     DIMENSIONS,
+    GROUP,
     SHARES,
     SHOWN_ATTRIBUTES,
     VARIABLES,
@@ -39,21 +41,25 @@ from fhash_formats.container.variables import (
     part_place,
     shows_values,
 )
+from fhash_formats.container.reader import Container
+from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.zip_file import (
     DOCUMENT,
     FORMAT_VERSION,
     MAX_MEMBER,
     MAX_NAME,
     NAME,
+    FileSource,
     Member,
+    PreviewSource,
     document_member,
     ending,
     local_header,
 )
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
-from fhash_formats.support.atomic import replacing
-from fhash_formats.support.plain_json import plain_json
-from fhash_formats.support.slabs import slab_shape
+from fhash_formats.support.files import replacing
+from fhash_formats.support.threads import slab_shape
+from fhash_formats.support.values import plain_json
 
 Coded = npt.NDArray[Any] | bytes
 """A chunk to write: its values, or the bytes that the coder of its first codec made of them."""

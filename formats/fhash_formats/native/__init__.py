@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import MissingDependencyError
-from fhash_formats.support.fork_lock import ForkLock
+from fhash_formats.support.threads import ForkLock
 
 __all__ = [
     "ABI_VERSION",

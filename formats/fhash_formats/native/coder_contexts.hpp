@@ -27,7 +27,7 @@ const int PADDING = 2;                      // zeros beside a row of magnitudes
 const int LOG_PADDING = 4;                  // zeros beside a row of logarithms
 const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
 
-// Columns of the table of bands (transform/entropy/table.py). LOW, HIGH and SHIFT are the first of
+// Columns of the table of bands (transform/coder.py). LOW, HIGH and SHIFT are the first of
 // four columns, for t, z, y and x. BAND and SHIFT are columns within a reference.
 enum Column { LOW = 0, HIGH = 4, KIND = 8, REFERENCES = 9, BAND = 0, SHIFT = 1 };
 const int REFERENCE_COUNT = 4, REFERENCE_COLUMNS = 5;

@@ -1,4 +1,4 @@
-// The trained neighbourhood head over a tile. transform/head/head.py states the arithmetic, and
+// The trained neighbourhood head over a tile. transform/head.py states the arithmetic, and
 // tests/reference/head.py computes the same bits in numpy.
 #include <cstring>
 #include <memory>

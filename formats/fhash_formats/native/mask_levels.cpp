@@ -1,5 +1,5 @@
 // Levels of a mask from decoded values: how likely each vertex is occupied
-// (transform/entropy/mask_levels.py says what they mean).
+// (transform/coder.py says what they mean).
 //
 // Scores of values are summed over the vertices within reach along z, then y, then x, and cut after
 // each axis. Each sum is that of the vertex before, plus one value, less one.

@@ -97,7 +97,7 @@ struct Simple {
     uint16_t p, count;
 };
 
-// The state that a coder adapts (transform/entropy/prior.py). The caller's weights are int32,
+// The state that a coder adapts (transform/coder.py). The caller's weights are int32,
 // `lanes` to a set. Here they are int16, which holds all of them, and each set is filled up with
 // zeros to whole vectors.
 struct State {

@@ -11,7 +11,7 @@
 // and beyond in an Exp-Golomb code. Where large magnitudes are expected, their low bits are coded
 // apart.
 //
-// Python builds the passes and their taps (transform/entropy/predictor.py), so they are right
+// Python builds the passes and their taps (transform/predict.py), so they are right
 // whatever the bytes. tests/reference/predictor.py decodes the same.
 #include <cstdlib>
 #include <type_traits>
@@ -289,7 +289,7 @@ FHASH_CLONES int64_t decode(Pass<true>& pass, int32_t* q, const int64_t* shape,
 // counted: by vertex, whether its integer must come back (null: all must). The others become their
 // predictions, also in q.
 // levels: halvings of the first lattice along each axis.
-// passes, taps, tap_weights: see pass_arrays in transform/entropy/predictor.py. At most
+// passes, taps, tap_weights: see pass_arrays in transform/predict.py. At most
 // MAX_ROW_TAPS taps of a pass lie in the row of the vertex.
 // slots, weights, simples: the state to begin from.
 // data: receives the bytes if they fit the capacity.

@@ -6,10 +6,16 @@ mask over a series. `common/` holds what several formats share: the user's reque
 variable and of its axes, coordinates, packed values, stored bytes, errors.
 """
 
-from fhash_formats.readers.common.listing import Listed
-from fhash_formats.readers.common.request import RawLayout, parse_shape
-from fhash_formats.readers.masks import Mask, open_mask
-from fhash_formats.readers.registry import REGISTRY, Reader, list_variables, open_series
+from fhash_formats.readers.common.file_series import RawLayout, parse_shape
+from fhash_formats.readers.common.variables import Listed
+from fhash_formats.readers.registry import (
+    REGISTRY,
+    Mask,
+    Reader,
+    list_variables,
+    open_mask,
+    open_series,
+)
 
 __all__ = [
     "REGISTRY",

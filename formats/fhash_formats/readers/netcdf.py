@@ -1,26 +1,34 @@
-"""NetCDF files, read by the CF conventions with xarray.
-
-Packing is undone, fill values become NaN, times stay numbers. NetCDF4 is HDF5 and goes through
-h5netcdf, NetCDF3 ("classic") through common/netcdf3.py. Times are not decoded: float64 hours near
-347921 tell steps apart, calendars of models need no date, and `units` and `calendar` stay beside
-the numbers.
-`valid_range` never hides a value, since it is wrong in files that are in use.
-"""
+"""Reader of NetCDF 3 and 4."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from fhash_formats.readers.common import step_groups
-from fhash_formats.readers.common.cf_packing import Packing
-from fhash_formats.readers.common.failures import Stamp, refusing
-from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common import variables as step_groups
+from fhash_formats.readers.common.cf import (
+    MAX_LETTERS,
+    Column,
+    Packing,
+    beside,
+    coordinate,
+    only_counts,
+    packing,
+    real_time,
+    role_of_coordinate,
+    role_of_name,
+    usable,
+    written_times,
+)
+from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, refusing
 from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
@@ -29,37 +37,223 @@ from fhash_formats.readers.common.layout import (
     shared_roles,
     with_roles,
 )
-from fhash_formats.readers.common.listing import Listed, listing
-from fhash_formats.readers.common.netcdf_store import (
-    CLASSIC,
-    check_filters,
-    close_groups,
-    declared,
-    default_fill,
-    exactly_filled,
-    magic_of,
-    open_groups,
-    quietly,
-)
-from fhash_formats.readers.common.netcdf_surroundings import netcdf_metadata
-from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.stored_parts import hdf5_parts, not_stored
-from fhash_formats.readers.common.times import (
-    MAX_LETTERS,
-    only_counts,
-    real_time,
-    written_times,
+from fhash_formats.readers.common.surroundings import Stored, Wanted, metadata_of
+from fhash_formats.readers.common.variables import (
+    Listed,
+    Variable,
+    choose,
+    listing,
+    plain_name,
+    series_like,
 )
-from fhash_formats.readers.common.variables import Variable, choose, plain_name, series_like
-from fhash_formats.readers.hdf5 import is_hdf5
-from fhash_formats.series import AXES, Coordinate
-from fhash_formats.source_metadata import shown_name
-from fhash_formats.support.attributes import STORED, json_attributes, text_of
+from fhash_formats.readers.hdf5 import is_hdf5, require_filters
+from fhash_formats.series import AXES, Coordinate, SourceMetadata, shown_name
+from fhash_formats.support.values import STORED, is_wide_integer, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
+
+Values = npt.NDArray[Any]
+Exact = Callable[[Values, tuple[slice, ...]], Values]
+
+DEFAULT_FILLS = {
+    "i2": -32767,
+    "u2": 65535,
+    "i4": -2147483647,
+    "u4": 4294967295,
+    "i8": -9223372036854775806,
+    "u8": 18446744073709551614,
+    "f4": 9.969209968386869e36,
+    "f8": 9.969209968386869e36,
+}
+"""NC_FILL_SHORT and so on of netcdf.h; bytes have none that counts."""
+
+CLASSIC = (b"CDF\x01", b"CDF\x02", b"CDF\x05")
+"""First bytes of classic files."""
+
+
+def magic_of(path: Path) -> bytes:
+    """The first four bytes of a file."""
+    with path.open("rb") as file:
+        return file.read(4)
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Silence xarray's warnings about a file (several fill values, bounds that are missing).
+
+    None of them changes the values that are read.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def open_groups(
+    source: str, path: Path, head: bytes, *, raw: bool = False, decoded: bool = True
+) -> Mapping[str, xr.Dataset]:
+    """Datasets of all groups by path, "/" first.
+
+    raw: leave values packed. decoded: whether attributes that name variables are taken out, and
+    these made coordinates; if not, everything is as it is stored.
+    """
+    import xarray as xr
+
+    options: dict[str, Any] = {
+        "decode_times": False,
+        "decode_timedelta": False,
+        "decode_coords": "all",
+        "cache": False,
+        "chunks": None,
+        "mask_and_scale": not raw,
+    }
+    if not decoded:
+        options |= {"decode_coords": False, "concat_characters": False, "mask_and_scale": False}
+    if head in CLASSIC:
+        from fhash_formats.readers.netcdf3 import ClassicStore
+
+        with refusing(f"{source} cannot be read as classic NetCDF"):
+            return {"/": xr.open_dataset(ClassicStore(path), engine="store", **options)}
+    # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
+    return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+
+
+def close_groups(groups: Mapping[str, xr.Dataset]) -> None:
+    """Close the datasets of all groups."""
+    with quietly():
+        for dataset in groups.values():
+            dataset.close()
+
+
+def declared(source: str, array: xr.Variable) -> Packing | None:
+    """The packing of a variable that xarray unpacks; None for types that cannot be packed."""
+    stored = np.dtype(array.encoding.get("dtype", array.dtype))
+    return packing(source, stored, array.encoding) if stored.kind in "iuf" else None
+
+
+def default_fill(array: xr.Variable, packed: Packing | None) -> float | int | None:
+    """The number that NetCDF puts where nobody wrote, as it is read.
+
+    None for bytes, and where the variable declares a fill value of its own.
+    """
+    if packed is None or {"_FillValue", "missing_value"} & {*array.encoding, *array.attrs}:
+        return None
+    stored = DEFAULT_FILLS.get(packed.stored.str[1:])
+    if stored is None:
+        return None
+    value: float | int = packed.unpack(np.array([stored], packed.stored))[0].item()
+    return value
+
+
+def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:
+    """A test that tells a fill value from its neighbours; None where float64 suffices.
+
+    xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
+    """
+    stored = np.dtype(encoding.get("dtype", np.float32))
+    if not is_wide_integer(stored):
+        return None
+    plain = {
+        key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        for key, value in encoding.items()
+    }
+    packed = packing(source, stored, plain)
+    if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
+        return None
+
+    def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
+        if not np.isnan(values).any():
+            return values
+        return packed.unpack(_stored(path, name, ranges))
+
+    return exact
+
+
+def _stored(path: Path, name: str, ranges: tuple[slice, ...]) -> Values:
+    if magic_of(path) in CLASSIC:
+        from fhash_formats.readers.netcdf3 import read_header
+
+        return read_header(path).variables[name].read(ranges)
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][ranges])
+
+
+def check_filters(source: str, path: Path, name: str) -> None:
+    """Raise an error that says what is missing, if a variable cannot be decompressed here."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return
+    with h5py.File(path, "r") as file:
+        dataset = file.get(name)
+        if isinstance(dataset, h5py.Dataset):
+            require_filters(source, name, dataset)
+
+
+def netcdf_metadata(
+    path: Path,
+    handle: tuple[str, str],
+    groups: Collection[str],
+    layout: Layout,
+    request: Request,
+    coords: Mapping[str, Coordinate],
+    packed: Packing | None,
+    without: Collection[str],
+) -> Callable[[], SourceMetadata]:
+    """A function that reads what belongs to a variable.
+
+    handle: group and name of the variable. groups: its own group and those around it, the nearest
+        first. coords: positions of the axes. packed: how the values are
+        packed; None where they are read as they are stored. without: attributes that do not hold
+        for the values.
+    """
+
+    def read() -> SourceMetadata:
+        source = str(path)
+        with refusing(f"{source} cannot be read as NetCDF"):
+            with quietly():
+                opened = open_groups(source, path, magic_of(path), decoded=False)
+            try:
+                scope = [opened[group] for group in groups if group in opened]
+                variables = {
+                    str(name): stored_variable(array)
+                    for dataset in reversed(scope)
+                    for name, array in dataset.variables.items()
+                }
+                used = [each.name for each in coords.values()]
+                wanted = Wanted(
+                    source=source, name=handle[1], used=used, without=without, path=path
+                )
+                attributes = scope[0].attrs
+                return metadata_of(
+                    handle[1], variables, attributes, layout, request, wanted, packed, coords["t"]
+                )
+            finally:
+                close_groups(opened)
+
+    return read
+
+
+def stored_variable(array: xr.Variable) -> Stored:
+    """A variable of a dataset of which nothing was decoded."""
+    return Stored(
+        dimensions=tuple(map(str, array.dims)),
+        shape=array.shape,
+        dtype=array.dtype,
+        attributes=dict(array.attrs),
+        read=partial(_values, array),
+    )
+
+
+def _values(array: xr.Variable, places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+    with quietly():
+        values: npt.NDArray[Any] = array[places].to_numpy()
+    # without what xarray notes of the stored type, such as enumerations
+    return values if values.dtype.kind == "O" else np.asarray(values, dtype=values.dtype.str)
+
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
 MADE_UP = "phony_dim_"

@@ -1,19 +1,34 @@
-"""Raw bytes without a header.
-
-The layout comes from the user or from the file's name, such as name_256x256x128x10_float32_be.raw.
-"""
+"""Readers of plain values: raw files of a given layout, and NPY."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.failures import Stamp
-from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.flat import FlatArray
-from fhash_formats.readers.common.request import ENDIANS, RawLayout, Request, parse_dtype
+from fhash_formats.readers.common.file_series import (
+    ENDIANS,
+    FileSeries,
+    RawLayout,
+    Request,
+    Stamp,
+    parse_dtype,
+    refusing,
+)
+from fhash_formats.readers.common.layout import Dimension, arrange
+from fhash_formats.readers.common.stored_bytes import FlatArray
+from fhash_formats.readers.common.variables import (
+    Listed,
+    Variable,
+    choose,
+    expand,
+    field_reading,
+    listing,
+)
 from fhash_formats.series import AXES
 
 NAME = re.compile(
@@ -23,7 +38,7 @@ NAME = re.compile(
 FORM = "name_XxYxZ[xT]_TYPE[_be].raw, such as density_64x64x32x10_float32.raw"
 
 
-def matches(head: bytes, path: Path) -> bool:
+def is_raw(head: bytes, path: Path) -> bool:
     """Whether this is raw by its suffix; the first bytes are values and say nothing."""
     return path.suffix.lower() == ".raw"
 
@@ -100,3 +115,87 @@ def open_raw(path: Path, request: Request) -> FileSeries:
 def _advice(lengths: Mapping[str, int], size: int, needed: int) -> str:
     frames = "t" not in lengths and size % needed == 0
     return f"; with t={size // needed} the size would fit" if frames else ""
+
+
+MAGIC = b"\x93NUMPY"
+
+
+def is_npy(head: bytes, path: Path) -> bool:
+    """Whether this is .npy, or .npz, which is refused with advice."""
+    return head.startswith(MAGIC) or path.suffix.lower() == ".npz"
+
+
+class _Npy:
+    """The header of a .npy file: its variables, one for each field of a structured array."""
+
+    def __init__(self, path: Path, request: Request) -> None:
+        self.source, self.stamp = str(path), Stamp.of(path)
+        if path.suffix.lower() == ".npz":
+            raise InputError(
+                f"{self.source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
+                f" numpy.load('{path.name}')[NAME])"
+            )
+        with refusing(f"{self.source} cannot be read as .npy"):
+            # opened as a map for its header only: type, shape, order and the offset of the values;
+            # Python objects are refused by it
+            header = np.load(path, mmap_mode="r", allow_pickle=False)
+            self.shape, dtype, offset = header.shape, header.dtype, int(header.offset)
+            self.fortran = header.flags.f_contiguous and not header.flags.c_contiguous
+            del header
+        # Fortran's order: the same bytes, read as C order with the dimensions reversed
+        stored = self.shape[::-1] if self.fortran else self.shape
+        self.array = FlatArray(path, stored, dtype, offset=offset)
+        if self.array.end != self.stamp.size:
+            raise InputError(
+                f"{self.source} has {self.stamp.size} bytes, its header promises"
+                f" {self.array.end}; the file is cut or holds more than one array"
+            )
+        whole = Variable(name=path.stem, shape=self.shape, dtype=dtype)
+        self.variables = expand([whole])
+        if self.variables == [whole]:
+            request.refuse_var(self.source)
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable; none has a name."""
+        return [Dimension(name=None, length=length) for length in variable.shape]
+
+    def read(self, ranges: tuple[slice, ...]) -> Any:
+        """Values of the stored array in ranges of its dimensions."""
+        if self.fortran:
+            return self.array.read(ranges[::-1]).transpose()
+        return self.array.read(ranges)
+
+
+def open_npy(path: Path, request: Request) -> FileSeries:
+    """Open the series in a .npy file.
+
+    Its dimensions are (t, z, y, x) or (z, y, x) unless the request names the axes.
+    """
+    found = _Npy(path, request)
+    variable = choose(
+        found.source,
+        found.variables,
+        request.var,
+        booleans=request.booleans,
+        selected=len(request.select),
+    )
+    layout = arrange(found.source, variable.name, found.dimensions(variable), request)
+    stored = len(found.shape)
+    return FileSeries(
+        source=found.source,
+        name=variable.name,
+        shape=layout.shape,
+        dtype=variable.dtype,
+        axes=layout.axes,
+        fetch=layout.fetch(field_reading(found.read, variable, stored)),
+        stamp=found.stamp,
+        attributes=layout.attributes(),
+        # time as the fastest dimension: all steps are read together
+        chunks=layout.chunks(variable.shape) if found.fortran else None,
+    )
+
+
+def list_npy(path: Path, request: Request) -> list[Listed]:
+    """The variables of a .npy file."""
+    found = _Npy(path, request)
+    return listing(found.source, found.variables, found.dimensions, request)

@@ -1,4 +1,4 @@
-"""All formats that can be read, recognised by the first bytes of a file, then by its suffix."""
+"""Registry of the readers: finds the right one, opens a series or a mask, lists the variables."""
 
 from __future__ import annotations
 
@@ -7,26 +7,46 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
 from fhash_formats.readers import (
     hdf5,
-    metaimage,
     netcdf,
-    npy,
-    nrrd,
-    pvd,
     raw,
     tiff,
-    vtk_xml,
-    vtkhdf,
     zarr_store,
 )
-from fhash_formats.readers.common.failures import condense, refusing
-from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.listing import Listed, listed_series
-from fhash_formats.readers.common.request import RawLayout, Request, parse_axes, selection
+from fhash_formats.readers import (
+    images as metaimage,
+)
+from fhash_formats.readers import (
+    images as nrrd,
+)
+from fhash_formats.readers import (
+    raw as npy,
+)
+from fhash_formats.readers import (
+    vtk as pvd,
+)
+from fhash_formats.readers import (
+    vtk as vtk_xml,
+)
+from fhash_formats.readers import (
+    vtk as vtkhdf,
+)
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    RawLayout,
+    Request,
+    condense,
+    parse_axes,
+    refusing,
+    selection,
+)
 from fhash_formats.readers.common.stored_parts import require_inside
-from fhash_formats.readers.common.variables import SeveralVariablesError
+from fhash_formats.readers.common.variables import Listed, SeveralVariablesError, listed_series
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern, warn_of_gaps
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
 
@@ -76,7 +96,7 @@ class Reader:
             )
 
 
-RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
+RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.is_raw, open=raw.open_raw)
 ZARR = Reader(
     name="Zarr",
     suffixes=(".zarr", ".zip"),
@@ -89,7 +109,10 @@ ZARR = Reader(
 REGISTRY = (
     RAW,
     Reader(
-        name="VTKHDF", suffixes=vtkhdf.SUFFIXES, matches=vtkhdf.matches, open=vtkhdf.open_vtkhdf
+        name="VTKHDF",
+        suffixes=vtkhdf.VTKHDF_SUFFIXES,
+        matches=vtkhdf.is_vtkhdf,
+        open=vtkhdf.open_vtkhdf,
     ),
     Reader(
         name="NetCDF",
@@ -112,19 +135,26 @@ REGISTRY = (
     Reader(
         name="NumPy",
         suffixes=(".npy",),
-        matches=npy.matches,
+        matches=npy.is_npy,
         open=npy.open_npy,
         variables=npy.list_npy,
         selects=True,
     ),
     ZARR,
-    Reader(name="VTK", suffixes=vtk_xml.SUFFIXES, matches=vtk_xml.matches, open=vtk_xml.open_vtk),
-    Reader(name="collection", suffixes=pvd.SUFFIXES, matches=pvd.matches, open=pvd.open_pvd),
-    Reader(name="NRRD", suffixes=nrrd.SUFFIXES, matches=nrrd.matches, open=nrrd.open_nrrd),
+    Reader(
+        name="VTK", suffixes=vtk_xml.XML_SUFFIXES, matches=vtk_xml.is_vtk_xml, open=vtk_xml.open_vtk
+    ),
+    Reader(
+        name="collection",
+        suffixes=pvd.COLLECTION_SUFFIXES,
+        matches=pvd.is_collection,
+        open=pvd.open_pvd,
+    ),
+    Reader(name="NRRD", suffixes=nrrd.NRRD_SUFFIXES, matches=nrrd.is_nrrd, open=nrrd.open_nrrd),
     Reader(
         name="MetaImage",
-        suffixes=metaimage.SUFFIXES,
-        matches=metaimage.matches,
+        suffixes=metaimage.METAIMAGE_SUFFIXES,
+        matches=metaimage.is_metaimage,
         open=metaimage.open_metaimage,
     ),
     Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
@@ -367,3 +397,43 @@ def _is_container(path: Path, head: bytes) -> bool:
     from fhash_formats.container import is_container
 
     return is_container(path)
+
+
+class Mask:
+    """A mask over a series: `mask(step)` is the boolean frame (z, y, x).
+
+    A file with a single frame serves every step.
+    """
+
+    def __init__(self, values: Series) -> None:
+        self._values = values
+        self.files = values.files
+
+    def __call__(self, step: int) -> npt.NDArray[np.bool_]:
+        """Frame (z, y, x), True where the file's value at this step is neither zero nor NaN.
+
+        Raises InputError if the file cannot be read.
+        """
+        frame = self._values.read(step if self._values.shape[0] > 1 else 0)
+        mask: npt.NDArray[np.bool_] = frame != 0
+        return mask & ~np.isnan(frame) if frame.dtype.kind == "f" else mask
+
+    def close(self) -> None:
+        """Close the file."""
+        self._values.close()
+
+
+def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) -> Mask:
+    """Open a mask for a series of `shape` (t, z, y, x).
+
+    The file holds booleans or numbers of that shape, or of (z, y, x) for all steps alike, in any
+    format that `open_series` reads. Raises InputError for another shape.
+    """
+    values = open_whole(path, Request(var=var, booleans=True, asked=False))
+    if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
+        values.close()
+        raise InputError(
+            f"{path}: the mask has shape {values.shape} (t, z, y, x), the series {tuple(shape)};"
+            " it must be that, or one step of it"
+        )
+    return Mask(values)

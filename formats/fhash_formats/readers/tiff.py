@@ -19,11 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.failures import Stamp, condense, naming
-from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.grid import component_by_number, component_variables, lattice
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.stored_bytes import PlainFile
+from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, condense, naming
+from fhash_formats.readers.common.stored_bytes import (
+    PlainFile,
+    component_by_number,
+    component_variables,
+    lattice,
+)
 from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import Coordinate, NotStored
 

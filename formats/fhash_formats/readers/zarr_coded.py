@@ -15,16 +15,13 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.readers.common.cf_packing import Packing
-from fhash_formats.readers.common.failures import condense, refusing
-from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.cf import Packing
+from fhash_formats.readers.common.file_series import FileSeries, Request, condense, refusing
 from fhash_formats.readers.common.layout import Layout, arrange, label
-from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.zarr_store import ZarrTree, open_tree, series_in
 from fhash_formats.series import AXES
-from fhash_formats.transform.array_axes import NO_AXIS, TILE_AXES, ArrayAxes
-from fhash_formats.transform.stream import MAX_TILE_VERTICES
+from fhash_formats.transform.stream import MAX_TILE_VERTICES, NO_AXIS, TILE_AXES, ArrayAxes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,11 +1,15 @@
-"""Zarr of formats 2 and 3, in a folder or a ZIP: an array, or a group with arrays in it."""
+"""Reader of Zarr stores, folders and ZIPs, through the zarr library."""
 
 from __future__ import annotations
 
+import base64
+import binascii
+import struct
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +17,29 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common import step_groups
-from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
-from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
-from fhash_formats.readers.common.fields import expand, reading
-from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.hdf5_tree import sibling
+from fhash_formats.readers.common import variables as step_groups
+from fhash_formats.readers.common.cf import (
+    MAX_LETTERS,
+    SCALING,
+    Column,
+    Packing,
+    beside,
+    only_counts,
+    packing,
+    real_time,
+    role_of_coordinate,
+    role_of_name,
+    usable,
+    written_times,
+)
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    FolderStamp,
+    Request,
+    Stamp,
+    condense,
+    refusing,
+)
 from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
@@ -27,49 +48,224 @@ from fhash_formats.readers.common.layout import (
     shared_roles,
     with_roles,
 )
-from fhash_formats.readers.common.listing import Listed, listing
-from fhash_formats.readers.common.positions import Column, beside, usable
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
-from fhash_formats.readers.common.stored_parts import (
-    not_stored,
-    warn_of_column,
-    zarr_parts,
-)
-from fhash_formats.readers.common.times import (
-    MAX_LETTERS,
-    only_counts,
-    real_time,
-    written_times,
-)
+from fhash_formats.readers.common.stored_parts import not_stored, warn_of_column, zarr_parts
+from fhash_formats.readers.common.surroundings import Stored, Wanted, metadata_of, named_dimensions
 from fhash_formats.readers.common.variables import (
+    MIN_DIMENSIONS,
+    Listed,
     Variable,
     choose,
+    expand,
+    field_reading,
+    listing,
     parent,
     plain_name,
     series_like,
 )
-from fhash_formats.readers.common.zarr_nodes import (
-    METADATA,
-    metadata_of,
-    nodes_in_folder,
-    nodes_in_zip,
-    open_arrays,
-)
-from fhash_formats.readers.common.zarr_surroundings import dimension_names, zarr_metadata
-from fhash_formats.series import Coordinate
-from fhash_formats.source_metadata import shown_name
-from fhash_formats.support.attributes import PACKING, PLUMBING, STORED, json_attributes
+from fhash_formats.readers.hdf5 import sibling
+from fhash_formats.series import Coordinate, SourceMetadata, shown_name
+from fhash_formats.support.values import PACKING, PLUMBING, STORED, json_attributes
 
 if TYPE_CHECKING:
     import zarr
+
+METADATA = ("zarr.json", ".zarray", ".zgroup")
+
+
+def metadata_file(path: Path) -> Path | None:
+    """The metadata file of a group or array in a folder; None if the folder is neither."""
+    return next((path / name for name in METADATA if (path / name).is_file()), None)
+
+
+def nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
+    """Paths of all groups and arrays below a group.
+
+    Folders of chunks have no metadata and are not entered.
+    """
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and metadata_file(child) is not None:
+            yield f"{place}{child.name}"
+            if not (child / ".zarray").is_file():
+                yield from nodes_in_folder(child, f"{place}{child.name}/")
+
+
+def nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
+    """Place of the hierarchy in a ZIP, and its groups and arrays from there.
+
+    The place is the top, or the one folder that was zipped.
+    """
+    with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
+        names = file.namelist()
+    nodes = sorted(
+        {name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA}
+    )
+    tops = {name.split("/", 1)[0] for name in names}
+    inside = "" if "" in nodes else next(iter(tops)) if len(tops) == 1 else None
+    if inside is None or inside not in nodes:
+        raise InputError(
+            f"{source} is a ZIP that holds no zarr hierarchy ({', '.join(METADATA)} at its top)"
+        )
+    return inside, [node.removeprefix(inside).lstrip("/") for node in nodes]
+
+
+def open_arrays(
+    store: Any, inside: str, nodes: Iterable[str]
+) -> tuple[dict[str, zarr.Array[Any]], dict[str, Mapping[str, Any]], dict[str, str]]:
+    """Arrays by path, the attributes of groups, and the errors of those that cannot be opened.
+
+    An array with an unknown codec does not bar the others.
+    """
+    import zarr
+
+    arrays: dict[str, zarr.Array[Any]] = {}
+    groups: dict[str, Mapping[str, Any]] = {}
+    failed: dict[str, str] = {}
+    for node in nodes:
+        try:
+            opened = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
+        except Exception as error:  # codecs, types and JSON raise all kinds
+            failed[node] = condense(error)
+            continue
+        if isinstance(opened, zarr.Array):
+            arrays[node] = opened
+        else:
+            groups[node] = dict(opened.attrs)
+    return arrays, groups, failed
+
+
+FILL = "_FillValue"
+
+
+def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
+    """Name of each dimension, None for one without a name.
+
+    Format 3 has a field for them, xarray an attribute in format 2.
+    """
+    names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(
+        array.metadata, "dimension_names", None
+    )
+    if not isinstance(names, list | tuple) or len(names) != array.ndim:
+        return [None] * array.ndim
+    return [str(name) if name is not None else None for name in names]
+
+
+def zarr_metadata(
+    root: Path,
+    path: str,
+    arrays: Mapping[str, zarr.Array[Any]],
+    groups: Mapping[str, Mapping[str, Any]],
+    layout: Layout,
+    request: Request,
+    coords: Mapping[str, Coordinate],
+    packed: Packing | None,
+    without: Collection[str],
+) -> Callable[[], SourceMetadata | None]:
+    """A function that reads what belongs to an array.
+
+    It gives None where dimensions have no names, and nothing but positions lies beside the array.
+
+    root: of the hierarchy. path: of the array in it. arrays, groups: all of them, and the
+    attributes of groups. The other arguments are those of `netcdf_metadata`.
+    """
+
+    def read() -> SourceMetadata | None:
+        source = str(root)
+        group, _, name = path.rpartition("/")
+        with refusing(f"{source} cannot be read as zarr"):
+            if not name:
+                return None
+            variables = {
+                each.rpartition("/")[2]: stored
+                for place in dict.fromkeys(["", group])  # those of the nearest place count
+                for each, stored in _stored_in(arrays, place)
+            }
+            if None in dimension_names(arrays[path]):
+                taken = {each.name.rpartition("/")[2] for each in coords.values()}
+                if not any(
+                    each not in (name, *taken) and len(stored.shape) < MIN_DIMENSIONS
+                    for each, stored in variables.items()
+                ):
+                    return None
+                own = tuple(named_dimensions(layout, coords))
+                variables[name] = replace(variables[name], dimensions=own)
+                for each in taken & variables.keys():  # positions have their own dimension
+                    if variables[each].shape in [(length,) for length in layout.shape]:
+                        variables[each] = replace(variables[each], dimensions=(each,))
+            wanted = Wanted(
+                source=source,
+                name=name,
+                used=[each.name.rpartition("/")[2] for each in coords.values()],
+                without=without,
+                path=root,
+            )
+            attributes = groups.get(group, {})
+            return metadata_of(
+                name, variables, attributes, layout, request, wanted, packed, coords["t"]
+            )
+
+    return read
+
+
+def _stored_in(arrays: Mapping[str, zarr.Array[Any]], group: str) -> Sequence[tuple[str, Stored]]:
+    """The arrays of a group; a dimension without a name has one of its own."""
+    found = []
+    for path, array in arrays.items():
+        place, _, own = path.rpartition("/")
+        if place != group:
+            continue
+        stored = Stored(
+            dimensions=tuple(
+                name or f"{own}_dim_{number}" for number, name in enumerate(dimension_names(array))
+            ),
+            shape=array.shape,
+            dtype=np.dtype(array.dtype),
+            attributes=_attributes(array),
+            read=partial(_values, array),
+        )
+        found.append((path, stored))
+    return found
+
+
+def _attributes(array: zarr.Array[Any]) -> dict[str, Any]:
+    """The attributes of an array, with the fill value in the type of the array."""
+    found = {key: value for key, value in dict(array.attrs).items() if key not in PLUMBING}
+    fill: Any = found.pop(FILL, None)
+    if array.metadata.zarr_format == 2 and "_ARRAY_DIMENSIONS" in array.attrs:
+        fill = array.fill_value if fill is None else fill
+    dtype = np.dtype(array.dtype)
+    if isinstance(fill, str) and dtype.kind == "f":
+        fill = _decoded(fill)
+    if fill is not None:
+        try:
+            found[FILL] = dtype.type(fill) if dtype.kind in "iuf" else fill
+        except (ValueError, OverflowError, TypeError):
+            found[FILL] = fill
+    return found
+
+
+def _decoded(text: str) -> Any:
+    """A fill value of floats: a number as text, or base64 of a float64, as xarray writes it."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return struct.unpack("<d", base64.standard_b64decode(text))[0]
+    except (struct.error, binascii.Error):
+        return text
+
+
+def _values(array: zarr.Array[Any], places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+    values = np.asarray(array[places])
+    return values.astype(object) if values.dtype.kind in "TU" else values
+
 
 ZIP = b"PK\x03\x04"
 
 
 def matches(head: bytes, path: Path) -> bool:
     """Whether this is a folder with zarr metadata, or a ZIP."""
-    return metadata_of(path) is not None if path.is_dir() else head.startswith(ZIP)
+    return metadata_file(path) is not None if path.is_dir() else head.startswith(ZIP)
 
 
 def open_zarr(path: Path, request: Request) -> FileSeries:
@@ -104,7 +300,7 @@ def open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
 
     source = str(path)
     if path.is_dir():
-        if metadata_of(path) is None:
+        if metadata_file(path) is None:
             raise InputError(f"{source} holds no zarr metadata ({', '.join(METADATA)})")
         inside, nodes = "", ["", *nodes_in_folder(path)]
         store: LocalStore | ZipStore = LocalStore(path, read_only=True)
@@ -121,7 +317,7 @@ def open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
             # "." and ".." have a name and a folder around them too
             place = path if path.name.strip(".") else path.resolve()
             alone = "" in arrays and path.is_dir() and request.var is None
-            if alone and metadata_of(place.parent) is not None:
+            if alone and metadata_file(place.parent) is not None:
                 # an array of a group, named by its folder: its coordinates are beside it
                 store.close()
                 return open_tree(place.parent, replace(request, var=place.name))
@@ -182,7 +378,7 @@ class ZarrTree:
             step_groups.require_one_type(self.source, variable, self.packing)
             return step_groups.reading([self.reading(member) for member in variable.members])
         values = self.values(variable)
-        return reading(values.read, variable, values.array.ndim)
+        return field_reading(values.read, variable, values.array.ndim)
 
     def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes: those along a dimension by its name, else by their own name."""
@@ -297,7 +493,7 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         fetch=layout.fetch(found.reading(variable)),
         # In a folder the array's metadata shows a change of shape at once; a changed chunk shows
         # when all files are checked at the end.
-        stamp=Stamp.of((metadata_of(root / path) or root) if root.is_dir() else root),
+        stamp=Stamp.of((metadata_file(root / path) or root) if root.is_dir() else root),
         folder=FolderStamp.of(folder) if root.is_dir() else None,
         coords=found.coordinates(variable, layout),
         attributes=json_attributes(dict(array.attrs), without=without) | layout.attributes(),

@@ -1,9 +1,4 @@
-"""One chunk of an array to bytes and back, with settings that are chosen for each chunk.
-
-The settings are chosen in closed form and by trials, as the effort asks for, and stand in the
-stream. Nothing is trained, and the choice depends only on sizes in bytes and on arithmetic in a
-stated order, so the same chunk gives the same bytes on every machine.
-"""
+"""Encoding of one chunk to a stated quality: the search for a transform and a quantisation step."""
 
 from __future__ import annotations
 
@@ -16,33 +11,65 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.support.number_types import exact_number, integer_origin
-from fhash_formats.transform.axes.candidates import NO_TRANSFORM, candidates
-from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.entropy.labels import MAX_LABELS
-from fhash_formats.transform.tile.decoding import decode_tile, transform_for
-from fhash_formats.transform.tile.encoding import (
+from fhash_formats.support.values import exact_number, integer_origin
+from fhash_formats.transform.coder import MAX_LABELS
+from fhash_formats.transform.decoding import decode_tile, transform_for
+from fhash_formats.transform.encoding import (
+    OFFSETS,
+    TRELLIS_WEIGHT,
+    WEIGHT,
     CodedTile,
     Coding,
     encode_tile,
     exact_tile,
     labelled_tile,
+    with_trellis,
 )
-from fhash_formats.transform.tile.integers import OFFSETS, TRELLIS_WEIGHT, WEIGHT, with_trellis
-from fhash_formats.transform.tile.labelled import FEW, has_regions
-from fhash_formats.transform.tile.sections import Shape
-from fhash_formats.transform.tile.settings import TileSettings
-from fhash_formats.transform.values.elementwise import within
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile_format import FEW, Shape, TileSettings, has_regions
+from fhash_formats.transform.values import within
 
-__all__ = [
-    "DEFAULT_EFFORT",
-    "Quality",
-    "check_effort",
-    "decode_chunk",
-    "encode_chunk",
-    "supported",
-    "tile_shape",
-]
+MAX_DEPTHS = (1, 1, 5, 5)
+"""Most levels of a 9/7 transform along (t, z, y, x)."""
+NO_TRANSFORM = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
+"""The shortest description of a transform."""
+
+
+def candidates(shape: Shape) -> tuple[TransformSpec, ...]:
+    """The transforms to try, each once.
+
+    9/7 along all axes; then Haar, and then no transform, along the first axis longer than 1, which
+    often is time; then Haar along all axes.
+    """
+    first = next((axis for axis, n in enumerate(shape) if n > 1), None)
+    if first is None:
+        return (NO_TRANSFORM,)
+    depths = [
+        0 if n < 2 else max(1, min(deepest, n.bit_length() - 3))
+        for n, deepest in zip(shape, MAX_DEPTHS, strict=True)
+    ]
+    if min(shape[2:]) >= 16:
+        depths[2:] = [min(depths[2:])] * 2
+    # Few chunks are long in time: there, two levels of Haar are worth it.
+    haar_depth = min(2, shape[first].bit_length() - 1) if first < 2 else depths[first]
+    specs = (
+        _spec("9/7", depths, first, "9/7", depths[first]),
+        _spec("9/7", depths, first, "haar", haar_depth),
+        _spec("9/7", depths, first, "none", 0),
+        _spec("haar", depths, first, "haar", haar_depth),
+    )
+    return tuple(dict.fromkeys(specs))
+
+
+def _spec(
+    kind: str, depths: list[int], first: int, first_kind: str, first_depth: int
+) -> TransformSpec:
+    """A wavelet of one kind along all axes with a depth, but another kind along the first axis."""
+    kinds = [(kind if depth else "none", depth) for depth in depths]
+    kinds[first] = (first_kind, first_depth)
+    t, z, y, x = (AxisTransform(kind=name, depth=depth) for name, depth in kinds)
+    return TransformSpec(axes=(t, z, y, x))
+
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]

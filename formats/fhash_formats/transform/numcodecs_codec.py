@@ -18,7 +18,6 @@ from numcodecs.abc import Codec
 from numcodecs.compat import ensure_bytes, ndarray_copy
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import (
     DEFAULT_EFFORT,
     Quality,
@@ -27,6 +26,7 @@ from fhash_formats.transform.chunk import (
     encode_chunk,
     supported,
 )
+from fhash_formats.transform.spec import TransformSpec
 
 __all__ = ["NumcodecsTransform"]
 

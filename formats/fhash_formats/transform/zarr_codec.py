@@ -27,8 +27,6 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.array_axes import KEY, ArrayAxes, take_axes
-from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import (
     DEFAULT_EFFORT,
     Quality,
@@ -38,10 +36,11 @@ from fhash_formats.transform.chunk import (
     supported,
     tile_shape,
 )
-from fhash_formats.transform.stream import settings_of
-from fhash_formats.transform.tile.decoding import decode_tile
-from fhash_formats.transform.tile.encoding import encode_tile
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.stream import KEY, ArrayAxes, settings_of, take_axes
+from fhash_formats.transform.tile_format import TileSettings
 
 if TYPE_CHECKING:
     from zarr.core.array_spec import ArraySpec

@@ -1,14 +1,4 @@
-"""Writer of .raw: the bare values, little-endian, x fastest, then y, z and t.
-
-A name `*_XxYxZxT_TYPE.raw`, such as `run_128x64x64x10_float32.raw`, says how to read the file (as
-`readers.raw` understands it, `_be` for big-endian included) and must be true.
-
-Any other name gets a detached NRRD header beside it, `NAME.nhdr`: text that ParaView, 3D Slicer and
-pynrrd open. It holds the grid in space where it is even, and every coordinate exactly as
-`coordinates_AXIS:=...`. NRRD has no float16; it is stored as float32, exactly. Limits of ParaView's
-NRRD reader (VTK 9.7): it takes the x of several steps, or an x of at most 9 vertices, for the
-components of a vector; write .vti or .vtr for it then.
-"""
+"""Writers of plain values: raw files with an NRRD header, and NPY."""
 
 from __future__ import annotations
 
@@ -18,22 +8,47 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy_format
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.request import ENDIANS, parse_dtype
+from fhash_formats.readers.common.file_series import ENDIANS, parse_dtype
 from fhash_formats.readers.raw import layout_of_name
 from fhash_formats.series import AXES
-from fhash_formats.writers.common.labels import printable
-from fhash_formats.writers.common.region import Region
-from fhash_formats.writers.common.spacing import even_spacing
-from fhash_formats.writers.common.writer import (
+from fhash_formats.writers.common import (
     Frame,
     Put,
+    Region,
     Writer,
+    even_spacing,
     little_endian,
     of_one,
+    one_output,
+    printable,
     write_frame,
 )
+
+
+@contextmanager
+def _open_npy(
+    region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
+) -> Iterator[Put]:
+    dtype = little_endian(region.dtype, half=True)
+    header = {
+        "descr": npy_format.dtype_to_descr(dtype),
+        "fortran_order": False,
+        "shape": region.shape,
+    }
+    with temporaries[0].open("xb") as handle:
+        npy_format.write_array_header_1_0(handle, header)
+
+        def put(step: int, frame: Frame) -> None:
+            write_frame(handle, frame, dtype)
+
+        yield put
+
+
+NPY = Writer(name="NumPy", suffixes=(".npy",), outputs=one_output, open=of_one(_open_npy))
+
 
 NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are called as in numpy
 
@@ -61,7 +76,9 @@ def _outputs(path: Path, region: Region) -> list[Path]:
 
 
 @contextmanager
-def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+def _open_raw(
+    region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
+) -> Iterator[Put]:
     _, layout = layout_of_name(outputs[0].stem)
     dtype = (
         little_endian(region.dtype)
@@ -126,4 +143,4 @@ def _space(region: Region, axes: str) -> list[str]:
     ]
 
 
-RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=of_one(_open))
+RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=of_one(_open_raw))

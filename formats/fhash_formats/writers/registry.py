@@ -12,17 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, InputError
-from fhash_formats.support.atomic import check_output, replacing_all
-from fhash_formats.writers.common.labels import safe_name
-from fhash_formats.writers.common.region import Region
-from fhash_formats.writers.common.writer import Frame, Put, Writer
-from fhash_formats.writers.hdf5 import HDF5
-from fhash_formats.writers.netcdf import NETCDF
-from fhash_formats.writers.npy import NPY
-from fhash_formats.writers.raw import RAW
-from fhash_formats.writers.vti import VTK
-from fhash_formats.writers.vtkhdf import VTKHDF
-from fhash_formats.writers.zarr_store import ZARR
+from fhash_formats.support.files import check_output, replacing_all
+from fhash_formats.writers.common import Frame, Put, Region, Writer, safe_name
+from fhash_formats.writers.labelled import HDF5, NETCDF, ZARR
+from fhash_formats.writers.raw import NPY, RAW
+from fhash_formats.writers.vtk import VTK, VTKHDF
 
 WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK, VTKHDF)
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 from click.testing import Result
 
-from fhash_cli.durations import DurationType
+from fhash_cli.options import DurationType
 from fhash_codec.cost import cost, files, pictures
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction

@@ -1,4 +1,4 @@
-"""`fhash info`: the description of a sound file; every command refuses a damaged one."""
+"""`fhash info`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,115 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.info import tiling_text
+from fhash_cli.commands.info import MAX_TEXT, details, details_rows, listing, positions, tiling_text
+from fhash_formats.series import ArraySeries, Coordinate
+
+GOLDEN = Path(__file__).resolve().parents[2] / "golden"
+
+
+def added(line: str) -> bool:
+    """Whether a line is one that only -v prints: a setting, a level or a layer."""
+    return line.startswith("  ") and line.split()[0] not in "tzyx"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (
+            "paper-feature",
+            ["parts/0.tables.level_1 to parts/0.tables.level_", "bytes,",
+             "parts/0.mlp.weight_1 to parts/0.mlp.weight_2",
+             "relu", "parts/0.occupancy.bits, bytes,"],
+        ),
+        ("paper-transform", ["fhash.transform", "parts/0.occupancy.mask, fhash.transform,"]),
+        ("paper-sparse", ["; 2 at each needed vertex, float16; parts/0.tables.level_1 to parts/"]),
+        ("compact-psnr", ["density, fhash.transform,", "none: the values"]),
+        ("compact-mask", ["in the tiles of density"]),
+        (
+            "compact-cross",
+            ["; packed in the codec of density", "in the tiles of density"],
+        ),
+    ],
+)  # fmt: skip
+def test_the_card_names_every_part_with_its_place(
+    fhash: Callable[..., Result], name: str, said: list[str]
+) -> None:
+    path = GOLDEN / f"{name}.fhz"
+    short = fhash("info", path).stdout
+    for row in ("config ", "tables ", "MLP ", "occupancy "):
+        assert f"\n{row}" in short
+    for text in said:
+        assert text in short
+    card = json.loads(fhash("info", path, "--json").stdout)["card"]
+    full = fhash("info", path, "-v").stdout
+    assert [line.split() for line in short.splitlines() if not added(line)] == [
+        line.split() for line in full.splitlines() if not added(line)
+    ]
+    assert full.count("\n  level ") == len(card["tables"])
+    assert full.count("\n  layer ") == len(card["mlp"])
+    assert "\n  learning_rate  " in full
+    assert "\n  level " not in short
+
+
+def test_bytes_of_the_parts_are_those_of_the_arrays(fhash: Callable[..., Result]) -> None:
+    info = json.loads(fhash("info", GOLDEN / "paper-transform.fhz", "--json").stdout)
+    card, arrays = info["card"], info["arrays"]
+    parts = [*card["tables"], *card["mlp"], card["occupancy"]]
+    stored = sum(
+        array["bytes"]
+        for name, array in arrays.items()
+        if name.startswith(("parts/0.tables.", "parts/0.mlp.", "parts/0.occupancy."))
+    )
+    assert sum(part["bytes"] for part in parts) == stored
+    assert 0 < card["config"]["bytes"] < info["bytes"]
+
+
+def test_details_hold_what_json_can() -> None:
+    times = Coordinate(
+        name="time", values=np.array([0.0, 1.0]), attributes={"units": "days since 2001-01-01"}
+    )
+    series = ArraySeries(np.zeros((2, 3, 4, 5), "i2"), name="u", coords={"t": times}, missing=[-9])
+    series.attributes = {"note": "word " * 100, "valid": np.array([1, 2]), "odd": object()}
+    found = details(series)
+    assert (found["shape"], found["dtype"], found["fill"]) == ([2, 3, 4, 5], "int16", -9)
+    assert found["coordinates"][0]["dates"] == ["2001-01-01", "2001-01-02"]
+    assert found["coordinates"][1]["dates"] == []
+    assert found["attributes"]["valid"] == [1, 2]
+    rows = dict(details_rows(series))
+    assert rows["t, z, y, x"] == "2 x 3 x 4 x 5"
+    assert rows["note"].endswith("...")
+    assert len(rows["note"]) == MAX_TEXT + 3
+    assert "odd" not in rows
+
+
+def test_positions_of_times_are_dates_where_they_are() -> None:
+    time = Coordinate(name="t", values=np.array([0.5, 2.0]), attributes={"units": "s"})
+    assert positions(time, "t") == "t 0.5 to 2 s"
+    assert positions(time, "x") == "t 0.5 to 2 s"
+
+
+def test_several_variables_go_into_one_file_unless_one_can_be_read_in_two_ways() -> None:
+    dimensions = [{"name": name, "length": 2, "axis": name} for name in "tzyx"]
+    variables = [
+        {
+            "name": name,
+            "dtype": "float32",
+            "stored": "",
+            "units": "",
+            "shape": [2, 2, 2, 2],
+            "missing": [],
+            "problem": "",
+            "dimensions": dimensions,
+            "commands": [f"fhash encode 'a b.nc' --var {name}"],
+        }
+        for name in "uv"
+    ]
+    line = "\nall in one file:\n  fhash encode 'a b.nc' -o 'a b.fhz' --var all"
+    assert listing("a b.nc", 1, variables).endswith(line)
+    assert "all in one file" not in listing("a b.nc", 1, variables[:1])
+    variables[0]["commands"] *= 2
+    assert "all in one file" not in listing("a b.nc", 1, variables)
+
 
 PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
 Fhash = Callable[..., Result]

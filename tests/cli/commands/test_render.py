@@ -1,19 +1,338 @@
-"""`fhash render`: pictures from the command line, their reports, and refusals."""
+"""`fhash render`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import click
 import numpy as np
 import pytest
-from click.testing import Result
+from click.testing import CliRunner, Result
 from PIL import Image as Pictures
 
 import fhash_codec
-from fhash_codec.rendering.scene.scene import scene_in_png
-from fhash_codec.rendering.task.task import COUNTERS
+from fhash_cli.commands.render import (
+    AnimationOptions,
+    add_animation_options,
+    run_animation,
+    tracking,
+)
+from fhash_cli.main import Program
+from fhash_cli.options import run_argument
+from fhash_cli.output import Progress
+from fhash_cli.scene_options import (
+    PLACES,
+    NumbersType,
+    OpacityType,
+    PlaneType,
+    SceneOptions,
+    SizeType,
+    scene_options,
+)
+from fhash_codec.rendering.march_task import COUNTERS
+from fhash_codec.rendering.scenes import Scene, scene_in_png
+from fhash_formats.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [
+        (NumbersType(2), "1,2.5", (1.0, 2.5)),
+        (SizeType(), "800x600", (800, 600)),
+        (SizeType(), "64", (64, 64)),
+        (OpacityType(), "linear", "linear"),
+        (OpacityType(), "0:0,2:1", [[0.0, 0.0], [2.0, 1.0]]),
+        (OpacityType(named=False), "0.1:1", [[0.1, 1.0]]),
+        (PlaneType(), "0,0,1,0.5", {"normal": [0.0, 0.0, 1.0], "offset": 0.5}),
+        (PlaneType(), "1,2,3,0,0,-1", {"point": [1.0, 2.0, 3.0], "normal": [0.0, 0.0, -1.0]}),
+    ],
+)
+def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> None:
+    assert kind.convert(text, None, None) == value
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "part"),
+    [
+        (NumbersType(3), "1,2", "not 3 numbers"),
+        (SizeType(), "wide", "not a size"),
+        (OpacityType(), "0:a", "neither the name of an opacity nor points"),
+        (OpacityType(named=False), "linear", "not points"),
+        (PlaneType(), "0,0,1", "neither a normal and an offset"),
+        (PlaneType(), "a,b,c,d", "neither a normal and an offset"),
+    ],
+)
+def test_other_texts_are_refused(kind: click.ParamType[Any], text: str, part: str) -> None:
+    with pytest.raises(click.BadParameter, match=part):
+        kind.convert(text, None, None)
+
+
+VOLUME = cast(fhash_codec.Volume, SimpleNamespace(shape=(5, 2, 3, 4)))
+
+
+def scene(
+    file: str | None = None,
+    places: dict[str, object] | None = None,
+    effects: tuple[str, ...] = (),
+    isosurfaces: tuple[str, ...] = (),
+    settings: tuple[str, ...] = (),
+) -> Scene:
+    options = SceneOptions(
+        file=file,
+        places=places or {},
+        effects=effects,
+        isosurfaces=isosurfaces,
+        settings=settings,
+    )
+    return options.scene(VOLUME)
+
+
+def test_without_options_it_is_the_default_scene() -> None:
+    assert scene() == Scene()
+
+
+@pytest.mark.parametrize("place", sorted(set(PLACES.values()) - {"step"}))
+def test_every_option_sets_a_place_that_a_scene_has(place: str) -> None:
+    with pytest.raises(InputError) as refused:
+        scene(places={place: object()})
+    assert place.split(".")[-1] in str(refused.value)
+    assert "did you mean" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("camera.azimuth=x", r"^camera\.azimuth is 'x'; a number from .* is needed: .*degrees"),
+        ("camera.zoom=-1", r"^camera\.zoom is -1; allowed: "),
+        ("effects.shading.gradient=cel", r"^effects\.shading\.gradient is 'cel'; .*'cell'\?$"),
+        ("camera.position=[1,2]", r"^camera\.position is \[1, 2\]; a list of 3, each a number,"),
+    ],
+)
+def test_a_setting_that_is_refused_is_named_with_what_it_takes(setting: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scene(settings=(setting,))
+
+
+def test_a_negative_step_counts_from_the_end() -> None:
+    assert scene(places={"step": -1.0}).step == 4
+
+
+def test_options_replace_parts_of_the_scene_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "scene.json"
+    file.write_text(json.dumps({"time": 2.0, "camera": {"view": "xy", "zoom": 3.0}}))
+    changed = scene(file=str(file), places={"step": 1.0, "camera.zoom": 2.0})
+    assert (changed.step, changed.time) == (1.0, None)
+    assert (changed.camera.view, changed.camera.zoom) == ("xy", 2.0)
+
+
+def test_effects_surfaces_and_settings_add_up() -> None:
+    shown = scene(
+        effects=("ambient-occlusion", "shading"),
+        isosurfaces=("1.5,orange,0.5", "2"),
+        settings=("effects.shading.ambient=0.3",),
+    )
+    assert shown.effects.ambient_occlusion is not None
+    assert shown.effects.shading is not None
+    assert shown.effects.shading.ambient == 0.3
+    surfaces = shown.effects.isosurfaces
+    assert [(surface.value, surface.opacity) for surface in surfaces] == [(1.5, 0.5), (2.0, 1.0)]
+
+
+def test_an_unknown_effect_names_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean 'shadows'"):
+        scene(effects=("shadow",))
+
+
+def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
+    found: list[Scene] = []
+
+    @click.command()
+    @scene_options
+    def command(options: SceneOptions) -> None:
+        found.append(options.scene(VOLUME))
+
+    def parsed(*words: str) -> dict[str, object]:
+        done = CliRunner().invoke(command, words, standalone_mode=False, catch_exceptions=False)
+        assert done.exit_code == 0
+        return found[-1].to_dict()
+
+    planes = [
+        {"normal": [-1.0, 0.0, 0.0], "offset": -12.0},
+        {"normal": [0.0, 1.0, 1.0], "point": [1.0, 2.0, 3.0]},
+    ]
+    words = ("--clip-plane", "-1,0,0,-12", "--clip-plane", "1,2,3,0,1,1")
+    assert parsed(*words) == {"effects": {"clip": {"planes": planes}}}
+    assert parsed(*words, "--clip-box", ":,-2:0,:5") == {
+        "effects": {"clip": {"y": [-2.0, 0.0], "x": [None, 5.0], "planes": planes}}
+    }
+    assert parsed("--gradient-opacity", "0:0,0.1:1", "--attenuation", "0.2") == {
+        "transfer_function": {"gradient_opacity": [[0.0, 0.0], [0.1, 1.0]]},
+        "effects": {"attenuated_maximum_intensity": {"attenuation": 0.2}},
+    }
+    assert parsed("--effect", "average-intensity") == {"effects": {"average_intensity": True}}
+    with pytest.raises(InputError, match="effect 'clip' is not known"):
+        parsed("--effect", "clip")
+
+
+SMALL = Scene(size=(24, 18))
+
+
+@click.group(cls=Program)
+def program() -> None:
+    """A stand-in for fhash."""
+
+
+@click.command("render")
+@run_argument
+@click.option("-o", "output", required=True)
+@click.option("--force", is_flag=True)
+@add_animation_options
+def render(run: str, output: str, force: bool, several: AnimationOptions) -> None:
+    """A stand-in for `fhash render`."""
+    with fhash_codec.open(run) as volume, Progress(quiet=True) as progress:
+        scene = several.over(SMALL, volume)
+        if several.several(scene):
+            result, text = run_animation(
+                volume, scene, several, output, force=force, progress=progress
+            )
+        else:
+            result, text = tracking(volume, SMALL, several, progress).to_dict(), ""
+    click.echo(json.dumps({"result": result, "text": text}))
+
+
+class OneCommand(Program):
+    """Program with the command above."""
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        return render if name == "render" else None
+
+
+def invoke(*words: object) -> Result:
+    group = OneCommand("fhash")
+    return CliRunner().invoke(group, ["render", *map(str, words)], prog_name="fhash")
+
+
+def done(*words: object) -> dict[str, Any]:
+    result = invoke(*words)
+    assert result.exit_code == 0, result.stderr
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_numbered_pictures_go_on(run: Path, tmp_path: Path) -> None:
+    words = (run, "-o", tmp_path / "a.png", "--animate", "steps,orbit=90", "--frames", "4")
+    first = done(*words)
+    assert [Path(path).name for path in first["result"]["paths"]] == [
+        f"a.000{number}.png" for number in range(4)
+    ]
+    assert (first["result"]["rendered"], first["result"]["kept"]) == (4, 0)
+    assert first["result"]["counters"]["rays"] > 0
+    (tmp_path / "a.0002.png").unlink()
+    again = done(*words)
+    assert (again["result"]["rendered"], again["result"]["kept"]) == (1, 3)
+    assert "1 rendered, 3 kept" in again["text"]
+    scenes = [scene_in_png(path) for path in sorted(tmp_path.glob("*.png"))]
+    assert [scene.camera.azimuth for scene in scenes] == [0, 30, 60, 90]
+    assert [scene.step for scene in scenes] == pytest.approx([0, 2 / 3, 4 / 3, 2])
+
+
+def test_a_film_and_its_pictures(run: Path, tmp_path: Path) -> None:
+    done(
+        run,
+        "-o",
+        tmp_path / "a.gif",
+        "--animate",
+        "orbit",
+        "--frames",
+        "3",
+        "--fps",
+        "5",
+        "--pictures",
+        tmp_path / "p.png",
+    )
+    with Pictures.open(tmp_path / "a.gif") as picture:
+        assert picture.info["duration"] == 200
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.gif",
+        "p.0000.png",
+        "p.0001.png",
+        "p.0002.png",
+    ]
+
+
+def test_an_evolution_with_features(run: Path, tmp_path: Path) -> None:
+    found = done(
+        run,
+        "-o",
+        tmp_path / "a.png",
+        "--evolution",
+        "::2",
+        "--columns",
+        "2",
+        "--track",
+        "interval:6:8=#ff0000",
+        "--track",
+        "isosurface:9",
+    )
+    assert found["result"]["steps"] == [0, 2]
+    with Pictures.open(tmp_path / "a.png") as picture:
+        assert picture.size == (24 * 2 + 1, 18)
+    tracked = found["result"]["tracked"]
+    assert [entry["feature"] for entry in tracked] == ["interval:6:8", "isosurface:9"]
+    assert all(place["vertices"] > 0 for entry in tracked for place in entry["steps"])
+    assert "interval:6:8" in found["text"]
+
+
+def test_a_single_picture_of_the_features_of_the_file(run: Path, tmp_path: Path) -> None:
+    scene = Scene.from_dict(done(run, "-o", tmp_path / "a.png", "--track", "own")["result"])
+    assert {colour for _, colour in scene.transfer_function.colours} == {"#d55e00"}  # type: ignore[misc, str-unpack]
+    assert Scene.from_dict(done(run, "-o", tmp_path / "a.png")["result"]) == SMALL
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (["-o", "{}/a.png", "--animate", "steps", "--evolution", ":"], "exclude"),
+        (["-o", "{}/a.png", "--frames", "3"], "--animate"),
+        (["-o", "{}/a.png", "--columns", "3"], "--evolution"),
+        (["-o", "{}/a.mpg", "--animate", "orbit"], ".mp4"),
+        (["-o", "{}/a.gif", "--evolution", ":"], ".png"),
+        (["-o", "{}/a.png", "--animate", "steps=0:9"], "outside"),
+        (["-o", "{}/a.png", "--animate", "{}/none.toml"], "no such animation"),
+        (["-o", "{}/a.png", "--evolution", "7:9"], "steps 0 to 2"),
+        (["-o", "{}/a.png", "--animate", "orbit", "--track", "blob:3"], "not known"),
+        (
+            ["-o", "{}/a.png", "--animate", "orbit", "--track", "own", "--track", "isosurface:8"],
+            "own",
+        ),
+        (["-o", "{}/no/a.png", "--animate", "orbit"], "does not exist"),
+        (["-o", "{}/a.gif", "--animate", "orbit", "--pictures", "{}/no/a.png"], "does not exist"),
+    ],
+)
+def test_one_line_and_nothing_written(
+    words: list[str], part: str, run: Path, tmp_path: Path
+) -> None:
+    result = invoke(run, *(word.format(tmp_path) for word in words))
+    assert result.exit_code == 2
+    assert part in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_that_is_there_is_refused(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.gif").write_bytes(b"mine")
+    words = (run, "-o", tmp_path / "a.gif", "--animate", "orbit", "--frames", "2")
+    refused = invoke(*words)
+    assert refused.exit_code == 2
+    assert "--force" in refused.stderr
+    assert (tmp_path / "a.gif").read_bytes() == b"mine"
+    done(*words, "--force")
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF")
+
 
 Fhash = Callable[..., Result]
 

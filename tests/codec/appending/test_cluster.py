@@ -17,7 +17,7 @@ from fhash_codec.appending import cluster as rooms
 from fhash_codec.appending import series_plan
 from fhash_codec.appending.cluster import HeldSteps
 from fhash_codec.compact import encode
-from fhash_codec.compact.tiles import blocks
+from fhash_codec.compact import tiles as blocks
 from fhash_formats.errors import OutputExistsError
 from fhash_formats.series import ArraySeries
 

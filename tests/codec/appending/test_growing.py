@@ -1,20 +1,85 @@
-"""`GrowingFile`: what the header of a file says while it grows."""
+"""Figures of a growing file: those of a comparison, before and after they were in a header."""
 
 from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError
+from fhash_codec import (
+    DamagedFileError,
+    EncodeConfig,
+    MissingInputError,
+)
+from fhash_codec import (
+    InputError as InputError_growing,
+)
+from fhash_codec import (
+    InputError as InputError_resuming,
+)
 from fhash_codec.appending import growing
-from fhash_codec.appending.figures import Figures
-from fhash_codec.appending.growing import GrowingFile
-from fhash_codec.appending.planning import plan_layers
+from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, bound_of_file, continued
+from fhash_codec.appending.writer import plan_layers
+from fhash_codec.header import full_header
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.array import transform_codecs
+from fhash_formats.errors import InputError
 from fhash_formats.series import index_coordinate
+from fhash_formats.transform.decoding import decode_tile
+
+WRITER = ContainerWriter("unused.fhz")
+"""A writer that gets nothing: few steps have their figures in the header."""
+
+
+def measured(count: int = 3) -> tuple[Figures, np.ndarray]:
+    errors = np.random.default_rng(0).normal(0, 0.01, (count, 2, 3, 4))
+    figures = Figures(Figures.scale_of(ValueRange(0.0, 5.0)))
+    for error in errors:
+        figures.steps.append(figures.measure(np.zeros(error.shape), error))
+    return figures, errors
+
+
+def test_figures_are_those_of_the_errors_rounded_to_the_worse_side() -> None:
+    figures, errors = measured()
+    quality = figures.header(WRITER, 5.0)
+    rmse = np.sqrt(np.mean(errors**2))
+    assert rmse <= quality["rmse"] <= rmse * (1 + 1e-5)
+    assert np.abs(errors).max() <= quality["max_abs_error"] <= np.abs(errors).max() * (1 + 1e-5)
+    assert quality["psnr"] == pytest.approx(20 * np.log10(5.0 / rmse), abs=1e-3)
+    assert len(quality["steps"]["rmse"]) == 4
+
+
+def test_what_a_header_tells_is_taken_up_again() -> None:
+    figures, _ = measured()
+    told = figures.header(WRITER, 5.0)
+    header = {
+        "domain": {"shape": [3, 2, 3, 4]},
+        "value_range": [0.0, 5.0],
+        "model": {},
+        "history": {},
+        "quality": told,
+    }
+    full = full_header(header, {})
+    again = Figures.of_header(full, figures.scale).header(WRITER, 5.0)
+    # Figures of steps are rounded to hundredths of a dB.
+    assert again["rmse"] == pytest.approx(told["rmse"], rel=2e-3)
+    assert again["rmse"] >= told["rmse"]
+    assert again["max_abs_error"] == told["max_abs_error"]
+    steps = full["quality"]["per_step"]
+    for wrong in (steps[:2], [*steps[:2], {"rmse": None, "max_abs_error": 1.0}]):
+        with pytest.raises(InputError, match="does not tell the errors of step 2"):
+            Figures.of_header({**header, "quality": {"per_step": wrong}}, 1.0)
+
+
+def test_a_range_of_one_value_has_a_scale() -> None:
+    for value in (0.0, 3.0, -1e-300):
+        assert Figures.scale_of(ValueRange(value, value)) > 0
+
 
 SHAPE = (3, 4, 5)
 
@@ -71,7 +136,173 @@ def test_there_is_a_limit_of_steps(begun, monkeypatch) -> None:
     monkeypatch.setattr(growing, "MAX_STEPS", 3)
     with file:
         add(file, frames, 0)
-        with pytest.raises(InputError, match="at most 3: begin another"):
+        with pytest.raises(InputError_growing, match="at most 3: begin another"):
             add(file, frames, 2)
     with fhash_codec.open(file.path) as volume:
         assert volume.shape[0] == 2
+
+
+BOUND = 0.01
+
+
+@pytest.fixture(scope="module")
+def frames_layers() -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 9, 12)), indexing="ij")
+    return (np.sin(5 * x + t) * np.cos(4 * y) + z).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def coder(frames_layers) -> LayerCoder:
+    config = EncodeConfig(max_error=BOUND, effort=1, tile="4x5x6x6")
+    return plan_layers(list(frames_layers), config, BOUND, None).coder
+
+
+def coded(coder: LayerCoder, frames_layers: np.ndarray):
+    figures = Figures(1.0)
+    with ThreadPoolExecutor(2) as workers:
+        return coder.code(list(frames_layers), figures, workers)
+
+
+def decoded(coder: LayerCoder, streams: list[bytes], shape: tuple[int, ...]) -> np.ndarray:
+    t, z, y, x = coder.tile
+    result = np.empty((t, z, 2 * y, 2 * x), np.float32)
+    for number, stream in enumerate(streams):
+        j, i = divmod(number, 2)
+        part = decode_tile(stream, coder.tile, np.float32, coder.settings)
+        result[:, :, j * y : (j + 1) * y, i * x : (i + 1) * x] = part
+    return result[tuple(slice(0, n) for n in shape)]
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_the_streams_decode_within_the_bound_that_is_told(frames_layers, coder, steps) -> None:
+    layer = coded(coder, frames_layers[:steps])
+    errors = np.abs(
+        decoded(coder, layer.streams, (steps, *frames_layers.shape[1:])) - frames_layers[:steps]
+    )
+    assert errors.max() <= BOUND
+    assert len(layer.errors) == steps
+    for error, told in zip(errors.astype(float), layer.errors, strict=True):
+        assert told.largest == pytest.approx(error.max(), rel=1e-4)
+        assert told.squares == pytest.approx((error**2).sum(), rel=1e-3)
+    assert (layer.value_range.low, layer.value_range.high) == (
+        frames_layers[:steps].min(),
+        frames_layers[:steps].max(),
+    )
+
+
+def test_values_beyond_the_range_take_settings_of_their_own_where_that_is_smaller(
+    frames_layers, coder
+) -> None:
+    far = 3 * frames_layers + 10
+    layer = coded(coder, far)
+    assert np.abs(decoded(coder, layer.streams, far.shape) - far).max() <= BOUND
+    shared = coded(replace(coder, settings=replace(coder.settings, low=-50.0, high=50.0)), far)
+    assert sum(map(len, layer.streams)) < 2 * sum(map(len, shared.streams))
+
+
+def test_a_tile_that_decodes_otherwise_is_told(frames_layers, coder, monkeypatch) -> None:
+    monkeypatch.setattr("fhash_codec.appending.growing.decode_tile", lambda *_: frames_layers[0])
+    with pytest.raises(RuntimeError, match="decodes to other values"):
+        coded(coder, frames_layers)
+
+
+BOUND_RESUMING = 0.02
+CONFIG = EncodeConfig(max_error=BOUND_RESUMING, effort=1, tile="2x4x6x4")
+
+
+@pytest.fixture
+def run(tmp_path, field):
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(field((4, 4, 6, 8)), path, CONFIG)
+    return path
+
+
+def with_array(run, path, name, values, dimension_names):
+    """A copy of a file with another array."""
+    with Container.open(run) as container, ContainerWriter(path) as writer:
+        table = container.arrays["tables/level_1"]
+        writer.add_sharded(
+            "tables/level_1",
+            shape=table.shape,
+            dtype=table.dtype,
+            chunk_shape=table.chunk_shape,
+            shard_shape=table.shard_shape,
+            chunks=(bytes(table.coded(index)) for index in np.ndindex(*table.grid)),
+            dimension_names=table.dimension_names,
+            codecs=transform_codecs(table.settings),
+        )
+        writer.add_whole(name, values, dimension_names=dimension_names, attributes={"a": 1})
+        header = dict(container.header)
+        writer.commit({**header, "more": {"key": 1}})
+    return path
+
+
+def test_the_state_is_that_of_the_file(run) -> None:
+    with continued(run) as growing:
+        assert (growing.steps, growing.shape) == (4, (4, 6, 8))
+        assert growing.coder.tile == (2, 4, 6, 4)
+        assert growing.coder.coding.error == BOUND_RESUMING
+        assert len(growing.figures.steps) == 4
+    with continued(run, 2) as growing:
+        assert growing.steps == len(growing.figures.steps) == 2
+
+
+def test_arrays_and_keys_that_do_not_depend_on_time_are_carried(run, tmp_path) -> None:
+    path = with_array(run, tmp_path / "a.fhz", "auxiliary/area", np.arange(6.0), ["y"])
+    with continued(path) as growing:
+        growing.publish()
+    with Container.open(path) as container:
+        area = container.arrays["auxiliary/area"]
+        np.testing.assert_array_equal(area.read(), np.arange(6.0))
+        assert (area.attributes, area.dimension_names) == ({"a": 1}, ("y",))
+        assert container.header["more"] == {"key": 1}
+    for names in (["time"], None):
+        other = tmp_path / f"{names}.fhz"
+        path = with_array(run, other, "auxiliary/pressure", np.arange(4.0), names)
+        with pytest.raises(InputError_resuming, match="has a value for each step"), continued(path):
+            pass
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3, 5])
+def test_only_whole_layers_are_kept(run, steps) -> None:
+    with (
+        pytest.raises(InputError_resuming, match=r"within a layer|are to be kept"),
+        continued(run, steps),
+    ):
+        pass
+
+
+def test_files_that_cannot_grow(tmp_path, field) -> None:
+    values = field((4, 4, 6, 8))
+    gaps = values.copy()
+    gaps[1, 2, 3, 4] = np.nan
+    cases = {
+        "does not promise a bound": (values, {"psnr": 40.0}),
+        "keeps features or has missing values": (gaps, {"max_error": BOUND_RESUMING}),
+    }
+    for number, (message, (source, promise)) in enumerate(cases.items()):
+        path = tmp_path / f"{number}.fhz"
+        fhash_codec.encode(source, path, EncodeConfig(effort=1, tile="2x4x6x4", **promise))
+        with pytest.raises(InputError_resuming, match=message), continued(path):
+            pass
+    with pytest.raises(MissingInputError), continued(tmp_path / "none.fhz"):
+        pass
+    (tmp_path / "bad.fhz").write_bytes(b"no container")
+    with pytest.raises(DamagedFileError), continued(tmp_path / "bad.fhz"):
+        pass
+
+
+def test_a_damaged_tile_is_found_before_anything_is_written(run) -> None:
+    data = bytearray(run.read_bytes())
+    data[data.index(b"/c/0/0/0/0") + 40] ^= 1
+    run.write_bytes(data)
+    with pytest.raises(DamagedFileError, match=r"run\.fhz"), continued(run):
+        pass
+    assert run.read_bytes() == data
+
+
+def test_the_bound_of_a_file() -> None:
+    header = {"value_range": [1.0, 3.0]}
+    assert bound_of_file({**header, "config": {"max_error": 2}}) == 2
+    assert bound_of_file({**header, "config": {"max_error_rel": 0.1}}) == pytest.approx(0.2)
+    assert bound_of_file({**header, "config": {"psnr": 40, "max_error": None}}) is None

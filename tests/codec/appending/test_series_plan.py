@@ -12,7 +12,7 @@ import pytest
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, UnsupportedFileError
 from fhash_codec.appending import series_plan
 from fhash_codec.appending.series_plan import SeriesPlan, bounded, plan_parts
-from fhash_formats.container import strict_json
+from fhash_formats.container import record as strict_json
 from fhash_formats.errors import FhashError, MissingInputError, OutputExistsError
 from fhash_formats.series import ArraySeries, Coordinate
 

@@ -1,4 +1,4 @@
-"""`Writer`: frames in, a file that is complete after every layer and keeps its bound."""
+"""`append`: the steps of a series behind those of a file, all of them or none."""
 
 from __future__ import annotations
 
@@ -13,35 +13,174 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kill_writer import BOUND, SHAPE, TILE, frame
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, Writer
 from fhash_codec.appending.growing import GrowingFile
+from fhash_codec.appending.writer import append, bound_of, plan_layers
+from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import OutputError, OutputExistsError
-from fhash_formats.series import Coordinate
+from fhash_formats.series import ArraySeries, Coordinate
 
-sys.path.insert(0, str(Path(__file__).parent))
+CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, timings=False)
 
-from kill_writer import BOUND, SHAPE, TILE, frame
 
-CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile=TILE)
+def frames(first: int, end: int) -> np.ndarray:
+    return np.stack([frame(step) for step in range(first, end)])
+
+
+def series(first: int, end: int, times: list[float] | None = None, **options) -> ArraySeries:
+    coords = {}
+    if times is not None:
+        coords["t"] = Coordinate(name="time", values=np.array(times, dtype=float))
+    return ArraySeries(frames(first, end), coords=coords, **options)
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(series(0, 6), path, CONFIG)
+    return path
+
+
+def test_steps_follow_and_the_older_ones_keep_every_bit(run) -> None:
+    with fhash_codec.open(run) as volume:
+        before = volume[:]
+    report = append(series(6, 13), run)
+    assert (report["steps"], report["kept"], report["appended"]) == (13, 6, 7)
+    assert report["bytes"] == run.stat().st_size
+    assert report["max_abs_error"] <= BOUND
+    with fhash_codec.open(run) as volume:
+        assert volume.verify()
+        after = volume[:]
+        np.testing.assert_array_equal(after[:6], before)
+        assert np.abs(after - frames(0, 13)).max() <= BOUND
+        np.testing.assert_array_equal(volume.coords["t"].values, np.arange(13))
+    assert os.listdir(run.parent) == ["run.fhz"]
+    found = fhash_codec.diff(frames(0, 13), run)
+    assert report["psnr"] == pytest.approx(found["psnr"], abs=0.02)
+    assert report["psnr"] <= found["psnr"]
+    assert report["rmse"] >= found["rmse"]
+
+
+def test_steps_that_are_not_kept_are_replaced(run) -> None:
+    assert append(series(3, 9), run, keep=3)["steps"] == 9
+    with fhash_codec.open(run) as volume:
+        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND
+
+
+def test_times_follow_those_of_the_file(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(series(0, 3, [1.0, 2.0, 4.5]), path, CONFIG)
+    with pytest.raises(InputError, match=r"begins at time 4.5, and the file ends at 4.5"):
+        append(series(3, 6, [4.5, 5.0, 6.0]), path)
+    with pytest.raises(InputError, match="must be finite and ascend"):
+        append(series(3, 6, [5.0, 7.0, 6.0]), path)
+    append(series(3, 6, [5.0, 6.0, 7.0]), path)
+    with fhash_codec.open(path) as volume:
+        np.testing.assert_array_equal(volume.coords["t"].values, [1, 2, 4.5, 5, 6, 7])
+
+
+def with_gap(values: np.ndarray) -> np.ndarray:
+    values = values.copy()
+    values[4, 0, 0, 0] = np.nan
+    return values
+
+
+def test_what_does_not_fit_changes_nothing(run) -> None:
+    before = run.read_bytes()
+    metres = ArraySeries(frames(0, 3), units="m")
+    place = {"x": Coordinate(name="x", values=np.arange(12) + 1.0)}
+    hours = {"t": Coordinate(name="t", values=np.arange(3) + 9.0, attributes={"units": "h"})}
+    for source, message in (
+        (frames(6, 9)[:, :, :9], r"has shape \(z, y, x\)"),
+        (frames(6, 9).astype("f8"), "has number type float64"),
+        (with_gap(frames(6, 12)), "step 4 has values that are missing"),
+        (ArraySeries(frames(6, 9), coords=place), "has positions 1 to 12 along x"),
+        (run, "is encoded already"),
+    ):
+        with pytest.raises(InputError, match=message):
+            append(source, run)
+        assert run.read_bytes() == before
+        assert os.listdir(run.parent) == ["run.fhz"]
+    # Units that only one of the two has are no contradiction.
+    append(metres, run, keep=3)
+    append(ArraySeries(frames(6, 9), coords=hours), run)
+
+
+def test_a_failure_while_steps_are_coded_changes_nothing(run) -> None:
+    before = run.read_bytes()
+
+    class Broken(ArraySeries):
+        def read(self, step: int) -> np.ndarray:
+            if step == 5:
+                raise InputError("the disk is gone")
+            return super().read(step)
+
+    with pytest.raises(InputError, match="the disk is gone"):
+        append(Broken(frames(6, 12)), run)
+    assert run.read_bytes() == before
+    assert os.listdir(run.parent) == ["run.fhz"]
+
+
+def test_a_file_with_a_single_tile(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(frames(0, 4), path, EncodeConfig(max_error=BOUND, effort=1, tile="whole"))
+    append(frames(4, 9), path)
+    with fhash_codec.open(path) as volume:
+        assert volume.chunks[0] == 4
+        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND
+
+
+RANGE = ValueRange(-1.0, 3.0)
+
+
+def test_the_bound_is_absolute_or_of_a_known_range() -> None:
+    assert bound_of(EncodeConfig(max_error=0.5), None) == 0.5
+    assert bound_of(EncodeConfig(max_error_rel=0.01), RANGE) == 0.04
+    with pytest.raises(InputError, match="give value_range"):
+        bound_of(EncodeConfig(max_error_rel=0.01), None)
+    for other in ({}, {"psnr": 50}, {"ratio": 5}):
+        with pytest.raises(InputError, match="promises a bound"):
+            bound_of(EncodeConfig(**other), RANGE)
+
+
+def test_the_plan_covers_the_expected_range_and_the_frames() -> None:
+    frames = list(np.linspace(0, 2, 3 * 4 * 5 * 6, dtype=np.float32).reshape(3, 4, 5, 6))
+    found = plan_layers(frames, EncodeConfig(max_error=0.1, effort=1), 0.1, ValueRange(-7.0, 1.0))
+    assert found.coder.settings.low <= -7
+    assert found.coder.settings.high >= 2
+    assert found.coder.coding.error == 0.1
+    assert found.coder.tile[0] <= 3
+    assert found.header["config"]["max_error"] == 0.1
+    assert found.header["feature_bounding_box"] == [[0, 4], [0, 5], [0, 6]]
+
+
+def test_integers_have_a_bound_of_whole_numbers() -> None:
+    frames = list(np.arange(2 * 3 * 4 * 5).reshape(2, 3, 4, 5))
+    found = plan_layers(frames, EncodeConfig(max_error=1.7, effort=1), 1.7, None)
+    assert found.coder.coding.error == 1.5
+
+
+CONFIG_WRITER = EncodeConfig(max_error=BOUND, effort=1, tile=TILE)
 LAYER = 3
 
 
 def written(path: Path, steps: int, **options) -> Path:
-    with Writer(path, shape=SHAPE, config=CONFIG, **options) as writer:
+    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, **options) as writer:
         for step in range(steps):
             writer.append(frame(step))
     return path
 
 
-def frames(steps: int) -> np.ndarray:
+def frames_writer(steps: int) -> np.ndarray:
     return np.stack([frame(step) for step in range(steps)])
 
 
 def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+    with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
         for step in range(10):
             writer.append(frame(step))
             assert (writer.steps, writer.steps_written) == (step + 1, (step + 1) // LAYER * LAYER)
@@ -54,7 +193,7 @@ def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
     assert os.listdir(tmp_path) == ["run.fhz"]
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames(10)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(10)).max() <= BOUND
         assert volume.chunks == (LAYER, *SHAPE)
         np.testing.assert_array_equal(volume.coords["t"].values, np.arange(10))
 
@@ -63,7 +202,7 @@ def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
     path = written(tmp_path / "run.fhz", 7)
     with fhash_codec.open(path) as volume:
         told = volume.info
-    found = fhash_codec.diff(frames(7), path)
+    found = fhash_codec.diff(frames_writer(7), path)
     quality = told["quality"]
     assert quality["psnr"] == pytest.approx(found["psnr"], rel=1e-5)
     assert quality["psnr"] <= found["psnr"]
@@ -73,7 +212,7 @@ def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
     for step, other in zip(quality["per_step"], found["quality"]["per_step"], strict=True):
         assert step["rmse"] == pytest.approx(other["rmse"], rel=2e-3)
         assert step["rmse"] >= other["rmse"]
-    values = frames(7)
+    values = frames_writer(7)
     assert told["value_range"] == [values.min(), values.max()]
     assert told["config"]["max_error"] == BOUND
     assert quality["max_abs_error"] <= BOUND
@@ -114,24 +253,26 @@ def test_a_short_last_layer_is_not_extended_but_may_be_dropped(tmp_path) -> None
         for step in range(3, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames(9)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND
         assert len(volume.info["quality"]["per_step"]) == 9
 
 
 def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    fhash_codec.encode(frames(6), path, EncodeConfig(max_error=BOUND, effort=5, tile=TILE))
+    fhash_codec.encode(frames_writer(6), path, EncodeConfig(max_error=BOUND, effort=5, tile=TILE))
     with Writer.resume(path) as writer:
         for step in range(6, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames(9)).max() <= BOUND
-    fhash_codec.encode(frames(6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE))
+        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND
+    fhash_codec.encode(
+        frames_writer(6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE)
+    )
     with pytest.raises(InputError, match="does not promise a bound"):
         Writer.resume(tmp_path / "psnr.fhz")
     feature = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, features=("interval:0.5:1",))
-    fhash_codec.encode(frames(6), tmp_path / "feature.fhz", feature)
+    fhash_codec.encode(frames_writer(6), tmp_path / "feature.fhz", feature)
     with pytest.raises(InputError, match="keeps features"):
         Writer.resume(tmp_path / "feature.fhz")
 
@@ -139,7 +280,9 @@ def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
 def test_a_trained_head_is_shared_and_values_beyond_the_range_keep_the_bound(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     config = EncodeConfig(max_error=BOUND, effort=5, tile=TILE)
-    values = frames(9) * np.array([1, 1, 1, 1, 1, 1, 40, 40, 40], np.float32)[:, None, None, None]
+    values = (
+        frames_writer(9) * np.array([1, 1, 1, 1, 1, 1, 40, 40, 40], np.float32)[:, None, None, None]
+    )
     with Writer(path, shape=SHAPE, config=config) as writer:
         for values_of_step in values:
             writer.append(values_of_step)
@@ -153,7 +296,7 @@ def test_a_trained_head_is_shared_and_values_beyond_the_range_keep_the_bound(tmp
 @pytest.mark.parametrize("dtype", ["uint8", "int64", "float64", "float16"])
 def test_other_number_types(tmp_path, dtype) -> None:
     path = tmp_path / "run.fhz"
-    values = (100 + 20 * frames(5)).astype(dtype)
+    values = (100 + 20 * frames_writer(5)).astype(dtype)
     with Writer(path, shape=SHAPE, max_error=0.0 if dtype == "int64" else 2.0) as writer:
         for values_of_step in values:
             writer.append(values_of_step)
@@ -167,7 +310,7 @@ def test_coordinates_and_labels(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
     options = {"coords": coords, "name": "u", "units": "m s-1", "time_units": "hours"}
-    with Writer(path, shape=SHAPE, config=CONFIG, attributes={"a": 1}, **options) as writer:
+    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, attributes={"a": 1}, **options) as writer:
         for step, now in enumerate((0.0, 0.1, 0.7, 2.0)):
             writer.append(frame(step), time=now)
     with fhash_codec.open(path) as volume:
@@ -178,9 +321,9 @@ def test_coordinates_and_labels(tmp_path) -> None:
         np.testing.assert_array_equal(volume.coords["z"].values, [1, 2, 4, 8])
         np.testing.assert_array_equal(volume.coords["x"].values, np.arange(12) / 3)
     with pytest.raises(InputError, match="the coordinate of x has shape"):
-        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG, coords={"x": np.arange(3)})
+        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"x": np.arange(3)})
     with pytest.raises(InputError, match="coords names 'w'"):
-        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG, coords={"w": np.arange(3)})
+        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"w": np.arange(3)})
 
 
 def test_many_irregular_times_have_an_array(tmp_path) -> None:
@@ -199,7 +342,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
     path, good = tmp_path / "run.fhz", frame(0)
     bad = good.copy()
     bad[0, 0, :2] = np.nan
-    with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+    with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
         writer.append(good)
         for wrong, time_of_step, message in (
             (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
@@ -218,7 +361,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
     with pytest.raises(InputError, match="the writer is closed"):
         writer.append(good)
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames(4)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(4)).max() <= BOUND
 
 
 @pytest.mark.parametrize(
@@ -247,14 +390,14 @@ def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
         assert volume.info["config"]["max_error"] == 0.004
-        assert np.abs(volume[:] - frames(4)).max() <= 0.004
+        assert np.abs(volume[:] - frames_writer(4)).max() <= 0.004
 
 
 def test_an_existing_file_needs_force(tmp_path) -> None:
     path = written(tmp_path / "run.fhz", 3)
     with pytest.raises(OutputExistsError):
-        Writer(path, shape=SHAPE, config=CONFIG)
-    with Writer(path, shape=SHAPE, config=CONFIG, force=True) as writer:
+        Writer(path, shape=SHAPE, config=CONFIG_WRITER)
+    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, force=True) as writer:
         writer.append(frame(0))
     with fhash_codec.open(path) as volume:
         assert volume.shape[0] == 1
@@ -264,7 +407,7 @@ def test_a_failing_simulation_keeps_what_it_appended(tmp_path) -> None:
     path = tmp_path / "run.fhz"
 
     def simulate() -> None:
-        with Writer(path, shape=SHAPE, config=CONFIG) as writer:
+        with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
             for step in range(4):
                 writer.append(frame(step))
             raise ZeroDivisionError
@@ -276,7 +419,7 @@ def test_a_failing_simulation_keeps_what_it_appended(tmp_path) -> None:
 
 
 def test_without_a_frame_there_is_no_file(tmp_path) -> None:
-    with Writer(tmp_path / "run.fhz", shape=SHAPE, config=CONFIG):
+    with Writer(tmp_path / "run.fhz", shape=SHAPE, config=CONFIG_WRITER):
         pass
     assert os.listdir(tmp_path) == []
 
@@ -285,7 +428,7 @@ def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     tmp_path, monkeypatch
 ) -> None:
     path = tmp_path / "run.fhz"
-    writer = Writer(path, shape=SHAPE, config=CONFIG)
+    writer = Writer(path, shape=SHAPE, config=CONFIG_WRITER)
     for step in range(LAYER):
         writer.append(frame(step))
 
@@ -347,7 +490,7 @@ def test_killed_it_loses_no_layer_that_was_written(tmp_path) -> None:
         with fhash_codec.open(path) as volume:
             assert volume.verify()
             steps = volume.shape[0]
-            assert np.abs(volume[:] - frames(steps)).max() <= BOUND
+            assert np.abs(volume[:] - frames_writer(steps)).max() <= BOUND
         assert told <= steps <= told + LAYER
         before = steps
     with Writer.resume(path):

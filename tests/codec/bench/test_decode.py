@@ -10,11 +10,11 @@ import pytest
 
 from fhash_codec.bench import decode
 from fhash_codec.bench.decode import TURNS, bench_decode
-from fhash_codec.coreset.bricks import build_coreset
-from fhash_codec.coreset.features import Interval
-from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.coreset.scan import scan
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import build_coreset
+from fhash_codec.features.features import Interval
+from fhash_codec.features.occupancy import unpack
+from fhash_codec.features.scan import scan
+from fhash_codec.paper.network import Architecture
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 

@@ -13,8 +13,8 @@ import pytest
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
-from fhash_codec.compact.tiles.blocks import Blocks
-from fhash_codec.coreset.selection import select_features
+from fhash_codec.compact.tiles import Blocks
+from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 

@@ -9,9 +9,9 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact import tiles_to_promise
-from fhash_codec.compact.tiles import blocks
-from fhash_codec.coreset.selection import select_features
+from fhash_codec.compact import encode as tiles_to_promise
+from fhash_codec.compact import tiles as blocks
+from fhash_codec.features.selection import select_features
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries, StepsSeries

@@ -18,7 +18,7 @@ from fhash_codec.cost.results import (
     Read,
     Stage,
 )
-from fhash_codec.rendering.task.task import complete
+from fhash_codec.rendering.march_task import complete
 from fhash_formats.series import ArraySeries
 
 

@@ -8,14 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from fhash_codec.compact.choices.transform import choose_transform, count_trials
-from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.compact.tiles.sample import Sample
+from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.tiles import Coding, Outcome, Tile
+from fhash_codec.compact.transform import choose_transform, count_trials
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import look_at
 from fhash_formats.series import ArraySeries
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.tile_format import TileSettings
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 24, 24), (1, 1, 40, 40), (3, 1, 1, 30), (2, 150, 8, 8)])

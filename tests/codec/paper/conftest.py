@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_codec.coreset.boxes import Box
-from fhash_codec.paper.architecture import level_resolutions
-from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.boxes import Box
+from fhash_codec.paper.network import ArrayTable, Network, level_resolutions
 
 Points = list[npt.NDArray[np.float64]]
 """Key indices, z, y and x of points, each (n,)."""

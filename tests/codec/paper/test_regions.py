@@ -8,9 +8,9 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.paper import points
+from fhash_codec.paper import model as points
+from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import ArrayTable
-from fhash_codec.paper.points import decode_region, sample_points
 from fhash_formats.errors import InputError, RegionError
 
 

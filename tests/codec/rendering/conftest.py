@@ -11,8 +11,8 @@ from frame_field import by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer, Scene, Volume
-from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.task.arrays import Arrays
+from fhash_codec.rendering.image import Image
+from fhash_codec.rendering.march_task import Arrays
 
 SHAPE = (3, 20, 24, 28)
 
@@ -78,7 +78,7 @@ def tensors() -> Arrays:
     """torch's arrays on the processor: what marches on CUDA marches here too."""
     import torch
 
-    from fhash_codec.rendering.task.torch_arrays import TorchArrays
+    from fhash_codec.rendering.torch_arrays import TorchArrays
 
     return TorchArrays(torch.device("cpu"))
 

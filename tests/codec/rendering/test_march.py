@@ -10,11 +10,12 @@ import numpy.typing as npt
 import pytest
 from frame_field import by_stream, streamed
 
-from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.scene.scene import AmbientOcclusion, Camera, Shadows
-from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.march_task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.scenes import AmbientOcclusion, Camera, Shadows
 from fhash_formats.errors import InputError
 
 Shape = tuple[int, ...]

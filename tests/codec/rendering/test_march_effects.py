@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from frame_field import by_stream
 
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.camera.clip import Body
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.task.task import Frame, Grading, Lighting, Marched, Surface, Table, Task
+from fhash_codec.rendering.march_task import Frame, Grading, Lighting, Marched, Surface, Table, Task
+from fhash_codec.rendering.scenes import Camera
+from fhash_codec.rendering.view import Body
 
 FRONT = Camera(view="xy", projection="parallel", parallel_scale=4.0)
 """Looks along z from the last layer to the first; 8 x 8 pixels see the middles of 8 x 8 cells."""

@@ -1,7 +1,10 @@
-"""Renderers: pictures of files, the frames that are kept, and the counters."""
+"""The renderer, and evolutions."""
 
 from __future__ import annotations
 
+import dataclasses
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -13,17 +16,65 @@ from forked import ended_well, forked, needs_fork
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.rendering import render
 from fhash_codec.rendering import renderer as module
-from fhash_codec.rendering.scene.scene import scene_in_png
-from fhash_codec.rendering.task.task import COUNTERS, complete, rows
-from fhash_codec.rendering.task.units import Units
+from fhash_codec.rendering.march_task import COUNTERS, Units, complete, rows
+from fhash_codec.rendering.renderer import evolution
+from fhash_codec.rendering.scenes import Effects, Evolution, scene_in_png
+from fhash_codec.rendering.scenes import Scene as Scene_evolution
 from fhash_formats.errors import DamagedFileError, InputError
 
-SMALL = {"size": [40, 32]}
+SMALL = Scene(size=(40, 32))
+
+
+def test_the_function_renders_a_picture(volume: Volume) -> None:
+    image = fhash_codec.render(volume, SMALL)
+    assert image.rgba.shape == (32, 40, 4)
+    assert image.rgba[..., 3].max() > 0.1
+    assert image.source == volume.path.name
+    assert image.seconds > 0
+    assert image._repr_png_().startswith(b"\x89PNG")
+
+
+def test_without_a_scene_the_default_is_rendered(volume: Volume) -> None:
+    stages = []
+    image = render(volume, progress=lambda stage, *_: stages.append(stage))
+    assert image.rgba.shape == (*Scene().size[::-1], 4)
+    assert dict(image.scene) == Scene().to_dict()
+    assert set(stages) == {"decoding", "marching"}
+
+
+def test_it_is_the_picture_of_a_renderer(volume: Volume) -> None:
+    np.testing.assert_array_equal(render(volume, SMALL).rgba, Renderer(volume).render(SMALL).rgba)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import fhash_codec.rendering.renderer; f = fhash_codec.render",
+        "from fhash_codec import render as f; import fhash_codec.rendering.scenes as s",
+        "from fhash_codec import *; f = render; import fhash_codec.rendering.scenes",
+    ],
+)
+def test_the_function_is_the_same_whatever_was_imported_before(statement: str) -> None:
+    check = "import fhash_codec.rendering; assert fhash_codec.rendering.render is f"
+    subprocess.run([sys.executable, "-c", f"{statement}; {check}"], check=True)
+
+
+def test_importing_the_package_loads_no_renderer() -> None:
+    code = (
+        "import sys, fhash_codec.rendering; slow = ('PIL', 'fhash_codec.rendering.'); "
+        "print([name for name in sys.modules if name.startswith(slow)])"
+    )
+    command = [sys.executable, "-c", code]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+SMALL_RENDERER = {"size": [40, 32]}
 
 
 def scene(**parts: Any) -> Scene:
-    return Scene.from_dict({**SMALL, **parts})
+    return Scene.from_dict({**SMALL_RENDERER, **parts})
 
 
 def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
@@ -290,3 +341,77 @@ def test_nothing_outside_a_clip_is_decoded_or_evaluated(
     assert part.counters["decoded_vertices"] <= whole.counters["decoded_vertices"]
     assert 0 < part.counters["samples"] < 0.5 * whole.counters["samples"]
     assert part.counters["evaluations"] <= part.counters["samples"]
+
+
+SMALL_EVOLUTION = Scene_evolution(size=(20, 14))
+
+
+def test_an_evolution_is_a_grid_of_its_steps(volume: Volume, drawing: Any) -> None:
+    draw = drawing()
+    asked = Evolution(steps=(0.0, 1.0, 2.5, 3.0, 4.0), columns=3)
+    scene = dataclasses.replace(
+        SMALL_EVOLUTION, effects=Effects(colour_bar=True), background="transparent", evolution=asked
+    )
+    image = evolution(volume, scene, draw=draw)
+    assert image.rgba.shape == (2 * 14 + 1, 3 * 20 + 2, 4)
+    for number, step in enumerate([0, 1, 2.5, 3, 4]):
+        row, column = divmod(number, 3)
+        panel = image.rgba[row * 15 : row * 15 + 14, column * 21 : column * 21 + 20]
+        np.testing.assert_allclose(panel[..., 0], step / 10, rtol=1e-6)
+    assert not image.rgba[:, 20].any()
+    assert not image.rgba[15:, 42:].any()
+    assert not any(each.effects.colour_bar or each.effects.legend for each in draw.scenes)
+    assert all(each.effects.time_label for each in draw.scenes)
+    assert image.counters == {"rays": 5 * 280}
+    assert image.seconds == 2.5
+    assert Scene_evolution.from_dict(image.scene) == scene
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "columns"),
+    [(1, (64, 64), 1), (6, (64, 64), 3), (5, (128, 16), 1), (4, (16, 128), 4)],
+)
+def test_an_evolution_is_wider_than_high(
+    count: int, size: tuple[int, int], columns: int, volume: Volume, drawing: Any
+) -> None:
+    scene = dataclasses.replace(
+        SMALL_EVOLUTION, size=size, evolution=Evolution(steps=(0.0,) * count)
+    )
+    image = evolution(volume, scene, draw=drawing())
+    assert image.rgba.shape[1] // size[0] == columns
+
+
+def test_evolutions_that_cannot_be(volume: Volume, drawing: Any) -> None:
+    for steps, columns, size, part in (
+        ([], None, (9, 9), "at least one"),
+        ([0], 2, (9, 9), "columns"),
+        ([0] * 9, 9, (9999, 9), "pixels"),
+    ):
+        with pytest.raises(InputError, match=part):
+            evolution(
+                volume,
+                dataclasses.replace(
+                    SMALL_EVOLUTION, size=size, evolution=Evolution(steps=steps, columns=columns)
+                ),
+                draw=drawing(),
+            )
+    with pytest.raises(InputError, match="at least one"):
+        evolution(volume, SMALL_EVOLUTION, draw=drawing())
+    with pytest.raises(InputError, match="steps of its own"):
+        dataclasses.replace(SMALL_EVOLUTION, step=1.0, evolution=Evolution(steps=(0.0,)))
+    with pytest.raises(InputError, match="the scene is an evolution"):
+        Renderer(volume).plan(
+            dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0,)))
+        )
+
+
+def test_a_renderer_draws_evolutions(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["compact"]) as real:
+        image = fhash_codec.render(
+            real,
+            dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0, 1.5), columns=2)),
+        )
+        single = fhash_codec.render(
+            real, dataclasses.replace(SMALL_EVOLUTION, step=1.5, effects=Effects(time_label=True))
+        )
+        np.testing.assert_array_equal(image.rgba[:, -SMALL_EVOLUTION.size[0] :], single.rgba)

@@ -1,4 +1,4 @@
-"""The simulation: a series that is finite and bounded for every scene, shape and seed."""
+"""Simulation of a scene, its terms and its explanation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fhash_codec.simulation import simulate as module
-from fhash_codec.simulation.effects.catalogue import EFFECTS
-from fhash_codec.simulation.scene import scene_of
-from fhash_codec.simulation.simulate import MAX_SEED, Simulation, blocks, simulate
+from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
+from fhash_codec.simulation.simulate import (
+    MAX_SEED,
+    Simulation,
+    blocks,
+    counts,
+    reasons,
+    simulate,
+    spacing_of,
+    terms_of,
+)
 from fhash_formats.errors import InputError, RegionError
 
 BLOB = {"effect": "blob", "radius": 0.2, "edge": 0.05}
@@ -235,3 +243,117 @@ def test_memory_does_not_grow_with_the_steps() -> None:
     series = simulate("vortex", (10_000, 4, 4, 4))
     assert series.read(9_999).nbytes == 256
     assert series.counters.frames == 1
+
+
+BLOB_TERMS = {"effect": "blob"}
+
+
+def made(monkeypatch: pytest.MonkeyPatch, *effects: dict[str, Any]) -> list[str]:
+    """Kinds of the effects whose terms are made, in order."""
+    kinds: list[str] = []
+    for kind, effect in EFFECTS.items():
+        own = effect.term  # type: ignore[attr-defined]
+
+        def term(self: Any, *words: Any, own: Any = own, kind: str = kind) -> Any:
+            kinds.append(kind)
+            return own(self, *words)
+
+        monkeypatch.setattr(effect, "term", term)
+    terms_of(SimulatedScene(effects=effects), 0)  # type: ignore[arg-type]
+    return kinds
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_an_effect_that_is_not_named_or_has_no_strength_is_never_made(
+    monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    assert made(monkeypatch, BLOB_TERMS) == ["blob"]
+    assert made(monkeypatch, BLOB_TERMS, {"effect": kind, "strength": 0}) == ["blob"]
+
+
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_a_named_effect_is_made_once(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    assert made(monkeypatch, BLOB_TERMS, {"effect": kind}) == ["blob", kind]
+
+
+def test_without_a_body_nothing_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    effects = [{"effect": kind} for kind, effect in EFFECTS.items() if effect.role != "body"]
+    assert made(monkeypatch, *effects) == []
+    terms = terms_of(SimulatedScene(effects=tuple(effects)), 0)  # type: ignore[arg-type]
+    assert len(terms.idle) == len(effects)
+    assert "no body" in terms.idle[0]
+
+
+def test_roles_and_sums() -> None:
+    effects = (BLOB_TERMS, {"effect": "diffusion"}, {"effect": "diffusion", "strength": 0.5})
+    terms = terms_of(SimulatedScene(effects=effects), 0)  # type: ignore[arg-type]
+    assert terms.diffusivity == pytest.approx(0.501)
+    assert terms.spreads == [1, 2]
+    assert not terms.stretched
+    assert terms.exact
+
+
+@pytest.mark.parametrize(
+    ("kind", "sheared", "exact"),
+    [("rotation", False, True), ("vortex", True, True), ("turbulence", True, False)],
+)
+def test_flows_say_whether_they_shear_and_are_exact(kind: str, sheared: bool, exact: bool) -> None:
+    one = SimulatedScene(effects=(BLOB_TERMS, {"effect": kind}))  # type: ignore[arg-type]
+    two = SimulatedScene(effects=(BLOB_TERMS, {"effect": kind}, {"effect": "advection"}))  # type: ignore[arg-type]
+    assert (terms_of(one, 0).sheared, terms_of(one, 0).exact) == (sheared, exact)
+    assert not terms_of(two, 0).exact
+
+
+def test_the_spacing_of_one_vertex_is_zero() -> None:
+    scene = SimulatedScene(shape=(1, 4, 10), size=(1.0, 2.0, 5.0))
+    assert spacing_of(scene) == (0.0, 0.5, 0.5)
+
+
+EFFECTS_HERE = [
+    {"effect": "blob"},
+    {"effect": "vortex", "strength": 0},
+    {"effect": "turbulence"},
+    {"effect": "front", "direction": (0, 0, 0)},
+    {"effect": "diffusion"},
+]
+
+
+def test_every_named_effect_has_its_line_and_the_others_one() -> None:
+    lines = dict(reasons(simulate({"effects": EFFECTS_HERE, "background": 2, "units": "K"})))
+    assert lines["effects"] == "5 effects named, one line each"
+    assert lines["1 blob"].startswith("computed: adds its value")
+    assert lines["2 vortex"] == "not computed: its strength is 0"
+    assert "waves from 0.3 m down" in lines["3 turbulence"]
+    assert lines["4 front"] == "not computed: its direction is 0"
+    assert lines["5 diffusion"].startswith("computed: widens")
+    others = set(EFFECTS) - {"blob", "vortex", "turbulence", "front", "diffusion"}
+    assert all(kind in lines["not named"] for kind in others)
+    assert "4 parts" in lines["time"]
+    assert "draw them out" in lines["surfaces"]
+    assert lines["background"] == "2 K"
+
+
+def test_other_reasons() -> None:
+    alone = dict(reasons(simulate({"effects": [{"effect": "vortex"}]})))
+    assert alone["1 vortex"] == "not computed: the scene has no body, so nothing shows it"
+    assert "the background everywhere" in alone["surfaces"]
+    still = dict(reasons(simulate({"effects": [{"effect": "shell"}]})))
+    assert "nothing is carried" in still["time"]
+    assert "the same everywhere" in still["surfaces"]
+    one = dict(reasons(simulate({"effects": [{"effect": "shell"}, {"effect": "rotation"}]})))
+    assert "is one part" in one["time"]
+    bent = dict(reasons(simulate({"effects": [{"effect": "shell"}, {"effect": "fingers"}]})))
+    assert "fingers bend them" in bent["surfaces"]
+
+
+def test_counts_have_every_kind_and_zero_for_those_that_are_not_computed() -> None:
+    series = simulate({"effects": EFFECTS_HERE}, (2, 4, 4, 4))
+    before = counts(series)["effects"]
+    assert set(before) == set(EFFECTS)
+    assert all(values["places"] == 0 for values in before.values())
+    series.read(1)
+    after = counts(series)
+    computed = {kind for kind, values in after["effects"].items() if values["places"]}
+    assert computed == {"blob", "turbulence", "diffusion"}
+    assert {kind for kind, values in after["effects"].items() if values["made"]} == computed
+    assert (after["frames"], after["vertices"], after["parts"]) == (1, 64, 4)

@@ -9,7 +9,7 @@ import pytest
 from coded_stores import dataset, write
 
 import fhash_codec
-from fhash_codec.zarr_chunks.chunk_table import ChunkTable
+from fhash_codec.views.unpack import ChunkTable
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from coded_stores import SHAPE, dataset, write
 
-from fhash_codec.zarr_chunks import tiles as module
-from fhash_codec.zarr_chunks.tiles import Tiles
+from fhash_codec.views import pack as module
+from fhash_codec.views.pack import Tiles
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.file_series import Request
 from fhash_formats.readers.zarr_coded import open_coded
 from fhash_formats.transform.chunk import decode_chunk
 

@@ -9,7 +9,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.zarr_view import chunking
+from fhash_codec.views import view as chunking
 from fhash_formats.series import ArraySeries, Coordinate
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"

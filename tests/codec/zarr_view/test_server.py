@@ -1,4 +1,4 @@
-"""A view over HTTP: the same bytes, ranges, conditions, other origins, and what is refused."""
+"""Ranges and conditions of HTTP requests."""
 
 from __future__ import annotations
 
@@ -17,9 +17,58 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec.zarr_view.server import Server
-from fhash_codec.zarr_view.view import opened_view
+from fhash_codec.views.server import UNSATISFIABLE, Server, byte_range, names_tag
+from fhash_codec.views.view import opened_view
 from fhash_formats.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("header", "span"),
+    [
+        (None, None),
+        ("bytes=0-9", (0, 10)),
+        ("bytes=5-5", (5, 6)),
+        ("bytes=90-", (90, 100)),
+        ("bytes=90-1000", (90, 100)),
+        ("bytes=-7", (93, 100)),
+        ("bytes=-1000", (0, 100)),
+        ("Bytes = 1-2", (1, 3)),
+        ("bytes=100-", UNSATISFIABLE),
+        ("bytes=100-200", UNSATISFIABLE),
+        ("bytes=-0", UNSATISFIABLE),
+        ("bytes=9-3", None),
+        ("bytes=0-1,5-6", None),
+        ("bytes=-", None),
+        ("bytes=a-b", None),
+        ("lines=0-1", None),
+        ("bytes=" + "9" * 30 + "-", None),
+    ],
+)
+def test_ranges(header: str | None, span: tuple[int, int] | None) -> None:
+    assert byte_range(header, 100) == span
+
+
+def test_nothing_can_be_taken_from_nothing() -> None:
+    assert byte_range("bytes=-5", 0) == UNSATISFIABLE
+    assert byte_range("bytes=0-", 0) == UNSATISFIABLE
+
+
+@pytest.mark.parametrize(
+    ("header", "named"),
+    [
+        (None, False),
+        ('"a"', True),
+        ('W/"a"', True),
+        ('"b", "a"', True),
+        ("*", True),
+        ('"b"', False),
+        ("a", False),
+        ("", False),
+    ],
+)
+def test_tags(header: str | None, named: bool) -> None:
+    assert names_tag(header, '"a"') is named
+
 
 CHUNK = "/density/c/0/0/0/0"
 
@@ -104,7 +153,7 @@ def test_head_tells_what_get_gives(ask: Ask, path: str) -> None:
     assert told[1] == headers
 
 
-def test_ranges(ask: Ask) -> None:
+def test_ranges_server(ask: Ask) -> None:
     _, headers, body = ask(CHUNK)
     size = len(body)
     assert headers["Accept-Ranges"] == "bytes"
@@ -203,7 +252,7 @@ def test_names_of_other_machines_get_nothing_on_loopback(whole: Path, host: str)
 def test_connections_beyond_the_limit_are_told_so(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fhash_codec.zarr_view.server.MAX_CONNECTIONS", 2)
+    monkeypatch.setattr("fhash_codec.views.server.MAX_CONNECTIONS", 2)
     with serving(whole) as server:
         held = [http.client.HTTPConnection("127.0.0.1", server.server_address[1]) for _ in "ab"]
         for connection in held:
@@ -233,7 +282,7 @@ def test_without_descriptors_the_server_waits(whole: Path, monkeypatch: pytest.M
 
     pauses: list[float] = []
     monkeypatch.setattr(socket.socket, "accept", accept_later)
-    monkeypatch.setattr("fhash_codec.zarr_view.server.time.sleep", pauses.append)
+    monkeypatch.setattr("fhash_codec.views.server.time.sleep", pauses.append)
     with serving(whole, news.append) as server:
         assert asking(server)("/zarr.json")[0] == 200
     assert news == ["no connection can be accepted for now: Too many open files"]

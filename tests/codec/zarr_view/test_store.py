@@ -15,8 +15,8 @@ from zarr.core.buffer import default_buffer_prototype
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
-from fhash_codec.zarr_view import store as store_module
-from fhash_codec.zarr_view.store import DecodedStore
+from fhash_codec.views import store as store_module
+from fhash_codec.views.store import DecodedStore
 from fhash_formats.errors import DamagedFileError, MissingInputError
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"

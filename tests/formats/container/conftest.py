@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.expected_arrays import layer_shapes, occupancy_bytes
+from fhash_formats.container.reader import layer_shapes, occupancy_bytes
 from fhash_formats.container.zip_file import END, Member, comment, ending, local_header
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container import Container
-from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.array import TRANSFORM
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
 from fhash_formats.transform.chunk import encode_chunk
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.table_parts import TableParts
-from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.head.head import Layer, NeighbourHead
-from fhash_formats.transform.tile.encoding import encode_tile
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.container.growing import TableParts
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.head import Layer, NeighbourHead
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (4, 3, 4, 6)
 TILE = (4, 3, 4, 4)

@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+import json
+import struct
+import tracemalloc
 from itertools import product
 from typing import Any
 
+import numcodecs.zstd
 import numpy as np
 import pytest
-from hostile_files import DOCUMENT, edited, read_everything, refused
+from hostile_files import DOCUMENT, edited, frame, read_everything, refused, replaced
+from sharded_files import NAME, PATH, random_values, write_sharded
 
-from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import plain_codecs
-from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats import native
+from fhash_formats.container import Container, shard_order, shard_shape
+from fhash_formats.container import array as coding
+from fhash_formats.container.array import (
+    ABSENT,
+    MAX_SHARD_CHUNKS,
+    SINGLE_SHARD_CHUNKS,
+    ArrayMetadata,
+    PlainCoder,
+    Sharding,
+    chunk_coder,
+    parse_index,
+    plain_codecs,
+    sharding_codecs,
+    with_crc32c,
+    zstd_content_size,
+)
+from fhash_formats.container.zip_file import MAX_MEMBER
+from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.native import crc32c
 
 ARRAYS = {
     "huge shape": (lambda v: v.update(shape=[2**60]), "chunks; .* are declared", DamagedFileError),
@@ -146,3 +168,415 @@ def test_every_chunk_has_its_name_and_its_region() -> None:
 def test_names_of_no_chunk(key) -> None:
     with pytest.raises(DamagedFileError, match="no chunk of the array's grid"):
         metadata().parse_key(key)
+
+
+@pytest.mark.parametrize("size", [0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 2**20])
+def test_content_size_of_what_zstd_writes(size) -> None:
+    assert zstd_content_size(memoryview(numcodecs.zstd.compress(bytes(size), 3))) == size
+
+
+def test_crc32c_of_the_check_string() -> None:
+    """RFC 3720, appendix B.4, and the usual check value."""
+    assert crc32c(b"123456789") == 0xE3069283
+    assert crc32c(memoryview(bytes(32))) == 0x8A9136AA
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_crc32c_of_known_answers(plain: bool) -> None:
+    """RFC 3720, appendix B.4; by tables and by the instruction of the processor."""
+    scsi = bytes.fromhex(
+        "01c00000000000000000000000000000140000000000040000000014000000182800000000000000"
+        "0200000000000000"
+    )
+    answers = {
+        b"": 0x00000000,
+        b"123456789": 0xE3069283,
+        bytes(32): 0x8A9136AA,
+        b"\xff" * 32: 0x62A8AB43,
+        bytes(range(32)): 0x46DD794E,
+        bytes(range(31, -1, -1)): 0x113FDB5C,
+        scsi: 0xD9963A56,
+    }
+    crc = native.library().fhash_crc32c
+    for data, answer in answers.items():
+        assert crc(data, len(data), 0, plain) == answer
+        half = len(data) // 2
+        assert crc(data[half:], len(data) - half, crc(data, half, 0, plain), plain) == answer
+
+
+@pytest.mark.parametrize("size", [7, 255, 767, 768, 769, 12287, 12288, 12289, 100_003])
+def test_crc32c_is_that_of_the_definition(size: int) -> None:
+    """Long data go in three parts side by side; tables are those of single bits."""
+    data = np.random.default_rng(size).bytes(size)
+    table = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = byte >> 1 ^ (0x82F63B78 if byte & 1 else 0)
+        table.append(byte)
+    rest = 0xFFFFFFFF
+    for byte in data:
+        rest = rest >> 8 ^ table[(rest ^ byte) & 255]
+    crc = native.library().fhash_crc32c
+    assert crc(data, size, 0, 0) == crc(data, size, 0, 1) == rest ^ 0xFFFFFFFF
+    assert crc32c(memoryview(data)) == crc32c(data) == rest ^ 0xFFFFFFFF
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint16", "float16", "float64"])
+def test_decoding_gives_what_was_coded(dtype) -> None:
+    chunk = np.arange(24).reshape(2, 3, 4).astype(dtype)
+    coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
+    for given in (chunk, np.asfortranarray(chunk), chunk.astype(chunk.dtype.newbyteorder())):
+        decoded = coder.decode(memoryview(coder.encode(given)))
+        np.testing.assert_array_equal(decoded, chunk)
+        assert decoded.dtype == chunk.dtype
+        assert decoded.dtype.isnative
+
+
+def test_a_lack_of_memory_is_no_damage(monkeypatch) -> None:
+    chunk = np.arange(24, dtype=np.float32)
+    coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
+    data = memoryview(coder.encode(chunk))
+
+    def fail(*_):
+        raise RuntimeError("Zstd decompression error: b'Allocation error : not enough memory'")
+
+    monkeypatch.setattr(numcodecs.zstd, "decompress", fail)
+    with pytest.raises(MemoryError):
+        coder.decode(data)
+
+
+def test_unknown_codecs_are_refused(sample, samples) -> None:
+    codecs = [{"name": "test.negative"}, {"name": "crc32c"}]
+    with pytest.raises(UnsupportedFileError, match=r"codecs 'test[.]negative, crc32c'"):
+        chunk_coder(codecs, np.dtype(np.uint8), (4,))
+
+
+def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
+    codecs = [{"name": "fhash.transform", "configuration": {}}]
+    with pytest.raises(
+        DamagedFileError, match=r"tiles of 134,217,729 vertices; the limit is 134,217,728"
+    ):
+        chunk_coder(codecs, np.dtype(np.uint8), (1, 1, 1, (1 << 27) + 1))
+
+
+CHUNKS = {
+    "bomb": (
+        lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1),
+        "zstd declares 67108864 bytes; the chunk has 32",
+    ),
+    "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares None"),
+    "bomb that lies": (lambda right: frame(bytes(1 << 16), size=32), "zstd data are damaged"),
+    "two frames": (lambda right: numcodecs.zstd.compress(right, 1) * 2, "zstd data are damaged"),
+    "fewer bytes": (lambda right: frame(right[:16], size=32), "zstd data are damaged"),
+    "declares 2^63": (lambda right: frame(right, size=2**63), "zstd declares"),
+    "other content": (lambda right: right, "not a zstd frame"),
+    "empty": (lambda right: b"", "not a zstd frame"),
+    "header only": (
+        lambda right: frame(right, size=32)[:8],
+        "the header of the zstd frame is cut short",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHUNKS)
+def test_chunk_data(sample, samples, case) -> None:
+    make, message = CHUNKS[case]
+    coded = make(np.arange(4, dtype="<f8").tobytes())
+    coded += struct.pack("<I", crc32c(coded))
+    data = replaced(sample, samples, "time/c/0", coded)
+    refused(sample, data, f"member time/c/0: {message}")
+
+
+def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes() -> None:
+    """Otherwise damage could pass for a lack of memory, or a lack of memory for damage."""
+    float64 = np.dtype("<f8")
+    most = PlainCoder(plain_codecs(float64), float64, (2**17,))
+    data = with_crc32c(numcodecs.zstd.compress(bytes(2**20), 19))
+    assert not most.decode(memoryview(data)).any()
+    with pytest.raises(DamagedFileError, match="which 17 bytes cannot hold"):
+        PlainCoder(plain_codecs(float64), float64, (2**40,)).decode(
+            memoryview(with_crc32c(frame(b"abc"[:1], size=2**43)))
+        )
+
+
+@pytest.mark.parametrize(
+    "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"]
+)
+def test_chunk_without_its_crc(sample, samples, coded) -> None:
+    data = replaced(sample, samples, "time/c/0", coded)
+    refused(sample, data, "member time/c/0: .*CRC-32C")
+
+
+def test_frame_made_by_hand_is_read(sample, samples) -> None:
+    """The hostile frames above differ from this one only in what they are refused for."""
+    right = np.arange(4, dtype="<f8")
+    coded = frame(right.tobytes(), size=32)
+    coded += struct.pack("<I", crc32c(coded))
+    sample.write_bytes(replaced(sample, samples, "time/c/0", coded))
+    with Container.open(sample) as container:
+        np.testing.assert_array_equal(container.arrays["coords/time"].read(), right)
+
+
+def test_bytes_of_a_shard(tmp_path, samples) -> None:
+    """A shard is its inner chunks without gaps, an index of (offset, bytes), and its CRC-32C."""
+    values = np.arange(3, dtype=np.uint8)
+    path = write_sharded(tmp_path / "a.fhz", samples, values, (2,), (6,))
+    with Container.open(path) as container:
+        member = container.arrays[NAME].chunks[0,]
+    data = path.read_bytes()[member.data_offset : member.end]
+    coder = coding.chunk_coder(coding.plain_codecs(values.dtype), values.dtype, (2,))
+    first, second = coder.encode(values[:2]), coder.encode(np.array([2, 0], np.uint8))
+    index = struct.pack("<6Q", 0, len(first), len(first), len(second), ABSENT, ABSENT)
+    assert data == first + second + index + struct.pack("<I", crc32c(index))
+
+
+@pytest.mark.parametrize(
+    ("chunk_shape", "shard_shape"),
+    [((2, 3), (4, 7)), ((2,), (4, 6)), ((2, 0), (4, 6)), ((1, 1), (2048, 2048))],
+)
+def test_shards_that_do_not_fit(tmp_path, samples, chunk_shape, shard_shape) -> None:
+    with pytest.raises(InputError, match="sharding_indexed"):
+        write_sharded(
+            tmp_path / "a.fhz", samples, random_values((7, 6)), chunk_shape, shard_shape, chunks=[]
+        )
+
+
+BIG = 2**60
+
+
+INDICES = {
+    "offset outside": (lambda t: t[1].__setitem__(0, BIG), "overlap"),
+    "size outside": (lambda t: t[1].__setitem__(1, BIG), "larger than the shard"),
+    "sizes that overflow": (
+        lambda t: (t[0].__setitem__(1, 2**63), t[1].__setitem__(1, 2**63)),
+        "larger than the shard",
+    ),
+    "overlap": (lambda t: t[1].__setitem__(0, 0), "overlap"),
+    "two at one place": (lambda t: t.__setitem__(1, list(t[0])), "overlap"),
+    "gap": (lambda t: t[1].__setitem__(1, t[1][1] - 1), "overlap"),
+    "exchanged": (lambda t: t.__setitem__(slice(0, 2), [t[1], t[0]]), "overlap"),
+    "missing": (lambda t: t.__setitem__(1, [ABSENT, ABSENT]), "missing"),
+    "half missing": (lambda t: t[1].__setitem__(0, ABSENT), "missing"),
+    "beyond the array": (lambda t: t.__setitem__(3, [0, 5]), "beyond the end"),
+    "empty": (
+        lambda t: (
+            t[2].__setitem__(1, 0),
+            t[1].__setitem__(1, t[1][1] + t[2][1]),
+            t[2].__setitem__(0, t[2][0] + 10**6),
+        ),
+        "overlap",
+    ),
+}
+
+
+@pytest.fixture
+def line(tmp_path, samples):
+    """One shard of four inner chunks, of which the last is beyond the end of the array.
+
+    Returns the file, its parts for `samples.pack`, and the number of the shard among the parts.
+    """
+    path = write_sharded(tmp_path / "a.fhz", samples, random_values((5,)), (2,), (8,))
+    parts = samples.unpack(path.read_bytes())
+    return path, parts, [name for name, _ in parts].index(f"{PATH}/c/0")
+
+
+def refused_shard(path, samples, parts, message, kind=DamagedFileError):
+    path.write_bytes(samples.pack(parts))
+    for act in (
+        lambda c: c.arrays[NAME].read(),
+        lambda c: c.arrays[NAME].read((slice(2, 3),)),
+        lambda c: c.verify(),
+    ):
+        tracemalloc.start()
+        with pytest.raises(kind, match=message) as caught, Container.open(path) as container:
+            act(container)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 4 << 20
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+
+
+def test_hostile_indices(line, samples) -> None:
+    path, parts, at = line
+    name, data = parts[at]
+    for change, message in INDICES.values():
+        table = [list(entry) for entry in struct.iter_unpack("<2Q", data[-68:-4])]
+        change(table)
+        index = b"".join(struct.pack("<2Q", *entry) for entry in table)
+        changed = data[:-68] + index + struct.pack("<I", crc32c(index))
+        hostile = [*parts[:at], (name, changed), *parts[at + 1 :]]
+        refused_shard(path, samples, hostile, f"member {PATH}/c/0: .*{message}")
+
+
+def test_index_with_a_wrong_checksum(line, samples) -> None:
+    path, parts, at = line
+    name, data = parts[at]
+    parts[at] = name, data[:-1] + bytes([data[-1] ^ 1])
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: the CRC-32C of the shard's index")
+
+
+@pytest.mark.parametrize("data", [b"", b"x" * 67])
+def test_shard_shorter_than_its_index(line, samples, data) -> None:
+    path, parts, at = line
+    parts[at] = parts[at][0], data
+    refused_shard(path, samples, parts, f"member {PATH}/c/0: {len(data)} bytes are too few")
+
+
+def test_shards_that_declare_much(line, samples) -> None:
+    """A million inner chunks of a gibibyte each, in a few bytes."""
+    path, parts, _ = line
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
+    text = parts[place][1].decode()
+    many = text.replace('"chunk_shape":[8]', f'"chunk_shape":[{2**48}]').replace(
+        '"chunk_shape":[2]', f'"chunk_shape":[{2**28}]'
+    )
+    assert MAX_SHARD_CHUNKS == 2**20
+    parts[place] = parts[place][0], many.replace('"shape":[5]', f'"shape":[{2**48}]').encode()
+    refused_shard(path, samples, parts, "too few for the index|memory")
+
+
+SETTINGS = {
+    "index at the beginning": ({"index_location": "start"}, UnsupportedFileError),
+    "index without checksum": (
+        {"index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+        UnsupportedFileError,
+    ),
+    "another setting": ({"surprise": 1}, UnsupportedFileError),
+    "no codecs": ({"codecs": []}, UnsupportedFileError),
+    "codecs no list": ({"codecs": {"a": 1}}, DamagedFileError),
+    "inner codecs without checksum": (
+        {"codecs": coding.plain_codecs(np.dtype("f4"))[:-1]},
+        UnsupportedFileError,
+    ),
+    "shards in shards": (
+        {"codecs": sharding_codecs([1], coding.plain_codecs(np.dtype("f4")))},
+        UnsupportedFileError,
+    ),
+    "chunk no list": ({"chunk_shape": 2}, DamagedFileError),
+    "chunk of other rank": ({"chunk_shape": [2, 2]}, DamagedFileError),
+    "chunk of a fraction": ({"chunk_shape": [2.0]}, DamagedFileError),
+    "chunk of zero": ({"chunk_shape": [0]}, DamagedFileError),
+    "no divisor": ({"chunk_shape": [3]}, DamagedFileError),
+}
+
+
+@pytest.mark.parametrize("case", SETTINGS)
+def test_settings_that_are_refused(line, samples, case) -> None:
+    changes, kind = SETTINGS[case]
+    path, parts, _ = line
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
+    document = json.loads(parts[place][1])
+    document["codecs"][0]["configuration"].update(changes)
+    parts[place] = parts[place][0], json.dumps(document).encode()
+    refused_shard(path, samples, parts, f"member {PATH}/zarr.json: ", kind)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda c: c.append({"name": "crc32c"}), lambda c: c[0].pop("configuration")]
+)
+def test_sharding_stands_alone(line, samples, change) -> None:
+    path, parts, _ = line
+    place = [name for name, _ in parts].index(f"{PATH}/zarr.json")
+    document = json.loads(parts[place][1])
+    change(document["codecs"])
+    parts[place] = parts[place][0], json.dumps(document).encode()
+    refused_shard(path, samples, parts, "sharding_indexed", UnsupportedFileError)
+
+
+def test_every_flip_in_a_shard_is_found(sharded_file) -> None:
+    path, _ = sharded_file
+    with Container.open(path) as container:
+        members = list(container.arrays[NAME].chunks.values())
+    sound = path.read_bytes()
+    for member in members:
+        for at in range(member.offset, member.end):
+            damaged = bytearray(sound)
+            damaged[at] ^= 4
+            path.write_bytes(damaged)
+            with (
+                pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
+                Container.open(path) as container,
+            ):
+                container.verify()
+            if at >= member.data_offset:
+                with (
+                    pytest.raises(DamagedFileError, match=f"member {PATH}/c/"),
+                    Container.open(path) as container,
+                ):
+                    container.arrays[NAME].read()
+
+
+def test_index_of_a_full_shard() -> None:
+    index = struct.pack("<4Q", 0, 5, 5, 7)
+    entries = parse_index(index + struct.pack("<I", crc32c(index)), np.array([True, True]), 12)
+    assert entries.tolist() == [[0, 5], [5, 7]]
+
+
+def test_order_of_the_file() -> None:
+    order = list(shard_order((5, 3), (2, 1), (4, 2)))
+    assert order == [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1), (2, 2)]
+    assert sorted(order) == list(product(range(3), range(3)))
+
+
+@pytest.mark.parametrize(
+    ("grid", "shards"),
+    [
+        ((1, 1, 1, 1), (1, 1, 1, 1)),
+        ((4, 32, 32, 1), (1, 1, 1, 1)),
+        ((SINGLE_SHARD_CHUNKS + 1, 1, 1, 1), (SINGLE_SHARD_CHUNKS + 1, 1, 1, 1)),
+        ((3, 32, 32, 2), (3, 1, 1, 1)),
+    ],
+)
+def test_a_large_array_has_a_shard_for_each_layer(grid, shards) -> None:
+    chunk_shape = (2, 3, 5, 7)
+    shape = shard_shape(chunk_shape, grid)
+    assert all(n % chunk == 0 for n, chunk in zip(shape, chunk_shape, strict=True))
+    lengths = [n * chunk for n, chunk in zip(grid, chunk_shape, strict=True)]
+    assert tuple(-(-n // shard) for n, shard in zip(lengths, shape, strict=True)) == shards
+
+
+def test_a_large_grid_has_a_shard_for_each_layer_in_time() -> None:
+    tile = (2, 3, 4, 5)
+    assert shard_shape(tile, (4, 16, 8, 8)) == (8, 48, 32, 40)
+    assert shard_shape(tile, (5, 16, 8, 8)) == (2, 48, 32, 40)
+
+
+def test_the_parts_of_shards_hold_each_chunk_once() -> None:
+    sharding = Sharding(shard_shape=(4, 6), chunk_shape=(2, 2), codecs=())
+    spans = [range(1, 5), range(2, 4)]
+    chunks = []
+    for shard, in_shard in sharding.parts(spans):
+        for index in product(*in_shard):
+            assert sharding.place(index)[0] == shard
+            chunks.append(index)
+    assert sorted(chunks) == list(product(*spans))
+
+
+@pytest.mark.parametrize(
+    ("grid", "largest", "counts"),
+    [
+        ((4, 3, 5, 2), 1 << 20, (4, 3, 5, 2)),  # 120 MiB fit
+        ((4, 3, 5, 2), 1 << 25, (2, 3, 5, 2)),  # 3.8 GiB: half of the steps
+        ((4, 3, 5, 2), 1 << 27, (1, 1, 5, 2)),  # 15 GiB: a third of a layer, 1.3 GiB
+        ((4, 3, 5, 2), 1 << 29, (1, 1, 2, 2)),
+        ((4, 3, 5, 2), MAX_MEMBER // 2, (1, 1, 1, 2)),
+        ((4, 3, 5, 2), MAX_MEMBER, (1, 1, 1, 1)),  # no shard can hold such a tile
+        ((2, 1 << 7, 1 << 7, 1 << 7), 1, (1, 1 << 6, 1 << 7, 1 << 7)),  # 2^20 tiles
+    ],
+)
+def test_shards_stay_within_the_limits(grid, largest, counts) -> None:
+    sizes = np.ones(np.prod(grid), np.int64)
+    sizes[:] = largest - 64 if grid[0] == 4 else largest
+    assert shard_shape((1, 2, 3, 4), grid, sizes) == tuple(np.multiply((1, 2, 3, 4), counts))
+    order = shard_order(grid, (1, 1, 1, 1), counts)
+    if grid[0] == 4:
+        assert list(order) == list(product(*map(range, grid)))
+
+
+def test_the_largest_shard_decides() -> None:
+    sizes = np.ones((4, 2, 1, 1), np.int64)
+    sizes[2] = MAX_MEMBER // 2 - 100
+    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (4, 2, 1, 1)
+    sizes[3, 0] = 1000
+    assert shard_shape((1, 1, 1, 1), sizes.shape, sizes.ravel()) == (1, 2, 1, 1)

@@ -18,7 +18,7 @@ from fhash_formats.container import (
     read_metadata,
 )
 from fhash_formats.container.header import DEFAULTS, LOWEST, MASK_ARRAY, MISSING_ARRAY, STEPS
-from fhash_formats.container.variables import (
+from fhash_formats.container.hierarchy import (
     ARRAY,
     CONSOLIDATED,
     DIMENSIONS,
@@ -31,7 +31,7 @@ from fhash_formats.container.variables import (
 from fhash_formats.container.zip_file import FORMAT_VERSION
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.series import AXIS_NAMES
-from fhash_formats.support.number_types import DTYPES
+from fhash_formats.support.values import DTYPES
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
 

@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from forked import ended_well, forked, needs_fork
 
-from fhash_formats.container import fsspec_file
-from fhash_formats.container.fsspec_file import PAUSES, FsspecFile
+from fhash_formats.container import remote as fsspec_file
+from fhash_formats.container.remote import PAUSES, FsspecFile
 from fhash_formats.errors import (
     DamagedFileError,
     FhashWarning,

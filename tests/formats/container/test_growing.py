@@ -6,6 +6,7 @@ import errno
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,11 @@ from growing_file import (
     layer_values,
     streams_of,
 )
+from table_files import table_parts
 
 from fhash_formats.container import Container, ContainerWriter
-from fhash_formats.container.growing import GrowingContainer
+from fhash_formats.container import array as sharding
+from fhash_formats.container.growing import GrowingContainer, TableParts
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
 
 PROGRAM = Path(__file__).with_name("growing_file.py")
@@ -283,3 +286,27 @@ def test_a_full_disk_before_the_check_of_the_end_is_explained(tmp_path, monkeypa
         with pytest.raises(OutputError, match=r"a\.fhz: no space left.*the layers before"):
             add_layer(growing, 1)
     assert check_layers(tmp_path / "a.fhz") == 1
+
+
+@pytest.mark.parametrize("most", [1, 200])
+def test_a_table_beyond_a_member_is_cut_into_shards(tmp_path, samples, monkeypatch, most) -> None:
+    parts, header = table_parts(), samples.compact_header()
+
+    def written(name: str, parts: TableParts) -> Path:
+        with ContainerWriter(tmp_path / name) as writer:
+            parts.write(writer)
+            writer.commit({**header, "required_features": ["transform"]})
+        return tmp_path / name
+
+    whole = written("whole.fhz", parts)
+    monkeypatch.setattr(sharding, "MAX_MEMBER", most)
+    known = replace(parts, sizes=np.array([len(stream) for stream in parts.streams]))
+    paths = [written(f"{number}.fhz", each) for number, each in enumerate((parts, known))]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with Container.open(whole) as container, Container.open(paths[0]) as cut:
+        table, other = container.arrays["tables/level_1"], cut.arrays["tables/level_1"]
+        assert len(other.chunks) > len(table.chunks)
+        np.testing.assert_array_equal(table.read(), other.read())
+        for index in np.ndindex(table.grid):
+            assert table.coded_bytes(index) == other.coded_bytes(index) == len(other.coded(index))
+        assert cut.verify()

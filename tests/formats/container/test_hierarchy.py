@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
-from hostile_files import DOCUMENT, ROOT, edited, refused, replaced
+from hostile_files import DOCUMENT, ROOT, edited, read_everything, refused, replaced
+from numcodecs.zstd import compress
+from several_files import write_several
+from table_files import PLAIN, table_parts, write_table
 
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.array import ArrayMetadata, plain_codecs, with_crc32c
+from fhash_formats.container.hierarchy import free_node, part_place, shows_values
 from fhash_formats.errors import UnsupportedFileError
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.tile_format import TileSettings
 
 
 def extra_array(shape):
@@ -122,3 +132,230 @@ def test_a_newer_format_is_named_before_its_unknown_codecs(tmp_path, sample, sam
     refused(
         path, edited(path, samples, DOCUMENT, unknown), "feature 'teleport'", UnsupportedFileError
     )
+
+
+@pytest.mark.parametrize(
+    ("wish", "taken", "node"),
+    [
+        ("u", (), "u"),
+        ("u", ("u",), "u_2"),
+        ("u", ("u", "u_2"), "u_3"),
+        ("group/u", (), "group_u"),
+        ("wind speed (m/s)", (), "wind_speed_m_s_"),
+        ("velocity.x", (), "velocity_x"),
+        ("__u", (), "_u"),
+        ("\u00fc", (), "_"),
+        ("parts", (), "parts_2"),
+        ("u" * 300, (), "u" * 80),
+    ],
+)
+def test_names_at_the_root(wish, taken, node) -> None:
+    assert free_node(wish, taken) == node
+
+
+def test_places_of_parts_are_told_apart() -> None:
+    assert part_place(0, "mlp/weight_1") == "parts/0.mlp.weight_1"
+    places = [part_place(7, name) for name in ("a/b.c", "a.b/c", "a/b/c", "a.b.c")]
+    assert places == ["parts/7.a.b..c", "parts/7.a..b.c", "parts/7.a.b.c", "parts/7.a..b..c"]
+
+
+SHAPE = (4, 3, 4, 6)
+
+
+def table(dtype: str, settings: TileSettings | None) -> ArrayMetadata:
+    configuration = {} if settings is None else {"settings": settings.to_text()}
+    return ArrayMetadata(
+        shape=SHAPE,
+        dtype=np.dtype(dtype),
+        chunk_shape=SHAPE,
+        codecs=[{"name": "fhash.transform", "configuration": configuration}],
+    )
+
+
+def test_a_table_is_hidden_where_its_codec_lacks_something() -> None:
+    with_mask = replace(PLAIN, mask=MaskLevels())
+    assert shows_values(table("f4", PLAIN))
+    assert shows_values(table("i2", PLAIN))
+    assert shows_values(table("f4", with_mask))
+    assert not shows_values(table("i2", with_mask))
+    assert shows_values(table("f4", None))  # each tile has settings of its own
+    assert not shows_values(table("i2", None))
+    numbers = replace(table("f4", None), codecs=plain_codecs(np.dtype("f4")))
+    assert not shows_values(numbers)
+
+
+def test_one_variable_has_the_names_of_its_source(tmp_path, samples) -> None:
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        writer.begin({"name": "surface/rain rate", "units": "K", "attributes": {"flag": 1}})
+        assert writer.name_axes(["time", "z", "lat", "lat"], (4, 3, 5, 6)) == [
+            *("time", "z", "lat", "lat_2")
+        ]
+        writer.add_whole("coords/x", np.arange(6.0), attributes={"units": "m", "name": "lat"})
+        table_parts().write(writer)
+        header = samples.compact_header()
+        del header["coordinates"]["x"]
+        writer.commit(header)
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert list(container.arrays) == ["coords/x", "tables/level_1"]
+        table, x = container.arrays["tables/level_1"], container.coordinate("x")
+        assert (table.name, dict(table.attributes)) == ("surface_rain_rate", {"units": "K"})
+        assert table.dimension_names == ("time", "z", "lat_box", "lat_2")
+        assert (container.arrays["coords/x"].name, x.name) == ("lat_2", "lat")
+        assert container.coordinate("y").name == "lat"
+        assert (container.names, container.variable) == (["density"], None)
+        assert container.header["dimensions"] == ["time", "z", "lat", "lat_2"]
+
+
+def test_other_arrays_lie_with_the_parts(tmp_path, samples) -> None:
+    header = samples.header()
+    samples.write(tmp_path / "a.fhz", header, samples.arrays(header))
+    with Container.open(tmp_path / "a.fhz") as container:
+        paths = {name: array.name for name, array in container.arrays.items()}
+    assert paths["tables/level_1"] == "parts/0.tables.level_1"
+    assert paths["occupancy/bits"] == "parts/0.occupancy.bits"
+    assert paths["coords/x"] == "x"
+    assert "array" not in container.header
+
+
+def test_an_array_at_the_root_never_stands_for_one_of_the_format(tmp_path, samples) -> None:
+    """Its path is the name of another one, and it is of another shape."""
+    path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())
+    parts = samples.unpack(path.read_bytes())
+    document = json.loads(dict(parts)["values/zarr.json"])
+    document |= {"shape": [1, 2], "codecs": plain_codecs(np.dtype("f4"))}
+    del document["dimension_names"]
+    document["chunk_grid"]["configuration"]["chunk_shape"] = [1, 2]
+    coded = with_crc32c(compress(np.zeros((1, 2), "<f4"), 1))
+    added = [("key_frames/zarr.json", json.dumps(document).encode()), ("key_frames/c/0/0", coded)]
+    path.write_bytes(samples.pack([*added, *parts]))
+    with Container.open(path) as container:
+        assert set(container.arrays) == {"/key_frames", "tables/level_1"}
+        assert container.verify() == 2
+
+
+def change_first(key, value):
+    def change(root) -> None:
+        first = root["attributes"]["fhash"]["variables"][0]
+        if value is ...:
+            del first[key]
+        else:
+            first[key] = value
+
+    return change
+
+
+def change_root(key, value):
+    return lambda root: root["attributes"]["fhash"].update({key: value})
+
+
+ROOTS = {
+    "no list": (change_root("variables", {}), "variables is {}"),
+    "an empty list": (change_root("variables", []), "at least one variable"),
+    "a list of numbers": (change_root("variables", [1]), "a list of objects"),
+    "a name that is no text": (change_first("name", 5), "name is 5"),
+    "a name twice": (change_first("name", "w"), "a name that no other has"),
+    "an array in a group": (change_first("array", "a/b"), "a name of A-Z"),
+    "an array with a dot": (change_first("array", "a.b"), "a name of A-Z"),
+    "the group of parts": (change_first("array", "parts"), "a name of A-Z"),
+    "an array twice": (change_first("array", "w"), "variable 'w': .*array is 'w'"),
+    "an array that is not there": (change_first("array", "q"), "array tables/level_1 is missing"),
+    "no array": (change_first("array", ...), "array tables/level_1 is missing"),
+    "three dimensions": (change_first("dimensions", ["time", "z", "y"]), "four different"),
+    "a dimension twice": (change_first("dimensions", ["time", "z", "y", "y"]), "four different"),
+    "a dimension in a group": (
+        change_first("dimensions", ["time", "z", "y", "parts/u"]),
+        "four different",
+    ),
+    "a dimension that is a variable": (
+        change_first("dimensions", ["time", "z", "y", "w"]),
+        "four names that no variable has",
+    ),
+    "a dimension that is not there": (
+        change_first("dimensions", ["time", "z", "y", "q"]),
+        "array coords/x is missing",
+    ),
+    "a dimension of another length": (
+        change_first("dimensions", ["z", "time", "y", "lon_deg_"]),
+        "variable 'u': array coords/time is",
+    ),
+    "a feature that the root lacks": (change_root("required_features", []), "'u': .*transform"),
+    "a wrong header": (change_first("dilation", -1), "variable 'u': header key dilation"),
+    "a header of another box": (
+        change_first("feature_bounding_box", [[0, 3], [0, 5], [0, 6]]),
+        "variable 'u': .*levels",
+    ),
+    "shares that are a list": (change_first("shares", ["auxiliary/lat"]), "an object"),
+    "a shared table": (change_first("shares", {"tables/level_1": 2}), "auxiliary/..."),
+    "shares of no variable": (change_first("shares", {"auxiliary/a": 3}), "number of a variable"),
+    "shares of no number": (change_first("shares", {"auxiliary/a": "w"}), "number of a variable"),
+    "shares that are not there": (
+        change_first("shares", {"auxiliary/a": 2}),
+        "array parts/2.auxiliary.a is missing",
+    ),
+    "other documents at the root": (
+        lambda root: root["consolidated_metadata"]["metadata"]["u"].update(fill_value=1),
+        "consolidated_metadata has other documents",
+    ),
+    "a document less at the root": (
+        lambda root: root["consolidated_metadata"]["metadata"].pop("parts"),
+        "consolidated_metadata has other documents",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ROOTS)
+def test_headers_that_are_refused(tmp_path, samples, case) -> None:
+    path = write_several(tmp_path / "a.fhz", samples, paper=False)
+    change, message = ROOTS[case]
+    refused(path, edited(path, samples, ROOT, change), message)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("parts/3.a", "belongs to no variable"),
+        ("parts/00.a", "belongs to no variable"),
+        ("parts/u.a", "belongs to no variable"),
+        ("parts/0", "belongs to no variable"),
+        ("parts/0.", "belongs to no variable"),
+        ("parts/2.coords.x", "a coordinate, which lies at the root"),
+        ("parts/0.tables.level_1", "is already"),
+    ],
+)
+def test_arrays_that_belong_to_no_variable(tmp_path, samples, name, message) -> None:
+    path = write_several(tmp_path / "a.fhz", samples, paper=False)
+    parts = samples.unpack(path.read_bytes())
+    copies = [(n.replace("time/", f"{name}/"), d) for n, d in parts if n.startswith("time/")]
+    root = json.loads(parts[-1][1])
+    document = next(data for member, data in copies if member.endswith("zarr.json"))
+    root["consolidated_metadata"]["metadata"][name] = json.loads(document)
+    data = samples.pack([*copies, *parts[:-1], (ROOT, json.dumps(root).encode())])
+    refused(path, data, message)
+
+
+def test_an_array_of_another_name_is_ignored(tmp_path, samples) -> None:
+    path = write_several(tmp_path / "a.fhz", samples, paper=False)
+    parts = samples.unpack(path.read_bytes())
+    copies = [(n.replace("time/", "extra/"), data) for n, data in parts if n.startswith("time/")]
+    root = json.loads(parts[-1][1])
+    del root["consolidated_metadata"]
+    path.write_bytes(samples.pack([*copies, *parts[:-1], (ROOT, json.dumps(root).encode())]))
+    assert "extra" in read_everything(path)[1]
+
+
+def test_a_missing_chunk_of_any_variable_is_refused(tmp_path, samples) -> None:
+    path = write_several(tmp_path / "a.fhz", samples)
+    parts = samples.unpack(path.read_bytes())
+    for missing in ("w/c/0/0/0/0", "parts/0.auxiliary.area/c/0/0", "parts/3.key_frames/c/0"):
+        data = samples.pack([part for part in parts if part[0] != missing])
+        refused(path, data, "chunks|is missing")
+
+
+def test_an_unknown_feature_of_one_variable_is_told(tmp_path, samples) -> None:
+    path = write_several(tmp_path / "a.fhz", samples, paper=False)
+
+    def newer(root) -> None:
+        header = root["attributes"]["fhash"]
+        header["required_features"].append("teleport")
+
+    refused(path, edited(path, samples, ROOT, newer), "teleport", UnsupportedFileError)

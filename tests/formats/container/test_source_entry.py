@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_formats.container import describe_metadata, strict_json
+from fhash_formats.container import describe_metadata
+from fhash_formats.container import record as strict_json
 from fhash_formats.container.source_entry import MAX_BYTES, MAX_INLINE, check_source, read_metadata
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.series import Coordinate, index_coordinate
-from fhash_formats.source_metadata import SourceMetadata, SourceVariable
+from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
 
 SHAPE = [2, 1, 3, 4]
 

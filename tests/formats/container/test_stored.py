@@ -13,13 +13,13 @@ from sharded_files import NAME, random_values, write_sharded
 from table_files import HEAD, PLAIN
 
 from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter
-from fhash_formats.container.coding import transform_codecs
+from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.stored import Ahead, ChunkCache, StoredArray, chunks_after
 from fhash_formats.errors import DamagedFileError, RegionError
-from fhash_formats.support.number_types import DTYPES
-from fhash_formats.transform.head.head import NeighbourHead
-from fhash_formats.transform.tile.decoding import decode_tile
-from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.head import NeighbourHead
 
 
 def values_of(dtype, shape):

@@ -11,11 +11,12 @@ import pytest
 import zarr
 from sharded_files import NAME, PATH, random_values, write_sharded
 
-from fhash_formats.container import Container, coding
-from fhash_formats.container.coding import crc32c
+from fhash_formats.container import Container
+from fhash_formats.container import array as coding
+from fhash_formats.container.array import ABSENT
 from fhash_formats.container.remote import TAIL_BYTES
-from fhash_formats.container.sharding import ABSENT
 from fhash_formats.errors import DamagedFileError, InputError, RegionError
+from fhash_formats.native import crc32c
 from fhash_formats.support import threads as parallel
 
 CASES = {

@@ -1,4 +1,4 @@
-"""NetCDF: CF axes, packing and fill values, times without loss; every refusal."""
+"""Opening NetCDF files: groups, packed values, and the packing that a variable declares."""
 
 from __future__ import annotations
 
@@ -6,21 +6,100 @@ import os
 import sys
 from pathlib import Path
 
+import h5netcdf
 import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from stored_series import (
-    VALUES,
-    assert_frames,
-    frames,
-    save_netcdf,
-)
+from stored_series import VALUES, assert_frames, frames, save_netcdf
 
 from fhash_formats import list_variables, open_series
 from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.netcdf import close_groups, declared, magic_of, open_groups
 
 DIMS = ("time", "lev", "lat", "lon")
+
+
+def test_values_are_unpacked_unless_they_are_wanted_raw(tmp_path: Path) -> None:
+    path = save_netcdf(
+        tmp_path / "a.nc",
+        xr.Dataset({"v": (DIMS, VALUES)}),
+        encoding={"v": {"dtype": "i2", "scale_factor": 0.01, "_FillValue": -9}},
+    )
+    for raw, dtype in ((False, "f8"), (True, "i2")):
+        groups = open_groups(str(path), path, magic_of(path), raw=raw)
+        try:
+            array = groups["/"].variables["v"]
+            assert array.dtype == dtype
+            assert array.attrs.get("scale_factor") == (0.01 if raw else None)
+            packing = declared("a", array)
+            assert packing is not None
+            assert packing.scaled is not raw
+        finally:
+            close_groups(groups)
+
+
+def test_groups_of_a_file_are_all_opened(tmp_path: Path) -> None:
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
+    xr.Dataset({"w": (DIMS, VALUES * 2)}).to_netcdf(
+        path, mode="a", group="inner/most", engine="h5netcdf"
+    )
+    groups = open_groups(str(path), path, magic_of(path))
+    try:
+        assert {"/", "/inner/most"} <= set(groups)
+        np.testing.assert_array_equal(groups["/inner/most"]["w"].to_numpy(), VALUES * 2)
+    finally:
+        close_groups(groups)
+
+
+@pytest.fixture
+def grouped(tmp_path: Path) -> Path:
+    """A packed variable in a group, whose dimensions and coordinates are at the top."""
+    path = tmp_path / "grouped.nc"
+    with h5netcdf.File(path, "w") as root:
+        root.attrs["title"] = "top"
+        root.dimensions = {"time": 3, "lat": 4, "lon": 5, "bnds": 2}
+        time = root.create_variable("time", ("time",), "i4", data=np.array([0, 6, 18], "i4"))
+        time.attrs["units"] = "hours since 2000-01-01"
+        time.attrs["bounds"] = "time_bnds"
+        bounds = np.arange(6.0).reshape(3, 2)
+        root.create_variable("time_bnds", ("time", "bnds"), "f8", data=bounds)
+        lat = np.array([10, 20, 30, 40], "i2")
+        packed = root.create_variable("lat", ("lat",), "i2", data=lat)
+        packed.attrs["scale_factor"] = 0.5
+        group = root.create_group("inner")
+        group.attrs["title"] = "inner"
+        values = np.arange(60, dtype="i2").reshape(3, 4, 5)
+        density = group.create_variable("rho", ("time", "lat", "lon"), "i2", data=values)
+        density.attrs["scale_factor"] = np.float32(0.5)
+        density.attrs["units"] = "kg"
+    return path
+
+
+def test_a_variable_of_a_group_finds_what_is_around_it(grouped: Path) -> None:
+    with open_series(grouped) as series:
+        metadata = series.metadata
+        assert series.coords["y"].values.tolist() == [5, 10, 15, 20]
+    assert metadata.dimensions == {"time": "t", "lat": "y", "lon": "x"}
+    assert [each.name for each in metadata.variables] == ["time", "lat", "time_bnds"]
+    assert metadata.named("lat").values.tolist() == [10, 20, 30, 40]
+    assert metadata.named("lat").values.dtype == np.int16
+    assert metadata.named("time").attributes["bounds"] == "time_bnds"
+    assert metadata.attributes == {"title": "inner"}
+    assert metadata.variable_attributes == {"scale_factor": np.float32(0.5), "units": "kg"}
+    assert (metadata.stored, metadata.file) == ("int16", "grouped.nc")
+
+
+def test_steps_are_cut(grouped: Path) -> None:
+    with open_series(grouped, steps=slice(2, None, -2)) as series:
+        assert series.metadata.named("time").values.tolist() == [18, 0]
+        assert series.metadata.named("time_bnds").values.tolist() == [[4, 5], [0, 1]]
+
+
+def test_numbers_as_stored_have_no_packing(grouped: Path) -> None:
+    with open_series(grouped, raw_values=True) as series:
+        assert series.metadata.variable_attributes == {}
+        assert series.metadata.stored is None
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".nc4", ".cdf", ".netcdf", ".h5", ".data"])

@@ -1,4 +1,4 @@
-"""Opening a series of any format: recognition, refusals, steps, and the cost of the import."""
+"""Masks from files: any format and type, steps or one frame for all, and shapes that do not fit."""
 
 from __future__ import annotations
 
@@ -12,18 +12,92 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import zarr
 
 import fhash_formats
-from fhash_formats import RawLayout, open_series
+from fhash_formats import RawLayout, open_mask, open_series
 from fhash_formats.container.zip_file import ending
 from fhash_formats.errors import FhashError, InputError, MissingInputError, RegionError
 from fhash_formats.readers import REGISTRY
+
+MASK = np.random.default_rng(0).random((4, 3, 5, 6)) < 0.4
+
+
+def save(path: Path, values: np.ndarray) -> Path:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["mask"] = values
+    elif path.suffix == ".zarr":
+        zarr.create_array(path, shape=values.shape, dtype=values.dtype)[...] = values
+    else:
+        path = path.with_name(
+            f"m_{'x'.join(map(str, reversed(values.shape)))}_{values.dtype.name}.raw"
+        )
+        path.write_bytes(values.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".h5", ".zarr", ".raw"])
+@pytest.mark.parametrize("dtype", ["?", "u1", "i2", "f4"])
+def test_nonzero_is_true(tmp_path: Path, suffix: str, dtype: str) -> None:
+    if (suffix, dtype) == (".raw", "?"):
+        dtype = "u1"
+    values = (MASK * (-3 if dtype in ("i2", "f4") else 1)).astype(dtype)
+    mask = open_mask(save(tmp_path / f"m{suffix}", values), MASK.shape)
+    for step, expected in enumerate(MASK):
+        frame = mask(step)
+        assert frame.dtype == bool
+        np.testing.assert_array_equal(frame, expected)
+    mask.close()
+
+
+def test_one_frame_serves_every_step(tmp_path: Path) -> None:
+    for values in (MASK[0], MASK[:1]):
+        mask = open_mask(save(tmp_path / "m.npy", values), (9, 3, 5, 6))
+        np.testing.assert_array_equal(mask(0), MASK[0])
+        np.testing.assert_array_equal(mask(8), MASK[0])
+
+
+def test_nan_is_false(tmp_path: Path) -> None:
+    values = np.where(MASK, 1.0, 0.0)
+    values[0, 0, 0, :2] = np.nan
+    mask = open_mask(str(save(tmp_path / "m.npy", values)), MASK.shape)
+    np.testing.assert_array_equal(mask(0), np.nan_to_num(values[0]) != 0)
+
+
+def test_a_mask_among_others_is_named(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file["a"], file["b"] = MASK, ~MASK
+    with pytest.raises(InputError, match="2 variables"):
+        open_mask(tmp_path / "m.h5", MASK.shape)
+    np.testing.assert_array_equal(open_mask(tmp_path / "m.h5", MASK.shape, var="b")(1), ~MASK[1])
+
+
+@pytest.mark.parametrize("shape", [(5, 3, 5, 6), (2, 3, 5, 6), (4, 3, 5, 7), (4, 6, 5, 3)])
+def test_another_shape_is_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match=r"the mask has shape \(4, 3, 5, 6\).*the series \("):
+        open_mask(save(tmp_path / "m.npy", MASK), shape)
+
+
+def test_other_types_and_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="complex"):
+        open_mask(save(tmp_path / "m.npy", MASK.astype(complex)), MASK.shape)
+    with pytest.raises(MissingInputError):
+        open_mask(tmp_path / "none.npy", MASK.shape)
+
+
+def test_a_mask_is_not_asked_for_its_axes(tmp_path: Path) -> None:
+    mask = np.ones((16, 24, 24, 3), bool)
+    np.testing.assert_array_equal(open_mask(save(tmp_path / "m.npy", mask), mask.shape)(3), mask[3])
+
 
 VALUES = np.random.default_rng(0).normal(size=(7, 2, 3, 4)).astype(np.float32)
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path_registry(tmp_path: Path) -> Path:
     np.save(tmp_path / "a.npy", VALUES)
     return tmp_path / "a.npy"
 
@@ -112,8 +186,8 @@ def test_a_raw_layout_is_for_files(tmp_path: Path) -> None:
         slice(6, 1, -2),
     ],
 )
-def test_steps_are_a_slice(path: Path, steps: slice) -> None:
-    with open_series(path, steps=steps) as series:
+def test_steps_are_a_slice(path_registry: Path, steps: slice) -> None:
+    with open_series(path_registry, steps=steps) as series:
         np.testing.assert_array_equal(np.stack(list(series.frames())), VALUES[steps])
         np.testing.assert_array_equal(series.coords["t"].values, np.arange(7)[steps])
 
@@ -122,30 +196,30 @@ def test_steps_are_a_slice(path: Path, steps: slice) -> None:
     ("steps", "words"),
     [(slice(0, 5, 0), "stride of 0"), (slice(3, 3), "empty"), (slice(10, 20), "empty")],
 )
-def test_steps_that_select_nothing(path: Path, steps: slice, words: str) -> None:
+def test_steps_that_select_nothing(path_registry: Path, steps: slice, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        open_series(path, steps=steps)
+        open_series(path_registry, steps=steps)
 
 
 @pytest.mark.parametrize("step", [-1, 7])
-def test_a_step_outside_the_series(path: Path, step: int) -> None:
-    with open_series(path) as series, pytest.raises(RegionError, match=r"outside 0\.\.6"):
+def test_a_step_outside_the_series(path_registry: Path, step: int) -> None:
+    with open_series(path_registry) as series, pytest.raises(RegionError, match=r"outside 0\.\.6"):
         series.read(step)
 
 
 @pytest.mark.parametrize("axes", ["z,y,x", "x", "t,y"])
-def test_axes_of_another_number(path: Path, axes: str) -> None:
+def test_axes_of_another_number(path_registry: Path, axes: str) -> None:
     with pytest.raises(InputError, match="the array has 4 dimensions"):
-        open_series(path, axes=axes)
+        open_series(path_registry, axes=axes)
 
 
-def refusal(path: Path) -> str:
+def refusal(path_registry: Path) -> str:
     """The message of the FhashError that reading a whole series raises, "" where it reads.
 
     Any other error passes.
     """
     try:
-        with open_series(path) as series:
+        with open_series(path_registry) as series:
             list(series.frames())
     except FhashError as error:
         return str(error)
@@ -195,10 +269,10 @@ def test_an_import_is_cheap() -> None:
 
 @pytest.mark.parametrize("suffix", [".npy", ".h5", ".nc", ".zip"])
 def test_a_raw_layout_is_not_for_files_of_another_format(
-    path: Path, tmp_path: Path, suffix: str
+    path_registry: Path, tmp_path: Path, suffix: str
 ) -> None:
     named = tmp_path / f"named{suffix}"
-    named.write_bytes(path.read_bytes())
+    named.write_bytes(path_registry.read_bytes())
     for layout in (
         RawLayout(dtype="f4"),
         RawLayout({"x": 1, "y": 1, "z": 1}),
@@ -279,8 +353,8 @@ def test_wishes_that_a_format_has_no_use_for_are_refused(
         head = b"ObjectType = Image\nNDims = 3\nDimSize = 4 3 2\nElementType = MET_FLOAT\n"
         head += b"ElementDataFile = LOCAL\n"
         (tmp_path / name).write_bytes((head if suffix == "mha" else b"") + VALUES[0].tobytes())
-    path = tmp_path / (f"*.{suffix}" if pattern else name)
-    open_series(path).close()
+    path_registry = tmp_path / (f"*.{suffix}" if pattern else name)
+    open_series(path_registry).close()
     wishes: list[tuple[dict[str, Any], str]] = [
         ({"raw_values": True}, "--raw-values cannot be used, .* hold no packed numbers"),
         ({"select": {"a": 1}}, "--select a=1"),
@@ -289,10 +363,10 @@ def test_wishes_that_a_format_has_no_use_for_are_refused(
         for use in (open_series, fhash_formats.list_variables):
             if use is open_series or suffix != "npy" or "select" not in wish:
                 with pytest.raises(InputError, match=message):
-                    use(path, **wish)
+                    use(path_registry, **wish)
 
 
-def test_missing_numbers_that_occur_are_noted(path: Path, tmp_path: Path) -> None:
+def test_missing_numbers_that_occur_are_noted(path_registry: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "b.npy", np.array([[[1, 2, 300]]], "i2").repeat(2, axis=0))
     np.save(tmp_path / "c.npy", np.array([[[1, 2, -9]]], "i2").repeat(2, axis=0))
     (tmp_path / "a.npy").unlink()

@@ -12,7 +12,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, GzipCodec, TransposeCodec
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.file_series import Request
 from fhash_formats.readers.zarr_coded import coded_names, open_coded
 from fhash_formats.transform.chunk import decode_chunk
 from fhash_formats.transform.zarr_codec import TransformCodec

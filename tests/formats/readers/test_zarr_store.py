@@ -1,4 +1,4 @@
-"""Zarr of both formats, in folders and ZIPs: groups, dimension names, chunks; every refusal."""
+"""Groups and arrays of a zarr hierarchy: in a folder, in a ZIP, and those that cannot be opened."""
 
 from __future__ import annotations
 
@@ -14,16 +14,106 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from stored_series import (
-    VALUES,
-    assert_frames,
-    create_zarr,
-    frames,
-    zipped,
-)
+from stored_series import VALUES, assert_frames, create_zarr, frames, zipped
 
 from fhash_formats import list_variables, open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.zarr_store import (
+    metadata_file,
+    nodes_in_folder,
+    nodes_in_zip,
+    open_arrays,
+)
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_nodes_of_a_folder_and_of_its_zip(tmp_path: Path, zarr_format: int) -> None:
+    folder = tmp_path / "a.zarr"
+    group = zarr.open_group(folder, mode="w", zarr_format=zarr_format)
+    group.create_group("in").attrs["time"] = 2.5
+    create_zarr(folder, VALUES, name="in/v", zarr_format=zarr_format)
+    assert metadata_file(folder) is not None
+    assert metadata_file(tmp_path) is None
+    assert list(nodes_in_folder(folder)) == ["in", "in/v"]
+    for inside in ("", "a.zarr/"):
+        archive = zipped(folder, tmp_path / "a.zip", inside=inside)
+        place, nodes = nodes_in_zip("a", archive)
+        assert (place, nodes) == (inside.rstrip("/"), ["", "in", "in/v"])
+    store = zarr.storage.LocalStore(folder, read_only=True)
+    arrays, groups, failed = open_arrays(store, "", ["", "in", "in/v", "none"])
+    assert list(arrays) == ["in/v"]
+    assert groups["in"] == {"time": 2.5}
+    assert list(failed) == ["none"]
+
+
+def test_a_zip_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "a.txt").write_text("words")
+    archive = zipped(tmp_path / "folder", tmp_path / "a.zip")
+    with pytest.raises(InputError, match="holds no zarr hierarchy"):
+        nodes_in_zip("a", archive)
+
+
+def dataset() -> xr.Dataset:
+    values = np.linspace(0, 9, 60).reshape(3, 4, 5)
+    values[0, 1, 2] = np.nan
+    return xr.Dataset(
+        {
+            "u": (("time", "lat", "lon"), values, {"units": "K", "grid_mapping": "crs"}),
+            "crs": ((), np.int32(0), {"grid_mapping_name": "latitude_longitude"}),
+            "lat_bnds": (("lat", "bnds"), np.arange(8, dtype="f4").reshape(4, 2)),
+        },
+        {
+            "time": ("time", np.array([0, 2, 3]), {"units": "days since 2000-01-01"}),
+            "lat": ("lat", np.arange(4, dtype="f4"), {"bounds": "lat_bnds", "levels": [1, 2]}),
+            "lon": ("lon", np.arange(5, dtype="i2")),
+            "slope": (("lat", "lon"), np.full((4, 5), np.nan, dtype="f4")),
+            "label": ("time", np.array(["a", "bb", "ö"], dtype=object)),
+        },
+        {"title": "a store"},
+    )
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+@pytest.mark.parametrize("group", [None, "inner"])
+def test_a_store_gives_what_was_written(tmp_path: Path, zarr_format: int, group: str) -> None:
+    path = tmp_path / "a.zarr"
+    packing = {"dtype": "int16", "scale_factor": 0.5, "_FillValue": -9}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of texts that are not yet in the specification
+        dataset().to_zarr(
+            path,
+            group=group,
+            zarr_format=zarr_format,
+            encoding={"u": packing, "slope": {"_FillValue": np.float32(-1)}},
+        )
+    with open_series(path, var="u" if group is None else f"{group}/u") as series:
+        metadata = series.metadata
+    assert metadata.dimensions == {"time": "t", "lat": "y", "lon": "x"}
+    assert (metadata.stored, metadata.file, metadata.digest) == ("int16", "a.zarr", None)
+    assert metadata.attributes == {"title": "a store"}
+    assert metadata.variable_attributes["_FillValue"] == -9
+    assert metadata.variable_attributes["grid_mapping"] == "crs"
+    found = {each.name: each for each in metadata.variables}
+    assert set(found) == {"time", "lat", "lon", "slope", "label", "crs", "lat_bnds"}
+    for name, one in found.items():
+        wanted = dataset()[name]
+        assert one.dimensions == wanted.dims
+        assert one.values.dtype == wanted.dtype
+        if name != "slope":
+            np.testing.assert_array_equal(one.values, wanted.values)
+    assert found["slope"].attributes["_FillValue"] == np.float32(-1)
+    assert (found["slope"].values == -1).all()
+    others = {key: value for key, value in found["lat"].attributes.items() if key != "_FillValue"}
+    assert others == {"bounds": "lat_bnds", "levels": [1, 2]}
+
+
+def test_an_array_without_names_has_no_source(tmp_path: Path) -> None:
+    root = zarr.open_group(tmp_path / "a.zarr", mode="w")
+    root.create_array("u", data=np.ones((2, 3, 4, 5)))
+    with open_series(tmp_path / "a.zarr") as series:
+        assert series.metadata is None
+
 
 DIMS = ["time", "z", "y", "x"]
 

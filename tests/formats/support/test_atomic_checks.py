@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
-from fhash_formats.support import atomic
-from fhash_formats.support.atomic import check_output
+from fhash_formats.support import files as atomic
+from fhash_formats.support.files import check_output
 
 
 def store(path: Path, text: str = "old") -> Path:

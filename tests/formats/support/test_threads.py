@@ -1,4 +1,4 @@
-"""Work in threads: order, failures, shares, calls within calls, and processes that fork."""
+"""A lock that is free in a forked process."""
 
 from __future__ import annotations
 
@@ -6,24 +6,131 @@ import gc
 import threading
 import weakref
 from collections.abc import Iterator, Sequence
+from math import prod
 
+import numpy as np
 import pytest
 from forked import ended_well, forked, needs_fork
+from hypothesis import given
+from hypothesis import strategies as st
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support import threads as parallel
 from fhash_formats.support.threads import (
     ITEMS_PER_THREAD,
     PART,
     SHARES_PER_THREAD,
+    ForkLock,
     at_most,
+    chunk_region,
+    common_part,
     in_threads,
     map_ahead,
+    region_bounds,
     row_parts,
     share_out,
+    slab_shape,
     thread_pool,
     usable_threads,
 )
+
+
+def test_one_thread_at_a_time_holds_it() -> None:
+    lock, entered, released = ForkLock(), threading.Event(), []
+
+    def wait() -> None:
+        entered.set()
+        with lock:
+            released.append(len(released))
+
+    with lock:
+        thread = threading.Thread(target=wait)
+        thread.start()
+        entered.wait()
+        thread.join(0.05)
+        assert released == []
+    thread.join()
+    assert released == [0]
+
+
+@needs_fork
+def test_a_forked_process_finds_it_free_although_a_thread_of_its_parent_holds_it() -> None:
+    lock, held, over = ForkLock(), threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with lock:
+            held.set()
+            over.wait()
+
+    def take() -> bool:
+        with lock:
+            return True
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    held.wait()
+    taken = ended_well(forked(take))
+    over.set()
+    thread.join()
+    assert taken
+
+
+@pytest.mark.parametrize(
+    ("shape", "itemsize", "limit", "chunk"),
+    [
+        ((10,), 8, 2**21, (10,)),
+        ((4, 100, 100, 100), 2, 2**21, (1, 100, 100, 100)),
+        ((4, 100, 100, 100), 4, 2**21, (1, 50, 100, 100)),
+        ((1, 1, 2048, 1024), 4, 2**21, (1, 1, 512, 1024)),
+        ((3, 2**30), 1, 2**21, (1, 2**21)),
+        ((5, 5), 8, 1, (1, 1)),
+        ((), 8, 100, ()),
+        ((3, 0, 2), 8, 100, (3, 0, 2)),
+    ],
+)
+def test_slabs(shape: tuple[int, ...], itemsize: int, limit: int, chunk: tuple[int, ...]) -> None:
+    assert slab_shape(shape, itemsize, limit) == chunk
+
+
+@given(
+    st.lists(st.integers(1, 10**6), max_size=5),
+    st.sampled_from([1, 2, 4, 8]),
+    st.integers(8, 10**9),
+)
+def test_slabs_keep_the_limit_and_use_it(shape: list[int], itemsize: int, limit: int) -> None:
+    chunk = slab_shape(shape, itemsize, limit)
+    size = prod(chunk) * itemsize
+    assert size <= limit
+    assert all(1 <= part <= whole for part, whole in zip(chunk, shape, strict=True))
+    assert size == prod(shape) * itemsize or size > limit / 4
+
+
+@given(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 5)), min_size=1, max_size=3))
+def test_regions_of_chunks_tile_the_array(axes: list[tuple[int, int]]) -> None:
+    shape, chunk = (tuple(column) for column in zip(*axes, strict=True))
+    covered = np.zeros(shape, dtype=int)
+    for index in np.ndindex(*(-(-n // c) for n, c in axes)):
+        covered[chunk_region(index, chunk, shape)] += 1
+    np.testing.assert_array_equal(covered, 1)
+
+
+def test_the_common_parts_of_all_chunks_make_the_region() -> None:
+    values = np.arange(5 * 7).reshape(5, 7)
+    bounds, chunk = [(1, 5), (2, 6)], (2, 3)
+    region = np.zeros((4, 4), int)
+    for index in np.ndindex(3, 2):
+        in_region, in_chunk = common_part(index, chunk, bounds)
+        region[in_region] += values[chunk_region(index, chunk, values.shape)][in_chunk]
+    np.testing.assert_array_equal(region, values[1:5, 2:6])
+
+
+def test_bounds_of_a_region() -> None:
+    assert region_bounds((slice(None), slice(1, 3, 1)), (4, 5), "a") == [(0, 4), (1, 3)]
+    for region in [(slice(0, 5),), (slice(2, 1),), (slice(0, 4, 2),), (slice(-1, 2),)]:
+        with pytest.raises(RegionError, match=r"a: .* within 0\.\.4"):
+            region_bounds(region, (4,), "a")
+    with pytest.raises(RegionError, match="2 axes; the array has 1"):
+        region_bounds((slice(0, 1), slice(0, 1)), (4,), "a")
 
 
 def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.head.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
 
 Floats = npt.NDArray[np.float32]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fhash_formats.transform.entropy.predictor import Predictor, passes_of
+from fhash_formats.transform.predict import Predictor, passes_of
 
 Four = tuple[int, int, int, int]
 

@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fhash_formats.transform.axes.basis import fit_basis
-from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
+from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec, fit_basis
 
 Depths = TypeVar("Depths", int, tuple[int, ...])
 

@@ -18,8 +18,8 @@ from zarr.codecs.numcodecs import FixedScaleOffset
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.tile.encoding import encode_tile
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 WAVES = spec_of(("haar", "9/7", "9/7", "9/7"), 1, (2, 2, 2, 2))

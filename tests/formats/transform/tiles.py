@@ -10,8 +10,8 @@ import numpy.typing as npt
 from specs import spec_of
 
 from fhash_formats.native import crc32c
-from fhash_formats.transform.tile.encoding import Coding, encode_tile, exact_tile
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.encoding import Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile_format import TileSettings
 
 Values = npt.NDArray[Any]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fhash_formats.transform.entropy.table import Table
+from fhash_formats.transform.coder import Table
 
 NEXT = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]])
 """FORMAT.md, Two quantisers."""

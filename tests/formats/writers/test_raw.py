@@ -1,4 +1,4 @@
-"""Bare values: a name that says the layout, or a NRRD header beside them."""
+"""NumPy's .npy: the same bytes as NumPy writes, half precision included."""
 
 from __future__ import annotations
 
@@ -7,10 +7,30 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labelled_region import DATA as DATA_NPY
+from labelled_region import labelled_region
 
 from fhash_formats import Region, open_series, save_region
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.series import Coordinate
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "i2"])
+def test_the_file_is_the_one_that_numpy_writes(tmp_path: Path, dtype: str) -> None:
+    values = np.nan_to_num(DATA_NPY * 10).astype(dtype)
+    region = labelled_region(dtype=np.dtype(dtype))
+    (path,) = save_region(tmp_path / "out.npy", region, iter(values))
+    np.save(tmp_path / "expected.npy", values)
+    assert path.read_bytes() == (tmp_path / "expected.npy").read_bytes()
+
+
+def test_values_of_the_other_byte_order_are_swapped(tmp_path: Path) -> None:
+    values = DATA_NPY.astype(">f4")
+    (path,) = save_region(tmp_path / "out.npy", labelled_region(dtype=values.dtype), iter(values))
+    stored = np.load(path)
+    assert stored.dtype == np.dtype("<f4")
+    np.testing.assert_array_equal(stored, values)
+
 
 POSITIONS = {
     "t": [347921.000277, 347922.0],

@@ -16,19 +16,27 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container import Container
-from fhash_formats.container.coding import TRANSFORM
-from fhash_formats.transform.axes.bands import band_table
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.coder import encode_integers
-from fhash_formats.transform.entropy.labels import encode_labels
-from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
-from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
-from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
-from fhash_formats.transform.entropy.prior import prior_state
-from fhash_formats.transform.entropy.table import Table, single_band
-from fhash_formats.transform.entropy.trellis import choose_levels
-from fhash_formats.transform.tile.sections import TRANSFORMED, parse_stream
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.container.array import TRANSFORM
+from fhash_formats.transform.coder import (
+    Table,
+    encode_integers,
+    encode_labels,
+    encode_mask,
+    mask_prior_state,
+    prior_state,
+    single_band,
+)
+from fhash_formats.transform.encoding import choose_levels
+from fhash_formats.transform.lifting import band_table
+from fhash_formats.transform.predict import (
+    Predictor,
+    blank_state,
+    encode_predicted,
+    pass_arrays,
+    passes_of,
+)
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile_format import TRANSFORMED, TileSettings, parse_stream
 
 GOLDENS = Path(__file__).parents[2] / "golden"
 NAMES = (

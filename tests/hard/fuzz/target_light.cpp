@@ -1,5 +1,5 @@
 // The light that passes the volume, with hostile values. The numbers of a table are finite, and the
-// steps are those of fhash_codec/rendering/task/light.py.
+// steps are those of fhash_codec/rendering/light.py.
 #include <algorithm>
 #include <cmath>
 

@@ -1,5 +1,5 @@
 // Points of the paper's network, of any size, at positions in the box. Python makes tables and
-// layers (fhash_codec/paper/points.py); the positions are a user's.
+// layers (fhash_codec/paper/model.py); the positions are a user's.
 #include <algorithm>
 #include <cmath>
 #include <cstring>

@@ -1,5 +1,5 @@
 // Values smoothed for shading, and factors of opacity by gradient, as
-// fhash_codec/rendering/task/bricks.py and slopes.py ask for them: values are finite or NaN,
+// fhash_codec/rendering/bricks.py and slopes.py ask for them: values are finite or NaN,
 // weights add up to 1, and factors are from 0 to 1.
 #include <algorithm>
 #include <cmath>

@@ -1,5 +1,5 @@
 // Training of the head, with voxels and learning rates at the limits that the sampling sets
-// (fhash_codec/compact/choices/head_samples.py).
+// (fhash_codec/compact/head_training.py).
 #include <algorithm>
 #include <cmath>
 

@@ -23,10 +23,10 @@ from fhash_codec.bench.paper.sets import (
     hash_table,
     scaled,
 )
-from fhash_codec.coreset.boxes import Sizes
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import ceil_log, level_resolutions
-from fhash_codec.paper.training.train import TrainingPlan
+from fhash_codec.boxes import Sizes
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.network import ceil_log, level_resolutions
+from fhash_codec.paper.train import TrainingPlan
 
 
 def build(

@@ -15,7 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from fhash_codec.paper.architecture import Resolution
+from fhash_codec.paper.network import Resolution
 
 PRIMES = (805459861, 2654435761, 1)
 """Factors of the corner's z, y and x in the spatial hash (Müller et al. 2022, equation 4)."""

@@ -20,9 +20,8 @@ from torch import Tensor
 from fhash_codec.bench.paper.encodings.corners import Level
 from fhash_codec.bench.paper.encodings.encoding import EMBEDDING_SIZE, HIDDEN_LAYERS, WIDTH
 from fhash_codec.bench.paper.encodings.places import sample_places
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.engines.initial import SPREAD
-from fhash_codec.training.adam import adam_step
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.engines.parameters import SPREAD, adam_step
 
 CHUNK = 1 << 15
 """Samples of a batch that pass through the tables and the network at a time."""

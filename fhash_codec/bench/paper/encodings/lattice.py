@@ -13,9 +13,9 @@ from torch import Tensor
 from fhash_codec.bench.paper.encodings.corners import GridLevel
 from fhash_codec.bench.paper.encodings.encoding import EMBEDDING_SIZE, HIDDEN_LAYERS, WIDTH
 from fhash_codec.bench.paper.encodings.places import sample_places
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture, parameter_count
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_codec.paper.network import Architecture, parameter_count
 
 CHUNK = 1 << 15
 """Points that are evaluated at a time."""

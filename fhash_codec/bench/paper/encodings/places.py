@@ -8,7 +8,7 @@ from math import prod
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.features.bricks import Coreset
 
 
 def sample_places(coreset: Coreset) -> npt.NDArray[np.int32]:

@@ -14,8 +14,8 @@ from torch import Tensor
 from fhash_codec.bench.paper.encodings.encoding import EMBEDDING_SIZE, HIDDEN_LAYERS, WIDTH
 from fhash_codec.bench.paper.encodings.places import sample_places
 from fhash_codec.bench.paper.sets import hash_resolutions, hash_table, tcnn_network, tcnn_tables
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.training.adam import adam_step
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.engines.parameters import adam_step
 from fhash_formats.errors import MissingDependencyError
 
 CHUNK = 1 << 18

@@ -14,8 +14,8 @@ from torch import Tensor
 from fhash_codec.bench.paper.data import Data
 from fhash_codec.bench.paper.encodings.encoding import Values
 from fhash_codec.bench.paper.encodings.places import sample_places
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.training.train import TrainingPlan
+from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.train import TrainingPlan
 
 
 class Model(Protocol):

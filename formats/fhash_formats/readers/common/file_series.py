@@ -1,24 +1,313 @@
-"""A series in a file: frames come out as (z, y, x), whatever the order of the file's dimensions."""
+"""Series in a file: the user's request, errors of reading, coordinates with units."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf_packing import Packing, missing_values, note_packing
-from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.times import settled
-from fhash_formats.series import AXES, Coordinate, NotStored, Series, check_values, index_coordinate
-from fhash_formats.source_metadata import plain_form
-from fhash_formats.support.attributes import plain_text
+from fhash_formats.errors import FhashError, InputError, MissingDependencyError
+from fhash_formats.readers.common.cf import Packing, missing_values, note_packing, settled
+from fhash_formats.series import (
+    AXES,
+    Coordinate,
+    NotStored,
+    Series,
+    check_values,
+    index_coordinate,
+    plain_form,
+)
+from fhash_formats.support.values import plain_text
+
+DTYPES = {
+    f"{kind}{8 * size}": f"{letter}{size}"
+    for kind, letter in (("uint", "u"), ("int", "i"))
+    for size in (1, 2, 4, 8)
+}
+DTYPES |= {f"float{8 * size}": f"f{size}" for size in (2, 4, 8)}
+"""Number types of raw files by long name; the short names are the values."""
+
+ENDIANS: dict[str, Literal["<", ">"]] = {"little": "<", "big": ">"}
+
+
+def parse_dtype(text: str) -> np.dtype[Any]:
+    """The number type of a long or short name ("float32", "f4"), in native byte order.
+
+    Raises InputError for any other name.
+    """
+    short = DTYPES.get(text.lower(), text.lower())
+    if short not in DTYPES.values():
+        raise InputError(
+            f"'{text}' is not a number type; allowed: {', '.join(DTYPES)} or short, such as f4 and"
+            " u1"
+        )
+    return np.dtype(short)
+
+
+def parse_shape(text: str) -> dict[str, int]:
+    """Lengths by axis from text such as "x=64,y=64,z=32,t=10", in the order given.
+
+    Raises InputError for text of another form.
+    """
+    shape: dict[str, int] = {}
+    for part in text.split(","):
+        axis, equals, length = (word.strip() for word in part.partition("="))
+        if (
+            axis not in AXES
+            or not equals
+            or not length.isascii()
+            or not length.isdigit()
+            or axis in shape
+        ):
+            raise InputError(
+                f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as"
+                " x=64,y=64,z=32,t=10"
+            )
+        shape[axis] = int(length)
+    return shape
+
+
+def parse_axes(text: str) -> tuple[str, ...]:
+    """The axis of each dimension of the file from text such as "t,z,y,x", in any case.
+
+    Raises InputError for text of another form.
+    """
+    letters = tuple(word.strip().lower() for word in text.split(","))
+    if not set(letters) <= set(AXES) or len(set(letters)) != len(letters):
+        raise InputError(
+            f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and"
+            " x, such as t,z,y,x"
+        )
+    return letters
+
+
+def selection(select: Mapping[str, int | str] | None) -> tuple[tuple[str, str], ...]:
+    """Pairs of names and indices, as `Request` holds them."""
+    return tuple((str(name), str(index)) for name, index in (select or {}).items())
+
+
+def inside_folder(path: Path, file: Path) -> None:
+    """Raise InputError if a file that another one refers to is outside the folder of that.
+
+    Links of the file system are followed.
+    """
+    if not file.resolve().is_relative_to(path.parent.resolve()):
+        raise InputError(
+            f"{path} refers to {file}, which is outside its folder; without --no-external"
+            " (no_external=True) it is read"
+        )
+
+
+@dataclass(frozen=True)
+class RawLayout:
+    """Layout of a headerless file; the file's name replaces what is None.
+
+    Attributes:
+        shape: lengths by axis, for at least three of t, z, y, x; axes left out have length 1. x is
+            the fastest in the file, then y, z, t.
+        dtype: a key or value of DTYPES.
+        endian: "little" (also where neither this nor the name says) or "big".
+
+    Raises InputError for a value that is not allowed.
+    """
+
+    shape: Mapping[str, int] | None = None
+    dtype: str | None = None
+    endian: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.shape is not None:
+            if not set(self.shape) <= set(AXES) or len(self.shape) < 3:
+                raise InputError(
+                    f"raw shape names {', '.join(self.shape) or 'no axis'}; name three or four of"
+                    " t, z, y, x, as in x=64,y=64,z=32"
+                )
+            for axis, length in self.shape.items():
+                if length < 1:
+                    raise InputError(f"raw shape: {axis}={length}; a length is at least 1")
+        if self.dtype is not None:
+            parse_dtype(self.dtype)
+        if self.endian is not None and self.endian not in ENDIANS:
+            raise InputError(f"byte order '{self.endian}'; allowed: {', '.join(ENDIANS)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """A request to a reader: name of the variable, axes of its dimensions, layout of raw bytes.
+
+    None stands for what was not said.
+
+    Attributes:
+        booleans: lets boolean arrays through (for masks), as the numbers 0 and 1.
+        missing: numbers that stand for missing values, besides those that the file declares. They
+            are compared with the values after unpacking; `open_series` sees to it for all formats.
+        raw_values: the numbers are read as stored; fill values, scale and offset are not applied.
+        select: for dimensions that are no axis, (name, index) as texts; see layout.py.
+        keep_extremes: extreme values that repeat are data, see `Series`.
+        digested: the digest of the file is taken where its metadata are asked for.
+        no_external: no file outside the folder of the one that is read may be read for it.
+        asked: a last dimension that may hold components is asked about; else it is x.
+    """
+
+    var: str | None = None
+    axes: tuple[str, ...] | None = None
+    raw: RawLayout | None = None
+    booleans: bool = False
+    missing: tuple[float, ...] = ()
+    raw_values: bool = False
+    select: tuple[tuple[str, str], ...] = ()
+    keep_extremes: bool = False
+    asked: bool = True
+    digested: bool = True
+    no_external: bool = False
+
+    def require_inside(self, path: Path, *files: Path) -> None:
+        """Raise InputError if a file refers to others that may not be read; see `no_external`."""
+        if self.no_external:
+            for file in files:
+                inside_folder(path, file)
+
+    def refuse_var(self, source: str) -> None:
+        """Raise InputError if a variable was named for a format that has none."""
+        if self.var is not None:
+            raise InputError(
+                f"{source}: --var {self.var} cannot be used, this format holds one array without a"
+                " name"
+            )
+
+
+LONGEST_MESSAGE = 240
+"""Characters kept of a library's message; HDF5 and zarr write paragraphs."""
+
+
+def condense(error: BaseException) -> str:
+    """A library's message on one line, cut to a length that a terminal shows.
+
+    The name of the error's type stands for an empty message.
+    """
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 3] + "..."
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Turn any error of a library on damaged or unsuitable data into an InputError "what: message".
+
+    The catch is wide on purpose: on the same broken file h5py raises OSError, RuntimeError or
+    KeyError, and zarr whatever its codecs raise. Errors of this project and a lack of memory pass.
+    """
+    try:
+        yield
+    except (FhashError, MemoryError):
+        raise
+    except Exception as error:
+        raise InputError(f"{what}: {condense(error)}") from error
+
+
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Put the name of a file before each message of this project that is raised inside.
+
+    Errors of libraries become InputError, as in `refusing`.
+    """
+    try:
+        with refusing(f"{source} cannot be read"):
+            yield
+    except (InputError, MissingDependencyError) as error:
+        if source in str(error):
+            raise
+        raise type(error)(f"{source}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """Size, time of change and identity of a file when it was opened.
+
+    Readers check it around every frame.
+    """
+
+    path: Path
+    size: int
+    changed: int
+    identity: int
+
+    @classmethod
+    def of(cls, path: Path) -> Stamp:
+        """The stamp of a file as it is now; raises InputError if it is gone."""
+        with refusing(f"{path} cannot be read"):
+            found = os.stat(path)
+        return cls(path, found.st_size, found.st_mtime_ns, found.st_ino)
+
+    def check(self) -> None:
+        """Raise InputError if the file has changed, so that frames of two states never mix."""
+        now = Stamp.of(self.path)
+        if now != self:
+            grown = (
+                f"{self.size} bytes before, {now.size} now"
+                if now.size != self.size
+                else "same size, written again"
+            )
+            raise InputError(
+                f"{self.path} changed while it was being read ({grown}); wait until it is complete"
+                " and start again"
+            )
+
+
+@dataclass(frozen=True)
+class FolderStamp:
+    """Content of a folder: number of files, their bytes, and a digest of names, sizes and times.
+
+    It looks at every file, which is too slow around every frame: `Series.check` uses it.
+    """
+
+    path: Path
+    files: int
+    size: int
+    digest: bytes
+
+    @classmethod
+    def of(cls, path: Path) -> FolderStamp:
+        """The stamp of a folder as it is now; raises InputError if it is gone."""
+        files, size, digest = 0, 0, hashlib.sha256()
+        with refusing(f"{path} cannot be read"):
+            folders = [os.fspath(path)]
+            while folders:
+                folder = folders.pop()
+                with os.scandir(folder) as found:
+                    entries = sorted(found, key=lambda entry: entry.name)
+                for entry in entries:
+                    if entry.is_dir():
+                        folders.append(entry.path)
+                        continue
+                    state = os.stat(entry.path)
+                    files, size = files + 1, size + state.st_size
+                    figures = f"{state.st_size} {state.st_mtime_ns} {state.st_ino}"
+                    digest.update(f"{entry.path}\0{figures}\0".encode(errors="surrogateescape"))
+        return cls(path, files, size, digest.digest())
+
+    def check(self) -> None:
+        """Raise InputError if anything in the folder has changed since it was opened."""
+        now = FolderStamp.of(self.path)
+        if now != self:
+            what = "something in it was written again"
+            if (now.files, now.size) != (self.files, self.size):
+                what = (
+                    f"{self.files} files and {self.size} bytes before,"
+                    f" {now.files} and {now.size} now"
+                )
+            raise InputError(
+                f"{self.path} changed while it was being read ({what}); wait until it is complete"
+                " and start again"
+            )
+
 
 SLAB_BYTES = 64 * 2**20
 """Bytes of a file that are kept between frames, at most.

@@ -16,11 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.positions import Column, coordinate
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import assign_axes
+from fhash_formats.readers.common.cf import Column, assign_axes, coordinate
+from fhash_formats.readers.common.file_series import Request
 from fhash_formats.series import AXES, Coordinate
-from fhash_formats.support.attributes import text_of
+from fhash_formats.support.values import text_of
 
 Read = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
 

@@ -1,8 +1,4 @@
-"""The bytes of an array in files that are plain, compressed, text, or many that follow each other.
-
-A compressed file is decompressed forward as it is read, and from its start again for earlier bytes.
-One object serves many reads, so that the frames of a series in order decompress the file once.
-"""
+"""Values in flat files: plain, compressed, in text, in many files; positions on a lattice."""
 
 from __future__ import annotations
 
@@ -10,6 +6,7 @@ import bz2
 import re
 import zlib
 from collections.abc import Callable, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -17,9 +14,106 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.flat import FlatArray
+from fhash_formats.readers.common.variables import Variable
+from fhash_formats.series import AXIS_NAMES, Coordinate
 
-BLOCK_BYTES = 2**20
+BLOCK_BYTES = 8 * 2**20
+"""Bytes read at once where the requested values are scattered, as with time fastest."""
+
+SHORTEST_RUN = 16 * 2**10
+"""Bytes below which a run of values is not worth a read of its own."""
+
+
+class FlatArray:
+    """An array of `shape` (slowest dimension first) and `dtype` from byte `offset` of a file on.
+
+    It is read with seek and read: a memory map would kill the process if the file were cut
+    meanwhile.
+    """
+
+    def __init__(
+        self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], *, offset: int = 0
+    ) -> None:
+        self.path, self.shape, self.dtype, self.offset = path, shape, dtype, offset
+
+    @property
+    def end(self) -> int:
+        """The byte after the last value, which is the expected size of the file."""
+        return self.offset + prod(self.shape) * self.dtype.itemsize
+
+    def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Values in ranges of the dimensions, one for each.
+
+        Raises InputError where the file ends too early.
+        """
+        parts = [
+            place
+            for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
+            if part != slice(0, length)
+        ]
+        if len(parts) > 1:
+            return self._read_parts(ranges, parts[0])
+        place = parts[0] if parts else 0
+        part = ranges[place]
+        rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
+        result = np.empty((rows, (part.stop - part.start) * inner), self.dtype)
+        with self.path.open("rb") as file:
+            self._fill(file, result, self.shape[place] * inner, part.start * inner)
+        return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
+
+    def _read_parts(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
+        """Values in ranges of which several are parts; `place` is the slowest of these.
+
+        Whatever lies behind an index along it is an array of its own.
+        """
+        inner = self.shape[place + 1 :]
+        bytes_inside = prod(inner) * self.dtype.itemsize
+        slow = [range(part.start, part.stop) for part in ranges[: place + 1]]
+        result = np.empty([len(part) for part in slow] + _lengths(ranges[place + 1 :]), self.dtype)
+        strides = [prod(self.shape[deeper + 1 : place + 1]) for deeper in range(place + 1)]
+        for where in np.ndindex(*(len(part) for part in slow)):
+            number = sum(
+                part[index] * stride
+                for part, index, stride in zip(slow, where, strides, strict=True)
+            )
+            offset = self.offset + number * bytes_inside
+            array = FlatArray(self.path, inner, self.dtype, offset=offset)
+            result[where] = array.read(ranges[place + 1 :])
+        return result
+
+    def _fill(self, file: BinaryIO, result: npt.NDArray[Any], stride: int, first: int) -> None:
+        """Fill each row of the result from `first` on in each `stride` values of the file."""
+        rows, run = result.shape
+        item = self.dtype.itemsize
+        if rows == 1 or run * item >= SHORTEST_RUN or stride * item > BLOCK_BYTES:
+            for row in range(rows):
+                self._read(file, result[row], row * stride + first)
+            return
+        together = max(1, BLOCK_BYTES // (stride * item))
+        for row in range(0, rows, together):
+            count = min(together, rows - row)
+            block = np.empty(count * stride, self.dtype)
+            self._read(file, block, row * stride)
+            result[row : row + count] = block.reshape(count, stride)[:, first : first + run]
+
+    def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
+        file.seek(self.offset + start * self.dtype.itemsize)
+        view = into.view(np.uint8).data
+        done = 0
+        while done < len(view):
+            count = file.readinto(view[done:])  # type: ignore[attr-defined]
+            if not count:
+                raise InputError(
+                    f"{self.path} ends after {file.tell()} bytes, {self.end} are needed"
+                )
+            done += count
+
+
+def _lengths(ranges: tuple[slice, ...]) -> list[int]:
+    return [part.stop - part.start for part in ranges]
+
+
+INFLATED_BYTES = 2**20
 """Bytes that are decompressed at once where they are only skipped."""
 
 STORED_BYTES = 2**18
@@ -292,10 +386,10 @@ class CompressedFile:
         if place < self._place or self._file is None:
             self._begin()
         while self._place < place:
-            self._need(min(BLOCK_BYTES, place - self._place))
+            self._need(min(INFLATED_BYTES, place - self._place))
         done = 0
         while done < len(view):
-            data = self._need(min(BLOCK_BYTES, len(view) - done))
+            data = self._need(min(INFLATED_BYTES, len(view) - done))
             view[done : done + len(data)] = data
             done += len(data)
         # One byte more reads the checksum behind the last one.
@@ -349,3 +443,101 @@ class CompressedFile:
                     raise InputError(f"{self.path} is cut after {self._place} decompressed bytes")
                 break
         return b""
+
+
+LETTERS = ("x", "y", "z")
+"""Names of the components of a vector with three of them."""
+
+IDENTITY_TOLERANCE = 1e-9
+"""Largest difference from 1 or 0 of a direction that still is that of an axis."""
+
+
+def lattice(
+    axis: str, origin: float, spacing: float, count: int, *, first: float = 0
+) -> Coordinate:
+    """The coordinate of an even axis: origin + (first + i) * spacing for i below `count`.
+
+    `first` is the index of the first position; a half stands for the centre of a cell. Raises
+    InputError for an origin or a spacing that is not finite, and for a spacing of 0.
+    """
+    if not np.isfinite([origin, spacing]).all() or (spacing == 0 and count > 1):
+        raise InputError(
+            f"the grid has the origin {origin} and the spacing {spacing} along {axis}; both must be"
+            " finite, and the spacing not 0"
+        )
+    values = origin + (first + np.arange(count, dtype=np.float64)) * spacing
+    return Coordinate(name=AXIS_NAMES[axis], values=values)
+
+
+def axis_steps(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The signed steps (n,) of axis vectors (n, n), one a row, each along its own axis.
+
+    Raises InputError for vectors that are turned: the positions would not belong to one axis each.
+    """
+    steps: npt.NDArray[np.float64] = np.diagonal(directions)
+    others = np.abs(directions - np.diag(steps))
+    if not np.isfinite(directions).all() or others.max() > IDENTITY_TOLERANCE * np.abs(steps).max():
+        raise InputError(
+            "the grid is turned against the axes (its direction is not the identity), and only"
+            " grids along x, y and z can be read; resample it first"
+        )
+    return steps
+
+
+def component_names(count: int, given: Sequence[str | None] = ()) -> list[str]:
+    """Names of `count` components: those given, where all are and they differ; x, y, z; or 0, 1."""
+    names = [name for name in given if name]
+    if len(names) == count and len(set(names)) == count:
+        return names
+    return list(LETTERS) if count == len(LETTERS) else [str(number) for number in range(count)]
+
+
+def component_variables(
+    name: str,
+    count: int,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    handle: Any,
+    *,
+    given: Sequence[str | None] = (),
+    auxiliary: bool = False,
+    error: str = "",
+) -> list[Variable]:
+    """The variables of an array: itself, or one for each component, such as `velocity.x`.
+
+    The handle of each is (handle, number of the component).
+    """
+    names = [""] if count == 1 else [f".{part}" for part in component_names(count, given)]
+    return [
+        Variable(
+            name=f"{name}{part}",
+            shape=shape,
+            dtype=dtype,
+            auxiliary=auxiliary,
+            error=error,
+            handle=(handle, number),
+        )
+        for number, part in enumerate(names)
+    ]
+
+
+def component_by_number(var: str | None, variables: Sequence[Variable]) -> str | None:
+    """The name of a component that was given by its number: `velocity.x` for `velocity.0`.
+
+    It is the given name where that is a variable, or no number of a component.
+    """
+    if var is None or any(var in (each.name, _last(each.name)) for each in variables):
+        return var
+    stem, _, number = var.rpartition(".")
+    parts = [
+        each
+        for each in variables
+        if stem and stem in (each.name.rpartition(".")[0], _last(each.name).rpartition(".")[0])
+    ]
+    if number.isascii() and number.isdigit() and int(number) < len(parts):
+        return parts[int(number)].name
+    return var
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]

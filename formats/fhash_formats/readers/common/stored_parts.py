@@ -21,11 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.file_series import condense, inside_folder
 from fhash_formats.readers.common.layout import Layout
-from fhash_formats.readers.common.request import inside_folder
 from fhash_formats.series import NotStored
-from fhash_formats.support.attributes import text_of
+from fhash_formats.support.values import text_of
 
 if TYPE_CHECKING:
     import zarr

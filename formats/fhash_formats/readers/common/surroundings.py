@@ -20,25 +20,21 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning
-from fhash_formats.readers.common.cf_packing import Packing
-from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.cf import Packing, with_times
+from fhash_formats.readers.common.file_series import Request, condense
 from fhash_formats.readers.common.layout import Layout, picks
-from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.times import with_times
 from fhash_formats.readers.common.variables import MIN_DIMENSIONS
-from fhash_formats.series import Coordinate
-from fhash_formats.source_metadata import (
+from fhash_formats.series import (
     COORDINATES,
     NO_AXIS,
+    Coordinate,
     SourceMetadata,
     SourceVariable,
     is_plain_name,
     references,
     without_names,
 )
-from fhash_formats.support.attributes import PLUMBING
-from fhash_formats.support.plain_json import UnknownValueError
-from fhash_formats.support.typed_values import stored_type, typed_attribute
+from fhash_formats.support.values import PLUMBING, UnknownValueError, stored_type, typed_attribute
 
 __all__ = [
     "MAX_ARRAYS",

@@ -1,16 +1,36 @@
-"""The choice of an array of a file: the only suitable one, or the one that was named."""
+"""Variables of a file: choice of one, fields of records, steps in groups, the listing."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import math
+import re
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.source_metadata import meant
+from fhash_formats.readers.common.cf import Column, Packing, beside
+from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    Read,
+    arrange,
+    is_asked,
+    label,
+    must_select,
+    picks,
+    readings,
+    single,
+)
+from fhash_formats.series import AXES, Coordinate, Series, empty_selection, meant
+from fhash_formats.support.values import json_attributes, plain_text
 
 MAX_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
@@ -201,3 +221,517 @@ def _listed(variables: Sequence[Variable]) -> str:
     return (
         text if len(variables) <= MAX_LISTED else f"{text} and {len(variables) - MAX_LISTED} more"
     )
+
+
+PARTS = ("real", "imag")
+"""Fields of a complex number, by numpy's names."""
+
+
+def leaves(
+    dtype: np.dtype[Any], path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], np.dtype[Any], tuple[int, ...]]]:
+    """Path, type and shape of each number in a type, nested fields included.
+
+    A field that is an array has a shape; others have ().
+    """
+    if dtype.subdtype is not None:
+        inner, shape = dtype.subdtype
+        for deeper, leaf, rest in leaves(inner, path):
+            yield deeper, leaf, (*shape, *rest)
+    elif dtype.names is not None and dtype.fields is not None:
+        for name in dtype.names:
+            yield from leaves(dtype.fields[name][0], (*path, name))
+    elif dtype.kind == "c":
+        part = np.empty(0, dtype).real.dtype
+        yield from (((*path, name), part, ()) for name in PARTS)
+    else:
+        yield path, dtype, ()
+
+
+def expand(variables: Sequence[Variable]) -> list[Variable]:
+    """The variables, with one for each field in place of those of a compound type.
+
+    The parts of a complex array are there by name only, beside the array itself.
+    """
+    expanded = []
+    for variable in variables:
+        if variable.dtype.names is None and variable.dtype.kind != "c":
+            expanded.append(variable)
+            continue
+        if variable.dtype.kind == "c":
+            expanded.append(variable)
+        expanded += [
+            replace(
+                variable,
+                name=".".join((variable.name, *path)),
+                shape=(*variable.shape, *shape),
+                dtype=dtype,
+                field=path,
+                auxiliary=variable.auxiliary or variable.dtype.kind == "c",
+            )
+            for path, dtype, shape in leaves(variable.dtype)
+        ]
+    return expanded
+
+
+def field_reading(read: Read, variable: Variable, stored: int) -> Read:
+    """`read` of an array of `stored` dimensions as that of a variable's field of it."""
+    if not variable.field:
+        return read
+
+    def field(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        values: Any = read(ranges[:stored])
+        for name in variable.field:
+            values = getattr(values, name) if values.dtype.kind == "c" else values[name]
+        # a copy, so that the other fields are not held in memory
+        return np.array(values[(..., *ranges[stored:])])
+
+    return field
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """One variable of a source.
+
+    Attributes:
+        name: full name, as `--var` takes it.
+        shape: lengths in the file's order.
+        dtype: type of the values, in words.
+        stored: type of the stored numbers, where values are unpacked; "" where it is the same.
+        missing: numbers that stand for missing values in the file, by its attributes.
+        units: of the values, "" where unknown.
+        dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
+            where an index must be selected, and "?" where two readings are likely.
+        options: for each likely reading, the options of `fhash encode` that it needs; none if the
+            variable cannot be encoded.
+        problem: why it cannot be encoded, "" if it can.
+        output: name of a container for it, which no other variable of the source has.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    stored: str = ""
+    missing: tuple[float, ...] = ()
+    units: str = ""
+    dimensions: tuple[tuple[str, str], ...] = ()
+    options: tuple[tuple[str, ...], ...] = ()
+    problem: str = ""
+    output: str = ""
+
+    def of_steps(self, steps: slice, *, whole: bool) -> Listed:
+        """This variable where some steps are asked for: its commands ask for them, too.
+
+        whole: whether the lengths are those of the whole source, so that an empty selection is
+        a problem.
+        """
+        axes = [axis for _, axis in self.dimensions]
+        count = self.shape[axes.index("t")] if "t" in axes else 1
+        if self.options and whole and not range(*steps.indices(count)):
+            problem = empty_selection(count)
+            return replace(self, options=(), problem=problem)
+        parts = [steps.start, steps.stop] + ([] if steps.step is None else [steps.step])
+        text = ":".join("" if part is None else str(part) for part in parts)
+        return replace(self, options=tuple((*words, "--t", text) for words in self.options))
+
+    def commands(self, path: str) -> list[str]:
+        """The command for each likely reading, for a shell."""
+        output = self.output or f"{self.name}.fhz"
+        return [
+            shlex.join(["fhash", "encode", path, "-o", output, *options])
+            for options in self.options
+        ]
+
+    def as_dict(self, path: str) -> dict[str, Any]:
+        """JSON values: all attributes, and the commands."""
+        return {
+            "name": self.name,
+            "shape": list(self.shape),
+            "dtype": self.dtype,
+            "stored": self.stored,
+            "missing": [value if math.isfinite(value) else str(value) for value in self.missing],
+            "units": self.units,
+            "dimensions": [
+                {"name": name, "length": length, "axis": axis}
+                for (name, axis), length in zip(self.dimensions, self.shape, strict=False)
+            ],
+            "commands": self.commands(path),
+            "problem": self.problem,
+        }
+
+
+def listing(
+    source: str,
+    variables: Sequence[Variable],
+    dimensions: Callable[[Variable], list[Dimension]],
+    request: Request,
+    packed: Callable[[Variable], Packing | None] = lambda variable: None,
+) -> list[Listed]:
+    """The variables of a file; coordinates and the members of joined ones are left out.
+
+    A request that names a variable gets that one alone, whatever it is.
+
+    dimensions, packed: dimensions of a variable that can be read, and the packing that the file
+        declares, whatever the request is.
+    """
+    shown = [variable for variable in variables if not variable.auxiliary]
+    good = [variable for variable in shown if not variable.problem(request.booleans)]
+    several = len(good) > 1
+    found = []
+    plain = Counter(plain_name(variable.name) for variable in shown)
+    if request.var is not None:
+        shown = [named(source, variables, good or shown, request.var)]
+    for variable in shown:
+        name, problem = plain_text(variable.name), variable.problem(request.booleans)
+        entry = Listed(
+            name=name,
+            shape=variable.shape,
+            dtype=kind_of(variable.dtype),
+            units=plain_text(variable.units),
+            problem=problem,
+            output=_output(variable.name, plain[plain_name(variable.name)] > 1),
+        )
+        if not problem:
+            said = ("--var", name) if several or request.var else ()
+            try:
+                entry = (
+                    _as_stored(entry, variable, packed)
+                    if request.raw_values
+                    else _unpacked(entry, packed(variable))
+                )
+                entry = _read(source, entry, dimensions(variable), request, said)
+            except InputError as error:  # of attributes that make no sense
+                entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
+        found.append(entry)
+    return found
+
+
+def _output(name: str, whole: bool) -> str:
+    """A name of a container for a variable, with its groups where the last part is not enough."""
+    text = name.replace("/", "_") if whole else plain_name(name)
+    return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
+
+
+def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
+    """An entry with the type of the values instead of the stored one, and the fill values."""
+    if packed is None:
+        return entry
+    # integers of which some are missing decode to integers again
+    changed = packed.scaled and packed.dtype != packed.stored
+    return replace(
+        entry,
+        dtype=kind_of(packed.dtype if packed.scaled else packed.stored),
+        stored=kind_of(packed.stored) if changed else "",
+        missing=tuple(fill.item() for fill in packed.fills),
+    )
+
+
+def _as_stored(
+    entry: Listed, variable: Variable, packed: Callable[[Variable], Packing | None]
+) -> Listed:
+    """An entry with the stored type; counts have not the unit of the values."""
+    try:
+        declared = packed(variable)
+    except InputError:  # the attributes make no sense, and are not used
+        return entry
+    if declared is None:
+        return entry
+    units = "" if declared.scaled else entry.units
+    return replace(entry, dtype=kind_of(declared.stored), units=units)
+
+
+def _read(
+    source: str,
+    entry: Listed,
+    dimensions: Sequence[Dimension],
+    request: Request,
+    named: tuple[str, ...],
+) -> Listed:
+    """An entry with its dimensions and the options of its readings."""
+    names = [label(place, dimension) for place, dimension in enumerate(dimensions)]
+    said = (*named, *_given(request))
+    axes = ["?"] * len(dimensions)
+    try:
+        picked = picks(source, entry.name, dimensions, request.select)
+        extra: list[int] = []
+        if request.axes is None:
+            picked |= single(dimensions, picked)
+            extra = must_select(dimensions, picked)
+        for place in {**picked, **dict.fromkeys(extra, 0)}:
+            axes[place] = "select"
+        chosen = {**picked, **dict.fromkeys(extra, 0)}
+        select = tuple(("--select", f"{names[place]}=0") for place in extra)
+        options = (*said, *(word for pair in select for word in pair))
+        kept = [place for place in range(len(dimensions)) if place not in chosen]
+        if request.axes is None and is_asked(
+            dimensions, chosen, selected=bool(request.select or extra)
+        ):
+            both = readings(dimensions, [dimensions[place] for place in kept])
+            for place in kept[:-1]:
+                axes[place] = dimensions[place].role or "?"
+            return replace(
+                entry,
+                dimensions=tuple(zip(names, axes, strict=True)),
+                options=tuple((*options, *text.split()) for text in both),
+            )
+        wishes = tuple((names[place], "0") for place in extra)
+        layout = arrange(
+            source, entry.name, dimensions, replace(request, select=(*request.select, *wishes))
+        )
+    except InputError as error:
+        return replace(
+            entry,
+            dimensions=tuple(zip(names, axes, strict=True)),
+            problem=str(error).removeprefix(f"{source}: "),
+        )
+    for place, axis in zip(kept, layout.axes, strict=True):
+        axes[place] = axis
+    return replace(entry, dimensions=tuple(zip(names, axes, strict=True)), options=(options,))
+
+
+def _given(request: Request) -> tuple[str, ...]:
+    """The options that the user gave already, which the commands repeat."""
+    words: list[str] = []
+    if request.axes is not None:
+        words += ["--axes", ",".join(request.axes)]
+    for name, index in request.select:
+        words += ["--select", f"{name}={index}"]
+    if request.raw is not None:
+        raw = request.raw
+        if raw.shape is not None:
+            words += ["--shape", ",".join(f"{axis}={n}" for axis, n in raw.shape.items())]
+        if raw.dtype is not None:
+            words += ["--dtype", raw.dtype]
+        if raw.endian is not None:
+            words += ["--endian", raw.endian]
+    if request.raw_values:
+        words.append("--raw-values")
+    for value in request.missing:
+        words += ["--missing", repr(value)]
+    return tuple(words)
+
+
+def listed_series(series: Series, request: Request) -> Listed:
+    """The only variable of a source that is one series already."""
+    return Listed(
+        name=series.name,
+        shape=series.shape,
+        dtype=kind_of(series.source_dtype or series.dtype),
+        missing=request.missing,
+        units=series.units,
+        dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
+        options=(("--var", request.var, *_given(request)) if request.var else _given(request),),
+        output=_output(series.name, whole=False),
+    )
+
+
+STEP_NAMES = """step steps timestep timesteps time_step ts time times t it iter iteration iterations
+cycle frame snapshot snap output out dump plt chk data state"""
+STEPS = frozenset(STEP_NAMES.split())
+"""Words before the number of a step. Other numbers count levels, members or blocks."""
+
+NUMBERED = re.compile(r"(?P<word>.*?)[\s_#:=.-]*(?P<number>\d+(\.\d+)?)")
+TIME_KEYS = ("time", "time_value", "timevalue", "sim_time", "simtime", "current_time")
+"""Names, in any case, of the attribute or number that holds the time of a group."""
+
+UNIT_KEYS = ("timeunits", "time_units", "time_unit", "timeunit")
+SI_KEY = "timeUnitSI"
+"""openPMD's attribute: seconds in one unit of `time`."""
+
+Attributes = Callable[[str], Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """The part of a path that counts steps: the path with `*` for it, and the number."""
+
+    template: str
+    number: float
+    group: str
+    plain: bool
+
+
+def _place(path: str) -> _Place | None:
+    """The part of a path that counts steps, None without one; the array's own name is none."""
+    parts = path.split("/")
+    for depth, part in enumerate(parts[:-1]):
+        match = NUMBERED.fullmatch(part)
+        if match is None:
+            continue
+        word = match["word"].strip().lower()
+        if word and word not in STEPS:
+            continue
+        stem = part[: match.start("number")]
+        return _Place(
+            template="/".join([*parts[:depth], f"{stem}*", *parts[depth + 1 :]]),
+            number=float(match["number"]),
+            group="/".join(parts[: depth + 1]),
+            plain=not word,
+        )
+    return None
+
+
+def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable]:
+    """The variables, and one more for each kind of array that has one group a step.
+
+    Its members become auxiliary, so that they are read only where they are named. Arrays of
+    different shapes, types or units are no series. A single group counts where its name or its
+    attributes say that it is a step.
+
+    attributes: attributes of a group by its path.
+    """
+    kinds: dict[str, list[tuple[_Place, Variable]]] = {}
+    for variable in variables:
+        place = None if variable.error or len(variable.shape) < 2 else _place(variable.name)
+        if place is not None and not variable.auxiliary:
+            kinds.setdefault(place.template, []).append((place, variable))
+    broken = _broken(variables)
+    joined, inside = [], set()
+    for template, members in kinds.items():
+        members.sort(key=lambda member: member[0].number)
+        first = members[0][1]
+        alike = {
+            (member.shape, member.dtype.newbyteorder("="), member.units) for _, member in members
+        }
+        numbers = {place.number for place, _ in members}
+        alone = len(members) == 1 and members[0][0].plain
+        if len(alike) > 1 or len(numbers) < len(members):
+            continue
+        if alone and group_time(attributes(members[0][0].group)) is None:
+            continue
+        shape = (len(members), *first.shape)
+        joined.append(
+            replace(
+                first,
+                name=template,
+                shape=shape,
+                error=next((why for key, why in broken if template.startswith(key)), ""),
+                members=tuple(member for _, member in members),
+            )
+        )
+        inside |= {member.name for _, member in members}
+    rest = [
+        replace(variable, auxiliary=True) if variable.name in inside else variable
+        for variable in variables
+    ]
+    return [*joined, *rest]
+
+
+def _broken(variables: Sequence[Variable]) -> list[tuple[str, str]]:
+    """Names, or beginnings of names, of joined variables one step of which cannot be opened."""
+    found = []
+    for variable in variables if any(each.error for each in variables) else ():
+        if not variable.error:
+            continue
+        own, group = _place(variable.name), _place(f"{variable.name}/")
+        if own is not None:
+            found.append((own.template, f"{variable.name} is {variable.error}"))
+        elif group is not None:
+            found.append((group.template, f"{variable.name} is {variable.error}"))
+    return found
+
+
+def group_time(attributes: Mapping[str, Any]) -> tuple[float, str] | None:
+    """Time and its unit in the attributes of a group; None without a time.
+
+    openPMD: `time` times `timeUnitSI` is in seconds.
+    """
+    known = json_attributes(attributes)
+    lower = {name.lower(): name for name in known}
+    key = next((lower[key] for key in TIME_KEYS if key in lower), None)
+    value = None if key is None else _number(known[key])
+    if value is None:
+        return None
+    scale = _number(known.get(SI_KEY))
+    if scale is not None:
+        return value * scale, "s"
+    units = next((str(known[lower[key]]) for key in UNIT_KEYS if key in lower), "")
+    return value, units
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value)
+
+
+def times(
+    members: Iterable[Variable],
+    attributes: Attributes,
+    scalar: Callable[[str], tuple[float, str] | None],
+) -> Coordinate:
+    """Times of the steps of a joined variable; the numbers in the names if the file gives none.
+
+    attributes: of a group or array by its path. scalar: value and unit of a number by its path,
+    None if there is no number.
+    """
+    places = [(_place(member.name), member.name) for member in members]
+    found = []
+    numbers = []
+    for place, name in places:
+        assert place is not None
+        numbers.append(place.number)
+        inner = name.removeprefix(place.group).split("/")[1:-1]
+        groups = ["/".join([place.group, *inner[:depth]]) for depth in range(len(inner) + 1)]
+        candidates = [group_time(attributes(path)) for path in (*groups, name)]
+        candidates += [scalar(f"{group}/{key}") for group in groups for key in ("time", "Time")]
+        found.append(next((time for time in candidates if time is not None), None))
+    known = [time for time in found if time is not None]
+    if len(known) < len(found) or len({units for _, units in known}) > 1:
+        return Coordinate(name="step", values=np.asarray(numbers, np.float64))
+    units = known[0][1]
+    return Coordinate(
+        name="time",
+        values=np.asarray([value for value, _ in known], np.float64),
+        attributes={"units": units} if units else {},
+    )
+
+
+def require_one_type(
+    source: str, variable: Variable, packing: Callable[[Variable], Packing | None]
+) -> None:
+    """Raise InputError if the steps of a variable are unpacked to different types."""
+    types = {
+        member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
+        for member, made in ((member, packing(member)) for member in variable.members)
+    }
+    first = variable.members[0].name
+    for name, dtype in types.items():
+        if dtype != types[first]:
+            raise InputError(
+                f"{source}: {name} has values of type {dtype}, {first} of type {types[first]}; the"
+                " steps of one series must be alike, --raw-values reads the numbers as stored"
+            )
+
+
+def require_positions(
+    source: str,
+    variable: Variable,
+    layout: Layout,
+    coords: Mapping[str, Coordinate],
+    columns: Callable[[str], Mapping[str, Column]],
+) -> None:
+    """Raise InputError if a step has positions of its own that differ from those of the first.
+
+    columns: what may be a coordinate in a group, by lower-case name.
+    """
+    for member in variable.members[1:]:
+        place = columns(parent(member.name))
+        own = beside(source, layout.axes, layout.shape, [place], certain=True, tied="t")
+        for axis, coordinate in own.items():
+            if not np.array_equal(coordinate.values, coords[axis].values):
+                raise InputError(
+                    f"{source}: {member.name} has other coordinates along {axis} than"
+                    f" {variable.members[0].name}; the steps of one series must be alike"
+                )
+
+
+def reading(reads: Sequence[Read]) -> Read:
+    """A read of several arrays as one, with their number as the first dimension."""
+
+    def stacked(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        return np.stack([read(ranges[1:]) for read in reads[ranges[0]]])
+
+    return stacked

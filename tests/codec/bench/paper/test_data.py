@@ -7,7 +7,7 @@ import pytest
 
 from fhash_codec.bench.paper.data import FEATURES, KINDS, Data, feature_text, simulated
 from fhash_codec.bench.paper.encodings.places import sample_places
-from fhash_codec.coreset.features import parse_feature
+from fhash_codec.features.features import parse_feature
 from fhash_formats.errors import InputError
 
 

@@ -9,9 +9,9 @@ import torch
 from fhash_codec.bench.paper.latency import EncodingField, measure_latency
 from fhash_codec.bench.paper.pictures import view_of_feature
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.task.task import Frame
-from fhash_codec.rendering.task.torch_arrays import TorchArrays
+from fhash_codec.rendering.march_task import Frame
+from fhash_codec.rendering.stream_march import stream
+from fhash_codec.rendering.torch_arrays import TorchArrays
 
 SHAPE = (6, 7, 8)
 FEATURE = "interval:0.3:0.8"

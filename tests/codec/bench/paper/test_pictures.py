@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from fhash_codec.bench.paper.pictures import IDENTICAL, PictureProbe, view_of_feature
-from fhash_codec.coreset.features import dilate, parse_feature
+from fhash_codec.features.features import dilate, parse_feature
 from fhash_formats.errors import InputError
 
 Single = npt.NDArray[np.float32]

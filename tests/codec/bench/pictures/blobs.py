@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fhash_codec.bench.pictures.vtk_peer import VtkPeer
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.task.task import Lighting, Table, Task
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import Lighting, Table, Task
+from fhash_codec.rendering.scenes import Camera
 from fhash_formats.series import Coordinate
 
 SHAPE = (4, 12, 14, 16)

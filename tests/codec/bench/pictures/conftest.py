@@ -17,7 +17,7 @@ from fhash_codec import EncodeConfig, Volume
 from fhash_codec.bench.pictures import beside_vtk, orbit
 from fhash_codec.bench.pictures.pictures import bench_render
 from fhash_codec.bench.pictures.results import RenderBench
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.scenes import Scene
 from fhash_formats.series import ArraySeries
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -10,8 +10,8 @@ from blobs import SHAPE, axes, field
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.bench.pictures.beside_vtk import Comparison, transfer_functions, turned
-from fhash_codec.rendering.scene.scene import Camera, Scene
-from fhash_codec.rendering.task.units import Units
+from fhash_codec.rendering.march_task import Units
+from fhash_codec.rendering.scenes import Camera, Scene
 from fhash_formats.series import ArraySeries
 
 

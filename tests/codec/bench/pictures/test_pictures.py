@@ -15,7 +15,7 @@ from fhash_codec import EncodeConfig, Volume, encode
 from fhash_codec.bench.pictures import pictures
 from fhash_codec.bench.pictures.pictures import FINEST, STEPS, bench_render, in_turns
 from fhash_codec.bench.pictures.results import NETWORK_PARTS, RenderBench
-from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.image import Image
 from fhash_formats.errors import InputError
 
 

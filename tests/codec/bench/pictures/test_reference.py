@@ -7,7 +7,7 @@ from blobs import CAMERAS, drawn, field, task
 
 from fhash_codec.bench.pictures.likeness import black, picture_psnr
 from fhash_codec.bench.pictures.reference import vtk_picture
-from fhash_codec.rendering.scene.scene import Camera
+from fhash_codec.rendering.scenes import Camera
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=["turned", "parallel", "near"])

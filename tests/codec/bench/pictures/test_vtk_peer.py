@@ -10,8 +10,8 @@ from fhash_codec.bench.pictures.likeness import black, picture_psnr
 from fhash_codec.bench.pictures.reference import vtk_picture
 from fhash_codec.bench.pictures.vtk_peer import VtkPeer
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.task.task import Frame
+from fhash_codec.rendering.march_task import Frame
+from fhash_codec.rendering.scenes import Camera
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=["turned", "parallel", "near"])

@@ -9,7 +9,7 @@ import numpy as np
 
 from fhash_codec.bench.rate.coded import PeerFiles, there_and_back
 from fhash_codec.bench.rate.peers import peers
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 
 def test_files_of_a_filter_are_read_by_regions(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.bench.rate.layouts import LAYOUTS, joined, parts_of, spans_of
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 VALUES = np.arange(3 * 4 * 5 * 6).reshape(3, 4, 5, 6)
 

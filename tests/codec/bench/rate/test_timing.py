@@ -5,7 +5,7 @@ from __future__ import annotations
 from fhash_codec.bench.rate.clock import Spent
 from fhash_codec.bench.rate.search import EXACT, Trial
 from fhash_codec.bench.rate.timing import access_of, places, shown_psnr, speed_of
-from fhash_codec.coreset.boxes import Box
+from fhash_codec.boxes import Box
 
 TRIAL = Trial(level=40.0, bytes=1000, psnr=45.0, max_error=0.1)
 

@@ -9,7 +9,7 @@ import pytest
 
 from fhash_codec.bench.train import points
 from fhash_codec.bench.train.points import bench_points
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.network import Architecture
 
 
 @pytest.mark.usefixtures("quick")

@@ -11,13 +11,12 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from fhash_codec.coreset.bricks import Coreset, build_coreset
-from fhash_codec.coreset.features import Interval
-from fhash_codec.coreset.scan import scan
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.features import Interval
+from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
-from fhash_codec.paper.training.probe import Probe
-from fhash_codec.paper.training.train import TrainingProgress, plan_training, train
+from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from fhash_codec.native.network import machine_paths
-from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import describe_engine, make_engine
+from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")

@@ -13,11 +13,11 @@ import pytest
 import torch
 from pretended_cuda import Pretended, pretended_cuda
 
-from fhash_codec.coreset.bricks import Coreset, build_coreset
-from fhash_codec.coreset.features import Everything, Feature, Interval
-from fhash_codec.coreset.scan import scan
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.features import Everything, Feature, Interval
+from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.network import Architecture
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries

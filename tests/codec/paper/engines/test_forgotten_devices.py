@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from pretended_cuda import MixedDevices, pretended_cuda
 
-from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.features.bricks import Coreset
 
 DEVICE = re.compile(
     r"\.to\((?:self\.)?device(?:, self\.dtype)?\)|device=device, "
@@ -31,8 +31,8 @@ LOW = 0.8
 """Smallest value of the feature: few vertices are samples."""
 FILES = (
     "fhash_codec.paper.engines.slab",
-    "fhash_codec.paper.engines.upsampling",
-    "fhash_codec.training.positions",
+    "fhash_codec.paper.engines.parameters",
+    "fhash_codec.paper.engines.parameters",
 )
 """Modules of the slab engine, the one with its class first."""
 

@@ -18,7 +18,6 @@ from readable_paper import NaiveEngine
 
 from fhash_codec.native import network
 from fhash_codec.native.network import PATHS, machine_paths
-from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import native
 from fhash_codec.paper.engines.native import (
     BLOCK,
@@ -32,8 +31,9 @@ from fhash_codec.paper.engines.native import (
     refusal,
     two_corners,
 )
+from fhash_codec.paper.engines.parameters import axis_matrices
 from fhash_codec.paper.engines.slab import SlabEngine
-from fhash_codec.paper.engines.upsampling import axis_matrices
+from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 
 CPU = torch.device("cpu")

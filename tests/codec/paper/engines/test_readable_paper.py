@@ -9,7 +9,7 @@ import pytest
 import torch
 from readable_paper import FHash, NaiveEngine, bucket_index, interpolate, locate
 
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.network import Architecture
 
 DOUBLE = torch.float64
 

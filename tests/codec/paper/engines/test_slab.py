@@ -14,9 +14,9 @@ from readable_paper import NaiveEngine
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines import slab
+from fhash_codec.paper.engines.parameters import CatchUp
 from fhash_codec.paper.engines.slab import (
     LIBRARIES,
     SCALARS,
@@ -30,7 +30,7 @@ from fhash_codec.paper.engines.slab import (
     columns_of,
     needed_bytes,
 )
-from fhash_codec.training.adam import CatchUp
+from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import FhashWarning
 
 CPU = torch.device("cpu")

@@ -14,10 +14,9 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.paper.encode import Selection, select
 from fhash_codec.paper.network import ArrayTable, Floats, Network
-from fhash_codec.paper.selection import Selection, select
-from fhash_codec.paper.tables.bricks import Bricks
-from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
+from fhash_codec.paper.tables import Bricks, TrainedTable, trained_tables
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 

@@ -14,12 +14,11 @@ from pretended_cuda import pretended_cuda
 
 import fhash_codec
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.architecture import Architecture
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.slab import SlabEngine
-from fhash_codec.paper.training.checkpoint import checkpoint_path, save_checkpoint
-from fhash_codec.paper.training.fit import train_model
-from fhash_codec.paper.training.train import TrainingProgress
+from fhash_codec.paper.fit import train_model
+from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.train import TrainingProgress, checkpoint_path, save_checkpoint
 from fhash_formats.errors import FhashWarning, InputError
 
 CONFIG = EncodeConfig(
@@ -38,7 +37,7 @@ def saved(coreset: Coreset, architecture: Architecture, tmp_path: Path) -> Path:
     output, states = tmp_path / "a.fhz", []
     engine_state = SlabEngine.state
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fhash_codec.paper.training.fit.KEEP_SECONDS", 0.0)
+        patch.setattr("fhash_codec.paper.fit.KEEP_SECONDS", 0.0)
         patch.setattr(
             SlabEngine, "state", lambda self: states.append(engine_state(self)) or states[-1]
         )
@@ -70,11 +69,11 @@ def test_a_training_that_diverges_begins_again_on_the_device(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     limits = iter([0.0, *[1e9] * 100])
-    check = fhash_codec.paper.training.train._Loop.check_errors
+    check = fhash_codec.paper.train._Loop.check_errors
     monkeypatch.setattr(
-        "fhash_codec.paper.training.train._Loop.check_errors",
+        "fhash_codec.paper.train._Loop.check_errors",
         lambda self: (
-            monkeypatch.setattr("fhash_codec.paper.training.train.DIVERGED", next(limits)),
+            monkeypatch.setattr("fhash_codec.paper.train.DIVERGED", next(limits)),
             check(self),
         ),
     )

@@ -6,19 +6,10 @@ import numpy as np
 import pytest
 
 from fhash_codec import Volume
-from fhash_codec.rendering.animation.tracking import (
-    COLOURS,
-    Tracked,
-    follow,
-    parse_tracked,
-    tracking_scene,
-)
-from fhash_codec.rendering.camera.grid import Grid
-from fhash_codec.rendering.colour.transfer_function import TransferFunction
-from fhash_codec.rendering.scene.scene import (
-    Isosurface,
-    Scene,
-)
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.scenes import Isosurface, Scene
+from fhash_codec.rendering.tracking import COLOURS, Tracked, follow, parse_tracked, tracking_scene
+from fhash_codec.rendering.transfer_function import TransferFunction
 from fhash_formats.errors import (
     InputError,
 )

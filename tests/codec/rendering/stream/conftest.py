@@ -12,13 +12,13 @@ import pytest
 from frame_field import FrameField
 
 from fhash_codec import Renderer, Scene, Volume
-from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.light import light_grid
+from fhash_codec.rendering.march_task import Arrays, Frame, Lighting, Surface, Table, Task
 from fhash_codec.rendering.renderer import decoded_frame
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.stream.fields import Field, NetworkField
-from fhash_codec.rendering.task.arrays import Arrays
-from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.scenes import Camera
+from fhash_codec.rendering.stream_fields import Field, NetworkField
 from fhash_formats.series import Coordinate
 
 

@@ -14,10 +14,12 @@ from frame_field import FrameField
 
 import fhash_codec
 from fhash_codec import Volume
-from fhash_codec.paper.engines.fused import start
+from fhash_codec.paper.engines.fused import engine as start
 from fhash_codec.paper.network import ArrayTable, Network
-from fhash_codec.rendering.camera.grid import Grid
-from fhash_codec.rendering.stream.fields import (
+from fhash_codec.rendering.bricks import Palette
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import NUMPY, Arrays, Frame, Table, Task, Units
+from fhash_codec.rendering.stream_fields import (
     Field,
     HostInference,
     NetworkField,
@@ -25,10 +27,6 @@ from fhash_codec.rendering.stream.fields import (
     central_slopes,
     inference_in,
 )
-from fhash_codec.rendering.task.arrays import NUMPY, Arrays
-from fhash_codec.rendering.task.palette import Palette
-from fhash_codec.rendering.task.task import Frame, Table, Task
-from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 

@@ -15,14 +15,13 @@ from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
 from fhash_codec import Volume
-from fhash_codec.paper.engines.fused import driver
-from fhash_codec.paper.engines.fused.points import FusedPoints
-from fhash_codec.rendering.stream import canvas
-from fhash_codec.rendering.stream.fields import Field
-from fhash_codec.rendering.stream.stream import stream
-from fhash_codec.rendering.task.arrays import NUMPY, Arrays
-from fhash_codec.rendering.task.devices import arrays_on
-from fhash_codec.rendering.task.task import Task
+from fhash_codec.paper.engines.fused import program as driver
+from fhash_codec.paper.engines.fused.engine import FusedPoints
+from fhash_codec.rendering import stream_rays as canvas
+from fhash_codec.rendering.march_task import NUMPY, Arrays, Task
+from fhash_codec.rendering.plan import arrays_on
+from fhash_codec.rendering.stream_fields import Field
+from fhash_codec.rendering.stream_march import stream
 
 Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
 

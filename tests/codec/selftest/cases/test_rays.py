@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.scene.scene import Camera
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.scenes import Camera
 from fhash_codec.selftest.cases import rays
 
 CASES = {case.name: case for case in rays.CASES}

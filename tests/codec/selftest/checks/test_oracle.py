@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fhash_codec.paper.model import sample_points
 from fhash_codec.paper.network import ArrayTable, Network
-from fhash_codec.paper.points import sample_points
 from fhash_codec.selftest.case import Case
 from fhash_codec.selftest.cases import networks
 from fhash_codec.selftest.checks import oracle

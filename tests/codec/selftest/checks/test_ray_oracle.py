@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.scene.scene import Camera
-from fhash_codec.rendering.task.task import Frame, Surface, Table, Task
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import Frame, Surface, Table, Task
+from fhash_codec.rendering.scenes import Camera
 from fhash_codec.selftest.checks.ray_oracle import reference_picture
 
 SHAPE = (5, 4, 4)

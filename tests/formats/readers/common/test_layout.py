@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf import Column
+from fhash_formats.readers.common.file_series import Request
 from fhash_formats.readers.common.layout import Dimension, arrange, shared_roles
-from fhash_formats.readers.common.positions import Column
-from fhash_formats.readers.common.request import Request
 
 
 def dims(text: str) -> list[Dimension]:

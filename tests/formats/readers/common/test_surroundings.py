@@ -19,7 +19,7 @@ from fhash_formats.readers.common.surroundings import (
     kept_dimensions,
     surroundings,
 )
-from fhash_formats.source_metadata import SourceMetadata
+from fhash_formats.series import SourceMetadata
 
 DIMENSIONS = {"time": "t", "lat": "y", "lon": "x"}
 

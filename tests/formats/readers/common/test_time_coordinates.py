@@ -12,8 +12,7 @@ import xarray as xr
 import zarr
 
 from fhash_formats import open_series
-from fhash_formats.readers.common.positions import Column
-from fhash_formats.readers.common.times import counts_steps, real_time
+from fhash_formats.readers.common.cf import Column, counts_steps, real_time
 
 VALUES = np.random.default_rng(0).normal(size=(4, 2, 3, 5)).astype("f4")
 HOURS = [0.0, 3.0, 6.0, 12.0]

@@ -1,24 +1,321 @@
-"""The choice of an array of a file; arrays that cannot be read are described."""
+"""Fields of compound types: their names, shapes and values."""
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from stored_series import (
-    VALUES,
-    assert_frames,
-    create_zarr,
-    frames,
-    save_netcdf,
-    write_hdf5,
-)
+from stored_series import VALUES, assert_frames, create_zarr, frames, save_netcdf, write_hdf5
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf import packing
+from fhash_formats.readers.common.file_series import RawLayout, Request
+from fhash_formats.readers.common.layout import Dimension
+from fhash_formats.readers.common.variables import (
+    Listed,
+    Variable,
+    expand,
+    field_reading,
+    group_time,
+    join,
+    leaves,
+    listing,
+    times,
+)
+from fhash_formats.readers.common.variables import (
+    reading as reading_step_groups,
+)
+
+NESTED = np.dtype(
+    [("rho", "f4"), ("v", [("x", "f8"), ("y", "f8")], (2,)), ("w", "i2", (3,)), ("c", "c8")]
+)
+
+
+def test_leaves_of_nested_types() -> None:
+    assert [(".".join(path), dtype.str, shape) for path, dtype, shape in leaves(NESTED)] == [
+        ("rho", "<f4", ()),
+        ("v.x", "<f8", (2,)),
+        ("v.y", "<f8", (2,)),
+        ("w", "<i2", (3,)),
+        ("c.real", "<f4", ()),
+        ("c.imag", "<f4", ()),
+    ]
+
+
+def test_every_leaf_reads_as_numpy_reads_it() -> None:
+    state = np.zeros((4, 5, 6), NESTED)
+    state["rho"] = np.arange(120).reshape(4, 5, 6)
+    state["v"]["y"] = np.arange(240).reshape(4, 5, 6, 2)
+    state["w"] = np.arange(360).reshape(4, 5, 6, 3)
+    state["c"] = state["rho"] * (1 + 2j)
+    expected = {
+        "s.rho": state["rho"],
+        "s.v.x": state["v"]["x"],
+        "s.v.y": state["v"]["y"],
+        "s.w": state["w"],
+        "s.c.real": state["c"].real,
+        "s.c.imag": state["c"].imag,
+    }
+    variables = expand([Variable(name="s", shape=state.shape, dtype=NESTED)])
+    assert [variable.name for variable in variables] == list(expected)
+    for variable in variables:
+        read = field_reading(lambda ranges: state[ranges], variable, state.ndim)
+        assert variable.shape == expected[variable.name].shape
+        ranges = (slice(1, 2), slice(0, 5), slice(2, 4), *[slice(1, 2)] * (len(variable.shape) - 3))
+        got = read(ranges)
+        np.testing.assert_array_equal(got, expected[variable.name][ranges])
+        assert got.base is None
+
+
+def test_parts_of_complex_arrays_are_there_by_name_only() -> None:
+    whole = Variable(name="psi", shape=(2, 3, 4), dtype=np.dtype("c16"))
+    assert [(one.name, one.auxiliary) for one in expand([whole])] == [
+        ("psi", False),
+        ("psi.real", True),
+        ("psi.imag", True),
+    ]
+
+
+def variable(name: str, *shape: int, dtype: str = "f4", **rest: object) -> Variable:
+    return Variable(name=name, shape=shape, dtype=np.dtype(dtype), **rest)  # type: ignore[arg-type]
+
+
+def unnamed(one: Variable) -> list[Dimension]:
+    return [Dimension(name=None, length=length) for length in one.shape]
+
+
+def listed(*variables: Variable, request: Request | None = None) -> list[Listed]:
+    return listing("a.h5", variables, unnamed, request or Request())
+
+
+def test_raw_values_have_the_stored_type_and_no_unit_of_others() -> None:
+    attributes = {"scale_factor": np.float32(0.1), "_FillValue": -9}
+    one = variable("a", 4, 12, 13, 14, dtype="i2", units="K")
+    for raw, scaled, dtype, units in (
+        (True, True, "int16", ""),
+        (True, False, "int16", "K"),
+        (False, True, "float32", "K"),
+    ):
+        said = packing("a.h5", np.dtype("i2"), attributes if scaled else {"_FillValue": -9})
+        (found,) = listing(
+            "a.h5", [one], unnamed, Request(raw_values=raw), lambda _, said=said: said
+        )
+        assert (found.dtype, found.units) == (dtype, units)
+        assert found.options == ((("--raw-values",) if raw else ()),)
+        assert found.missing == (() if raw else (-9,))
+
+
+def test_one_variable_needs_no_option() -> None:
+    (only,) = listed(variable("group/rho", 4, 12, 13, 14, units="kg"))
+    assert (only.units, only.dtype, only.options) == ("kg", "float32", ((),))
+    assert [axis for _, axis in only.dimensions] == ["t", "z", "y", "x"]
+    assert only.commands("a.h5") == ["fhash encode a.h5 -o rho.fhz"]
+
+
+def test_auxiliary_variables_are_left_out_and_others_are_named() -> None:
+    found = listed(
+        variable("a", 4, 12, 13, 14),
+        variable("b", 12, 13, 14),
+        variable("lat", 12, 13, auxiliary=True),
+        variable("line", 12),
+    )
+    assert [(one.name, one.options) for one in found] == [
+        ("a", (("--var", "a"),)),
+        ("b", (("--var", "b"),)),
+        ("line", ()),
+    ]
+    assert found[2].problem == "1 dimensions (12,); 3 or 4 can be read"
+    # a variable that cannot be read does not make the name of the other necessary
+    assert listed(variable("a", 4, 12, 13, 14), variable("line", 12))[0].options == ((),)
+
+
+def test_selections_and_both_readings() -> None:
+    request = Request(select=(("dim0", "2"),))
+    for given, prefix in ((Request(), "--select dim0=0"), (request, "--select dim0=2")):
+        (one,) = listed(variable("a", 5, 4, 12, 13, 14), request=given)
+        assert [" ".join(words) for words in one.options] == [prefix]
+        assert [axis for _, axis in one.dimensions] == ["select", "t", "z", "y", "x"]
+    (one,) = listed(variable("a", 5, 4, 12, 13, 3), request=request)
+    assert [" ".join(words) for words in one.options] == [
+        "--select dim0=2 --axes t,z,y,x",
+        "--select dim0=2 --select dim4=0",
+    ]
+    assert one.dimensions[-1] == ("dim4", "?")
+
+
+def test_a_wish_that_does_not_fit_is_the_problem() -> None:
+    (one,) = listed(variable("a", 4, 12, 13, 14), request=Request(select=(("member", "2"),)))
+    assert one.options == ()
+    assert one.problem.startswith("--select member=2: a has no dimension 'member'")
+
+
+@pytest.mark.parametrize("path", ["a b.h5", "step_*.h5"])
+def test_commands_are_safe_for_a_shell(path: str) -> None:
+    (first, _) = listed(variable("Step#*/my rho", 4, 12, 13, 14), variable("b", 4, 12, 13, 14))
+    words = shlex.split(first.commands(path)[0])
+    assert words == ["fhash", "encode", path, "-o", "myrho.fhz", "--var", "Step#*/my rho"]
+
+
+def test_every_wish_is_repeated() -> None:
+    request = Request(
+        raw=RawLayout({"x": 4, "y": 5, "z": 6}, "u2", "big"), raw_values=True, missing=(-9, 1e20)
+    )
+    (one,) = listed(variable("a", 6, 12, 13, 14), request=request)
+    assert " ".join(one.options[0]) == (
+        "--shape x=4,y=5,z=6 --dtype u2 --endian big --raw-values --missing -9 --missing 1e+20"
+    )
+
+
+def test_json_of_an_entry() -> None:
+    (one,) = listed(variable("a", 4, 12, 13, 14))
+    assert one.as_dict("a.h5") == {
+        "name": "a",
+        "shape": [4, 12, 13, 14],
+        "dtype": "float32",
+        "stored": "",
+        "missing": [],
+        "units": "",
+        "dimensions": [
+            {"name": f"dim{place}", "length": length, "axis": axis}
+            for place, (length, axis) in enumerate(zip((4, 12, 13, 14), "tzyx", strict=True))
+        ],
+        "commands": ["fhash encode a.h5 -o a.fhz"],
+        "problem": "",
+    }
+
+
+def test_packed_values_are_listed_by_their_own_type() -> None:
+    made = packing("a", np.dtype("i2"), {"scale_factor": 0.5, "_FillValue": -9})
+    (one,) = listing("a", [variable("a", 4, 12, 13, 14)], unnamed, Request(), lambda one: made)
+    assert (one.dtype, one.stored, one.missing) == ("float64", "int16", (-9,))
+
+
+def test_outputs_of_one_source_differ() -> None:
+    found = listed(
+        variable("level_0/rho", 12, 13, 14),
+        variable("level_1/rho", 12, 13, 14),
+        variable("Step#*/T", 4, 12, 13, 14),
+    )
+    assert [one.output for one in found] == ["level_0_rho.fhz", "level_1_rho.fhz", "T.fhz"]
+
+
+def variables(*names: str, shape: tuple[int, ...] = (2, 3, 4)) -> list[Variable]:
+    return [Variable(name=name, shape=shape, dtype=np.dtype("f4")) for name in names]
+
+
+def joined(*names: str, **groups: Mapping[str, Any]) -> dict[str, list[str]]:
+    found = join(variables(*names), lambda path: groups.get(path.replace("/", "__"), {}))
+    return {
+        variable.name: [member.name for member in variable.members]
+        for variable in found
+        if variable.members
+    }
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        ("Step#{}/rho", "Step#*/rho"),
+        ("{}/rho", "*/rho"),
+        ("data/{}/fields/E/x", "data/*/fields/E/x"),
+        ("timestep_{:04}/rho", "timestep_*/rho"),
+        ("plt{:05}/level_0/rho", "plt*/level_0/rho"),
+        ("run/Iteration {}/rho", "run/Iteration */rho"),
+        ("t={}.5/rho", "t=*/rho"),
+    ],
+)
+def test_steps_are_in_the_order_of_their_numbers(form: str, name: str) -> None:
+    names = [form.format(number) for number in (10, 9, 100)]
+    assert joined(*names) == {name: [names[1], names[0], names[2]]}
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("level_0/rho", "level_1/rho"),
+        ("member1/rho", "member2/rho"),
+        ("run_1/rho", "run_2/rho"),
+        ("rho_1", "rho_2"),
+        ("step_1/rho", "step_01/rho"),
+        ("0/rho",),
+    ],
+)
+def test_other_numbers_are_no_steps(names: tuple[str, ...]) -> None:
+    assert joined(*names) == {}
+
+
+def test_a_single_group_is_a_step_by_its_name_or_its_time() -> None:
+    assert joined("step_7/rho") == {"step_*/rho": ["step_7/rho"]}
+    assert joined("data/7/rho", data__7={"time": 0.5}) == {"data/*/rho": ["data/7/rho"]}
+
+
+def test_groups_of_other_shapes_stay_apart() -> None:
+    found = join(
+        [*variables("step_1/rho"), *variables("step_2/rho", shape=(2, 3, 5))], lambda path: {}
+    )
+    assert not any(variable.members or variable.auxiliary for variable in found)
+
+
+def test_members_are_read_only_by_name() -> None:
+    found = join(variables("step_1/rho", "step_2/rho", "mask"), lambda path: {})
+    assert {variable.name: (variable.shape, variable.auxiliary) for variable in found} == {
+        "step_*/rho": ((2, 2, 3, 4), False),
+        "step_1/rho": ((2, 3, 4), True),
+        "step_2/rho": ((2, 3, 4), True),
+        "mask": ((2, 3, 4), False),
+    }
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({"time": 2.0}, (2.0, "")),
+        ({"Time": np.array([2.0])}, (2.0, "")),
+        ({"TimeValue": 3, "time_units": "ms"}, (3.0, "ms")),
+        ({"time": 2.0, "timeUnitSI": 1e-15}, (2e-15, "s")),
+        ({"time": "noon"}, None),
+        ({"timeUnitSI": 1.0}, None),
+        ({}, None),
+    ],
+)
+def test_times_of_groups(attributes: Mapping[str, Any], expected: tuple[float, str] | None) -> None:
+    assert group_time(attributes) == expected
+
+
+def test_times_come_from_groups_or_from_numbers_beside() -> None:
+    members = variables("data/0/fields/E", "data/5/fields/E")
+    given = {"data/0": {"time": 0.0}, "data/5": {"time": 0.25}}
+    coordinate = times(members, lambda path: given.get(path, {}), lambda path: None)
+    assert (coordinate.name, coordinate.values.tolist()) == ("time", [0, 0.25])
+    beside = {"data/0/time": (1.0, "s"), "data/5/fields/time": (2.0, "s")}
+    coordinate = times(members, lambda path: {}, beside.get)
+    assert (coordinate.values.tolist(), coordinate.attributes) == ([1, 2], {"units": "s"})
+    coordinate = times(members, lambda path: {}, {"data/0/time": (1.0, "s")}.get)
+    assert (coordinate.name, coordinate.values.tolist()) == ("step", [0, 5])
+
+
+def test_only_the_steps_that_are_asked_for_are_read() -> None:
+    frames = [np.full((2, 3), step) for step in range(5)]
+    calls: list[int] = []
+
+    def reader(step: int) -> Any:
+        def read(ranges: tuple[slice, ...]) -> np.ndarray:
+            calls.append(step)
+            return frames[step][ranges]
+
+        return read
+
+    read = reading_step_groups([reader(step) for step in range(5)])
+    got = read((slice(1, 3), slice(0, 2), slice(1, 3)))
+    np.testing.assert_array_equal(got, np.stack(frames[1:3])[:, :, 1:])
+    assert calls == [1, 2]
+
 
 DIMS = ("time", "lev", "lat", "lon")
 

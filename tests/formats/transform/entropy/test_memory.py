@@ -12,9 +12,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the memor
 SCRIPT = """
 import resource, sys
 import numpy as np
-from fhash_formats.transform.entropy import coder, mask, predict
-from fhash_formats.transform.entropy.predictor import Predictor, passes_of
-from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform import coder, predict
+from fhash_formats.transform.predict import Predictor, passes_of
+from fhash_formats.transform.coder import single_band
 
 shape = (1, 1, 1 << 12, 1 << 12)  # 16 Mi vertices
 levels, order = (0, 0, 1, 1), (0, 1, 2, 3)
@@ -29,12 +29,12 @@ bits = nothing[0].view(bool)
 WORK = {
     "decode_integers": (64, lambda: coder.decode_integers(b"", shape, single_band(shape))),
     "encode_integers": (8, lambda: coder.encode_integers(integers, single_band(shape))),
-    "decode_mask": (16, lambda: mask.decode_mask(bytes([255]) * 99, nothing)),
-    "encode_mask": (16, lambda: mask.encode_mask(bits, nothing)),
+    "decode_mask": (16, lambda: coder.decode_mask(bytes([255]) * 99, nothing)),
+    "encode_mask": (16, lambda: coder.encode_mask(bits, nothing)),
     "decode_predicted": (64, lambda: predict.decode_predicted(b"", shape, predictor)),
     "encode_predicted": (80, lambda: predict.encode_predicted(integers, None, predictor)),
 }
-coder.prior_state(False), mask.mask_prior_state(), predict.blank_state()
+coder.prior_state(False), coder.mask_prior_state(), predict.blank_state()
 with open("/proc/self/status") as status:
     used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
 # The limit leaves room for the result and the coder's state, but not for its notes on each vertex.

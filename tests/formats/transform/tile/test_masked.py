@@ -11,12 +11,11 @@ import pytest
 from tiles import damaged_copies
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
-from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
-from fhash_formats.transform.tile.sections import MASKED
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.encoding import CodedTile, Coding, encode_tile, exact_tile
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile_format import MASKED, TileSettings
 
 SHAPE = (2, 3, 12, 17)
 NINE = AxisTransform(kind="9/7", depth=2)

@@ -10,12 +10,11 @@ import pytest
 from specs import spec_of
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.entropy.predictor import Predictor, passes_of
-from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
-from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.sections import EXACT, KIND, PREDICTED
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.predict import Predictor, passes_of
+from fhash_formats.transform.tile_format import EXACT, KIND, PREDICTED, TileSettings
 
 Values = npt.NDArray[Any]
 

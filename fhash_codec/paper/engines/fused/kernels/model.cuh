@@ -51,7 +51,7 @@ struct Model {
     int steps;                        // length of `weights`
 };
 
-// Adam's numbers of one step, `corrections` in training/adam.py: the factor of the mean square's
+// Adam's numbers of one step, `corrections` in paper/engines/parameters.py: the factor of the mean square's
 // root, and the pace.
 struct Rate {
     float root;
@@ -81,7 +81,7 @@ __device__ inline float block_sum(float value, float* scratch) {
     return sum;
 }
 
-// Effect of the steps since a brick's last one, whose gradient was zero: training/adam.py.
+// Effect of the steps since a brick's last one, whose gradient was zero: paper/engines/parameters.py.
 struct CatchUp {
     float factor;
     float epsilon;

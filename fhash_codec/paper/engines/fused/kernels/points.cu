@@ -12,7 +12,7 @@ static_assert(THREADS % COLUMNS == 0, "the threads of a column are whole shares"
 
 // The table of a level at one time; points.py holds the same record. Axes are x, y and z. Strides
 // count vertices, or bits of the bitmap where the level holds some vertices only
-// (paper/tables/ranked.py); an axis of one vertex has the stride 0, which makes both corners the
+// (paper/network.py); an axis of one vertex has the stride 0, which makes both corners the
 // same.
 struct Level {
     const float* table;               // (vertices, SIZE)

@@ -13,13 +13,11 @@ import numpy as np
 import torch
 from emulator import EmulatedDevice, HeldTable
 
-from fhash_codec.coreset.bricks import build_coreset
-from fhash_codec.coreset.features import Interval
-from fhash_codec.coreset.scan import scan
-from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.engines.fused.engine import FusedEngine
-from fhash_codec.paper.engines.fused.points import FusedPoints, PointKernels
-from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.features.bricks import build_coreset
+from fhash_codec.features.features import Interval
+from fhash_codec.features.scan import scan
+from fhash_codec.paper.engines.fused.engine import FusedEngine, FusedPoints, PointKernels
+from fhash_codec.paper.network import Architecture, ArrayTable, Network
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 

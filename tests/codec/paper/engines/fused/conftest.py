@@ -15,9 +15,9 @@ import pytest
 import torch
 from readable_paper import NaiveEngine
 
-from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines.fused.engine import FusedEngine
 from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_codec.paper.network import Architecture
 
 sys.path.insert(0, str(Path(__file__).parent))
 

@@ -10,9 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.paper.engines.fused.source import DeviceLimits, Sizes, Unavailable
-from fhash_codec.paper.network import ArrayTable
-from fhash_codec.paper.tables.ranked import SparseFrame
+from fhash_codec.paper.engines.fused.program import DeviceLimits, Sizes, Unavailable
+from fhash_codec.paper.network import ArrayTable, SparseFrame
 
 HERE = Path(__file__).parent
 LIMITS = DeviceLimits(

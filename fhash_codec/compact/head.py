@@ -1,0 +1,451 @@
+"""Choice of the head: whether it is worth its bytes, and its training in rounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from threading import Event
+from typing import NamedTuple
+
+from fhash_codec.compact.goal import step_after_gain
+from fhash_codec.compact.head_training import Pair, TrainedHead, train_head
+from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.step import octave_gain
+from fhash_codec.compact.tiles import Coding, Outcome
+from fhash_codec.progress import Parts, skip, stage
+from fhash_formats.transform.head import CROSS, INPUTS
+from fhash_formats.transform.tile_format import TileSettings
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Widths of the two hidden layers of a head, and whether it looks at the voxels of a cross."""
+
+    widths: tuple[int, int]
+    cross: bool
+
+    @property
+    def weights(self) -> int:
+        """Number of weights, biases not included."""
+        first, second = self.widths
+        return INPUTS * first + self._seen * first * second + second
+
+    @property
+    def products(self) -> int:
+        """Multiplications for a voxel in training."""
+        first, second = self.widths
+        return self._seen * (INPUTS * first + first * second) + second
+
+    @property
+    def _seen(self) -> int:
+        """Voxels whose first layer the second layer sees."""
+        return len(CROSS) if self.cross else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Length of the training of a head."""
+
+    updates: int
+    """Number of training updates."""
+    samples: int
+    """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
+    rate: float = 1e-2
+    """Highest learning rate. A short training gains as much as one of twice its length where it
+    learns three times as fast; a long one does not."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """Effort that is spent on the choice of a head."""
+
+    candidates: int
+    """Number of the first entries of GAIN_BY_WIDTHS that are considered."""
+    budget: Budget
+    """Training of a head with a cross."""
+    perceptron: Budget
+    """Training of the perceptron, whose updates cost a fifth."""
+
+    def budget_of(self, shape: Shape) -> Budget:
+        """Return the training of a head of a shape."""
+        return self.budget if shape.cross else self.perceptron
+
+
+GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
+"""Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
+EFFORTS = {
+    5: Effort(
+        candidates=4,
+        budget=Budget(updates=1300, samples=400_000, rate=3e-2),
+        perceptron=Budget(updates=5200, samples=800_000),
+    ),
+    6: Effort(
+        candidates=4,
+        budget=Budget(updates=5000, samples=400_000),
+        perceptron=Budget(updates=10000, samples=800_000),
+    ),
+    7: Effort(
+        candidates=4,
+        budget=Budget(updates=8000, samples=400_000),
+        perceptron=Budget(updates=16000, samples=800_000),
+    ),
+    8: Effort(
+        candidates=5,
+        budget=Budget(updates=12000, samples=400_000),
+        perceptron=Budget(updates=24000, samples=800_000),
+    ),
+    9: Effort(
+        candidates=5,
+        budget=Budget(updates=20000, samples=400_000),
+        perceptron=Budget(updates=40000, samples=800_000),
+    ),
+}
+"""Effort spent on heads by the effort of the encoder; below 5 there is no head."""
+TRIAL_HEAD = Shape((8, 8), cross=True)
+"""Head of the quick trial."""
+TRIAL_BUDGET = Budget(updates=400, samples=160_000, rate=3e-2)
+"""Training of the quick trial."""
+PERCEPTRON = Shape((12, 8), cross=False)
+"""Head that competes, too: where little is to be gained, its fewer weights may win."""
+GAIN_FACTOR = 1.2
+"""Gain of the full training as a multiple of the gain of the trial, roughly."""
+GAIN_BESIDES = 0.02
+"""Gain in dB of the full training besides that multiple."""
+MAX_OF_TRIAL = 1.5
+"""Largest gain of a perceptron as a multiple of that expected of the trial head."""
+LIKELY_OF_TRIAL = (0.85, 1.1)
+"""Such multiples that nearly all gains of perceptrons lie between."""
+WEIGHT_BYTES = 0.7
+"""Bytes that each weight of a head adds to the file."""
+HEAD_BYTES = 60
+"""Bytes that a head adds to the file besides its weights: its history and description."""
+WEIGHT_TIME = 5e-6
+"""Share of the file that each weight must save to pay for the decoding time it costs."""
+
+
+def expected_gain(gain_of_trial: float) -> float:
+    """Return the gain in dB that a full training of the trial head is expected to have."""
+    return GAIN_FACTOR * gain_of_trial + GAIN_BESIDES
+
+
+def likely_heads(size: float, gain: float, octave: float, effort: int) -> list[Shape]:
+    """Return the heads that are worth a training; none where none should save anything.
+
+    That with a cross and the perceptron are both trained where nothing but a training says which of
+    them saves more.
+
+    size: bytes of the coded tiles.
+    gain: expected gain in dB of a head of the widths of the trial head.
+    octave: dB that an octave of bytes buys.
+    """
+    widths = best_widths(size, gain, octave, effort)
+    if widths is None:
+        return [PERCEPTRON] if most_saved(size, gain, octave) > 0 else []
+    with_cross = Shape(widths, cross=True)
+    saved = _saved(with_cross, size, GAIN_BY_WIDTHS[widths] * gain, octave)
+    least, most = (_saved(PERCEPTRON, size, ratio * gain, octave) for ratio in LIKELY_OF_TRIAL)
+    if least >= saved:
+        return [PERCEPTRON]
+    return [with_cross] if most <= saved else [with_cross, PERCEPTRON]
+
+
+def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
+    """Return the widths of the head with a cross that should save most; None if none should.
+
+    The parameters are those of `likely_heads`.
+    """
+
+    def saved(widths: tuple[int, int]) -> float:
+        return _saved(Shape(widths, cross=True), size, GAIN_BY_WIDTHS[widths] * gain, octave)
+
+    best = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
+    return best if saved(best) > 0 else None
+
+
+def most_saved(size: float, gain: float, octave: float) -> float:
+    """Return the bytes that a perceptron saves at most, less those that it takes.
+
+    The parameters are those of `likely_heads`.
+    """
+    return _saved(PERCEPTRON, size, MAX_OF_TRIAL * gain, octave)
+
+
+def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
+    """Return the bytes that a head of this gain in dB saves, less those that it takes."""
+    share = 1 - 2 ** (-gain / octave) - WEIGHT_TIME * shape.weights
+    return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES
+
+
+HeadHistory = list[dict[str, float | None]]
+"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
+
+`samples` is the number of voxels that it learns from, the same at each point.
+"""
+StepSearch = Callable[[TileSettings], tuple[TileSettings, Outcome]]
+"""Search for the step that keeps the promise, from that of the settings on."""
+MIN_GAIN = 0.02
+"""Gain in dB of the quick trial on held-out samples below which no head will pay."""
+TRAINING_VERTICES = 48 << 20
+"""Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
+NEAR_GAIN = 0.2
+"""Gain in dB below which a head may be trained on the decoded values of its trial."""
+UNUSUAL = 1.0
+"""dB by which tiles may lose more or less than a head gains, before another step is looked for."""
+FARTHEST = 2.0
+"""Power of the usual factor of the step that is taken at most where tiles lose less."""
+POINTLESS = 0.005
+"""Share of the bytes that a head must cost before the step is searched: then it is left out."""
+CLOSE = 0.004
+"""Distance in dB from the PSNR that is searched for at which no further step is tried."""
+MIN_BYTES = 900
+"""Bytes of coded tiles below which a head cannot save what it takes.
+
+The smallest head takes some 250 bytes with its history, and few save 30 % of the tiles.
+"""
+
+
+class _Candidate(NamedTuple):
+    """A trained head, settings with it, and what the sample takes with these."""
+
+    trained: TrainedHead
+    settings: TileSettings
+    outcome: Outcome
+
+
+def choose_head(
+    sample: Sample,
+    settings: TileSettings,
+    outcome: Outcome,
+    coding: Coding,
+    find_step: StepSearch,
+    look: Callable[[TileSettings], Outcome],
+    tried: list[Outcome],
+    *,
+    aim: float | None,
+    data_range: float,
+    effort: int,
+    seed: int,
+    parts: Parts | None = None,
+) -> tuple[TileSettings, Outcome, HeadHistory]:
+    """Return settings with a head and a larger step if they make the sample smaller.
+
+    Otherwise the settings and their outcome are returned as they are. The last result is the
+    training history of the best head, empty if none was trained.
+
+    outcome: outcome of the settings, without a head.
+    coding: coding without a bound, for the values that a head is trained on.
+    find_step: search for the step that keeps the promise with a head.
+    look: codes the sample once, as that search does.
+    tried: outcomes of that search without a head.
+    aim: PSNR in dB that is searched for, at which sizes are compared; None for a bound, which all
+        outcomes keep.
+    data_range: range of the values, in data units.
+    parts: progress of the planning, which is told about the training.
+    """
+    if outcome.size < MIN_BYTES:
+        skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
+        return settings, outcome, []
+    training = _Training(seed=seed)
+    parts = parts or Parts()
+    tell = partial(parts.report, "training")
+    with stage("head trial", "gain of a quick training, by which heads are chosen"):
+        pairs = training_pairs(sample, settings, coding)
+        trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
+    if trial is None or trial.gain_db < MIN_GAIN:
+        skip("head", "its trial gains nothing")
+        return settings, outcome, []
+    octave = octave_gain(tried, data_range)
+    shapes = likely_heads(outcome.size, expected_gain(trial.gain_db), octave, effort)
+    if not shapes:
+        gained = f"its trial gained {trial.gain_db:.2f} dB"
+        skip("head", f"{gained}: no head would save what it takes itself")
+        return settings, outcome, []
+    why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
+    with stage("head", why):
+        # A head is trained on what it will meet: coarser data, which it lifts to the promise.
+        coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
+        if aim is not None:
+            lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
+            coarser = _coarsened(settings, coarser, lost, trial.gain_db)
+        if trial.gain_db > NEAR_GAIN or not sample.complete:
+            pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
+
+        def train(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
+            return training.run(pairs, coarser, shape, EFFORTS[effort].budget_of(shape), tell)
+
+        heads = [head for head in _side_by_side(shapes, train, parts) if head is not None]
+        without = _Compared(outcome, octave, aim, data_range)
+        best = _searched(without, [(head, coarser) for head in heads], find_step, look)
+    if best is None:
+        return settings, outcome, []
+    history = _history(best, data_range)
+    if without.extra_bytes(best) < 0:
+        return best.settings, best.outcome, history
+    return settings, outcome, history
+
+
+def _coarsened(
+    settings: TileSettings, coarser: TileSettings, lost: float, gain: float
+) -> TileSettings:
+    """Return settings of a step at which tiles lose about the dB that a head gains.
+
+    Where most vertices lie on a plateau, tiles lose them much faster than usual.
+
+    coarser: settings of a step at which they lose `lost` dB.
+    """
+    if abs(lost - gain) < UNUSUAL:
+        return coarser
+    share = gain / max(lost, gain / FARTHEST)
+    return replace(settings, step=settings.step * (coarser.step / settings.step) ** share)
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Comparison of candidates with the tiles without a head."""
+
+    outcome: Outcome
+    """Outcome without a head."""
+    octave: float
+    """dB that an octave of bytes buys."""
+    aim: float | None
+    """PSNR in dB that is searched for; None for a bound, which all outcomes keep."""
+    data_range: float
+    """Range of the values, in data units."""
+
+    def missing(self, candidate: _Candidate) -> float:
+        """Return the dB that a candidate is worse than the tiles without a head."""
+        return self.outcome.psnr(self.data_range) - candidate.outcome.psnr(self.data_range)
+
+    def extra_bytes(self, candidate: _Candidate) -> float:
+        """Return the bytes more than without a head, at the same quality."""
+        size = candidate.outcome.size
+        own_bytes = len(candidate.trained.head.to_bytes()) + HEAD_BYTES
+        extra: float = size - self.outcome.size + own_bytes
+        if self.aim is None:
+            return extra
+        return extra + self.outcome.size * (2 ** (self.missing(candidate) / self.octave) - 1)
+
+
+def _searched(
+    without: _Compared,
+    heads: Sequence[tuple[TrainedHead, TileSettings]],
+    find_step: StepSearch,
+    look: Callable[[TileSettings], Outcome],
+) -> _Candidate | None:
+    """Return the best of some heads with the step that keeps the promise; None of none.
+
+    They are compared at one step, and the step is searched for the best of them alone. It is not
+    where the head would not pay in any case.
+
+    heads: trained heads, each with the settings that it was trained for.
+    """
+    if not heads:
+        return None
+    trained = [(head, replace(settings, head=head.head)) for head, settings in heads]
+    if without.aim is None and len(trained) == 1:
+        head, settings = trained[0]
+        return _Candidate(head, *find_step(settings))
+    candidates = [_Candidate(head, settings, look(settings)) for head, settings in trained]
+    best = min(candidates, key=without.extra_bytes)
+    if without.aim is None:
+        return _Candidate(best.trained, *find_step(best.settings))
+    missing = without.aim - best.outcome.psnr(without.data_range)
+    if abs(missing) < CLOSE or without.extra_bytes(best) > POINTLESS * without.outcome.size:
+        return best
+    nearer = replace(best.settings, step=step_after_gain(best.settings.step, -missing))
+    return _Candidate(best.trained, *find_step(nearer))
+
+
+def _history(candidate: _Candidate, data_range: float) -> HeadHistory:
+    """Return the training of a candidate, as the file has it."""
+    trained = candidate.trained
+    psnr_without = candidate.outcome.psnr(data_range) - trained.gain_db
+    return [
+        {
+            "seconds": seconds,
+            "epoch": update,
+            "psnr": _finite(psnr_without + gain),
+            "samples": trained.samples,
+        }
+        for seconds, update, gain in trained.history
+    ]
+
+
+def _side_by_side(
+    shapes: Sequence[Shape],
+    train: Callable[[Shape, Callable[[float], None]], TrainedHead | None],
+    parts: Parts,
+) -> list[TrainedHead | None]:
+    """Train heads in threads: a training takes one processor.
+
+    train: trains a head and tells the share that is done to its second argument.
+    parts: progress of the planning.
+    """
+    shares, stopped = dict.fromkeys(shapes, 0.0), Event()
+
+    def run(shape: Shape) -> TrainedHead | None:
+        def tell(share: float) -> None:
+            if stopped.is_set():
+                raise CancelledError  # ends this thread where the other or the user stopped it
+            shares[shape] = share
+
+        trained = train(shape, tell)
+        tell(1.0)
+        return trained
+
+    with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
+        works = [workers.submit(run, shape) for shape in shapes]
+        try:
+            parts.wait(works, "training", lambda: sum(shares.values()) / len(shares))
+            return [work.result() for work in works]
+        finally:
+            stopped.set()
+
+
+def _finite(psnr: float) -> float | None:
+    """Return a PSNR that the header can hold: None for that of values without an error."""
+    return psnr if math.isfinite(psnr) else None
+
+
+def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
+    """Return the tiles as they decode without a head, with their originals and masks."""
+    decoded = sample.decoded(replace(settings, head=None, mask=None), coding)
+    return [
+        Pair(values, tile.values, tile.counted)
+        for values, tile in zip(decoded, sample.tiles, strict=True)
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Training:
+    """Training of heads: the part of its options that is the same for all heads."""
+
+    seed: int
+
+    def run(
+        self,
+        pairs: Sequence[Pair],
+        settings: TileSettings,
+        shape: Shape,
+        budget: Budget,
+        progress: Callable[[float], None],
+    ) -> TrainedHead | None:
+        """Train a head; None where there is nothing to learn.
+
+        progress: called with the share of the training that is done.
+        """
+        return train_head(
+            pairs,
+            low=settings.low,
+            high=settings.high,
+            hidden=shape.widths,
+            cross=shape.cross,
+            updates=budget.updates,
+            samples=budget.samples,
+            rate=budget.rate,
+            seed=self.seed,
+            progress=progress,
+        )

@@ -1,0 +1,298 @@
+"""Sample of the tiles on which choices are tried, and filling of vertices outside the features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from math import prod
+from typing import NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.compact.tiles import (
+    Blocks,
+    Coding,
+    Index,
+    Known,
+    Outcome,
+    Run,
+    Tile,
+    TileRun,
+    Values,
+    code,
+    measured,
+    recoded,
+    total,
+)
+from fhash_formats.support.threads import map_ahead
+from fhash_formats.transform.decoding import transform_for
+from fhash_formats.transform.encoding import filled
+from fhash_formats.transform.tile_format import TileSettings
+
+
+def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
+    """Return a tile with other values, of the same type, where vertices do not count.
+
+    Vertices whose value is not finite do not count either: the returned mask excludes them.
+
+    settings: transform and step for which the values shall be cheap; with other settings they are
+        still better than the values of the source.
+    density: thoroughness, see `fhash_formats.transform.encoding.filled`; with 0 the values of
+        the source stay if all of them are finite.
+    """
+    values, in_coreset = tile
+    if in_coreset is None:
+        return tile
+    if density == 0:
+        if values.dtype.kind != "f" or np.isfinite(values).all():
+            return tile
+        density = 1
+    finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
+    counted = finite & in_coreset
+    if counted.all() or not counted.any():
+        return tile
+    center = settings.dtype.type(settings.center)
+    with np.errstate(over="ignore", invalid="ignore"):
+        target = np.where(finite, values, 0).astype(settings.dtype) - center
+        transform = transform_for(settings, values.shape)
+        filling = filled(target, counted, finite, transform, settings, density) + center
+        # Beyond the range there is nothing to gain, and a type may have no such numbers.
+        filling = np.clip(filling, settings.low, settings.high)
+        if values.dtype.kind != "f":
+            filling = np.rint(filling)
+        return Tile(np.where(counted, values, filling.astype(values.dtype)), counted)
+
+
+Result = TypeVar("Result")
+Grams = dict[tuple[int, float, int | None], npt.NDArray[np.float64]]
+"""Products of lines by axis and centre."""
+_grams: WeakKeyDictionary[Blocks, Grams] = WeakKeyDictionary()
+
+GOLDEN_RATIO = 0.6180339887498949
+"""Fractional part of the golden ratio: its multiples modulo 1 are spread evenly."""
+MAX_TILES_AHEAD = 16
+"""Tiles of a series larger than memory that are worked on at a time."""
+MIN_COST_SHARE = 0.05
+"""Share of the mean cost that is added to each tile's cost: the sample needs cheap tiles, too."""
+
+
+def spread_order(count: int) -> list[int]:
+    """Return the numbers 0 to count - 1 in an order of which each beginning is spread evenly.
+
+    The order follows the golden ratio, so that no row or column of a grid of tiles is preferred.
+    """
+    return sorted(range(count), key=lambda number: number * GOLDEN_RATIO % 1.0)
+
+
+def strata(costs: Sequence[float], max_tiles: int) -> list[tuple[int, int]]:
+    """Choose tiles by cost: pairs of a tile and the number of tiles it stands for, in tile order.
+
+    Tiles of similar cost form a stratum; its middle tile stands for all of them. All strata cost
+    about the same, so an expensive tile stands for itself and a cheap one for many. A single
+    stratum has tiles of all costs: the one nearest to their mean stands for them, since most of
+    them may be nearly empty.
+
+    costs: approximate cost of each tile.
+    max_tiles: number of tiles chosen at most.
+    """
+    if max_tiles == 1:
+        return [(int(np.abs(np.asarray(costs) - np.mean(costs)).argmin()), len(costs))]
+    order = np.argsort(costs, kind="stable")
+    floor = MIN_COST_SHARE * float(np.mean(costs)) or 1.0
+    so_far = np.cumsum(np.asarray(costs, dtype=np.float64)[order] + floor)
+    shares = so_far / so_far[-1] * max_tiles * (1 - 1e-12)
+    groups = np.minimum(shares.astype(int), max_tiles - 1)
+    chosen = []
+    for group in np.unique(groups):
+        members = order[groups == group]
+        chosen.append((int(members[len(members) // 2]), len(members)))
+    return sorted(chosen)
+
+
+class _Job(NamedTuple):
+    """A tile to be coded, or only to be decoded where its stream is known."""
+
+    tile: Tile
+    settings: TileSettings
+    coding: Coding
+    before: TileRun | None
+    """Its stream, and the outcome with this head or another."""
+
+    def run(self) -> tuple[TileRun, Values]:
+        """Return the tile as it is coded, and its decoded values."""
+        if self.before is None:
+            coded, outcome = code(self.tile, self.settings, self.coding)
+        else:
+            stream, known = self.before
+            coded = recoded(self.tile, stream, self.settings, known.nonzero)
+            outcome = measured(self.tile, coded, self.settings, self.coding)
+        return TileRun(coded.data, outcome), coded.decoded
+
+
+class Sample:
+    """Tiles in memory that stand for all tiles of a series.
+
+    Attributes:
+        blocks: the series as a grid of tiles.
+        tiles: the tiles of the sample.
+        indices: their indices in the grid.
+        weights: number of tiles of the series that each of them stands for.
+        complete: whether the sample has all tiles with vertices that count.
+        counted: approximate number of vertices that count in the series.
+        grams: products of lines of all tiles of the series, see `choices.bases.TileSample`;
+            samples of the same grid share them.
+    """
+
+    def __init__(
+        self,
+        blocks: Blocks,
+        max_vertices: int,
+        pool: ThreadPoolExecutor,
+        costs: Sequence[float] | None = None,
+        tick: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Read tiles of at most `max_vertices` vertices together, at least one tile.
+
+        costs: approximate cost of each tile, in C order. Tiles are then chosen by `strata`, else
+        spread evenly.
+        tick: called after each tile that is worked on, in the thread that asked for the work.
+        """
+        indices = list(blocks.indices())
+        count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
+        chosen = _choose_tiles(len(indices), count, costs)
+        tiles = [
+            (index, blocks.read(index), weight * blocks.weight(index))
+            for index, weight in ((indices[number], weight) for number, weight in chosen)
+        ]
+        # At least one tile, even if no vertex counts.
+        tiles = [entry for entry in tiles if not entry[1].is_empty] or tiles[:1]
+        self.indices = [index for index, _, _ in tiles]
+        self.tiles = [tile for _, tile, _ in tiles]
+        self.weights = [weight for _, _, weight in tiles]
+        self.complete = count == len(indices)
+        self.counted = sum(weight * tile.counted_vertices for _, tile, weight in tiles)
+        self.blocks = blocks
+        self.grams = _grams.setdefault(blocks, {})
+        self._pool, self._costs, self._source = pool, costs, self.tiles
+        self._filling: tuple[TileSettings, int] | None = None
+        self._known = Known()
+        self.tick = tick
+
+    @property
+    def allows_bases(self) -> bool:
+        """Whether the series is in memory: bases of its own read all of it once more."""
+        return self.blocks.in_memory
+
+    @property
+    def filling(self) -> tuple[TileSettings, int] | None:
+        """Settings and density by which the tiles were filled; None for tiles of the source."""
+        return self._filling
+
+    @property
+    def is_single(self) -> bool:
+        """Whether this is one tile of several, which may be unlike the others."""
+        return len(self.tiles) == 1 and not self.complete
+
+    def wider(self, max_vertices: int) -> Sample:
+        """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
+
+        A sample that has all tiles is returned itself.
+        """
+        if self.complete:
+            return self
+        other = Sample(self.blocks, max_vertices, self._pool, self._costs, self.tick)
+        return other if self._filling is None else other.filled(*self._filling)
+
+    def filled(self, settings: TileSettings, density: int) -> Sample:
+        """Return the same tiles, filled for these settings (see `fill`) from the source."""
+        if self.blocks.complete:
+            return self
+        other = copy(self)
+        other._filling, other._known = (settings, density), Known()
+        filled = self._pool.map(lambda tile: fill(tile, settings, density), self._source)
+        other.tiles = list(self._ticking(filled))
+        return other
+
+    def map(self, work: Callable[[Tile], Result]) -> list[Result]:
+        """Return the results of `work` for the tiles of the sample, in order, by all threads."""
+        return list(self._ticking(self._pool.map(work, self.tiles)))
+
+    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
+        """Yield the results of `work` for all tiles of the series, in C order."""
+        indices = list(self.blocks.indices())
+        if self.blocks.in_memory:
+            results = self._pool.map(lambda index: work(self.blocks.read(index)), indices)
+            yield from self._ticking(results)
+        else:
+            tiles = (self.blocks.read(index) for index in indices)
+            yield from self._ticking(map_ahead(self._pool, work, tiles, MAX_TILES_AHEAD))
+
+    def run(self, settings: TileSettings, coding: Coding) -> Outcome:
+        """Code the tiles; the outcome that the series would have, by their weights."""
+        return self.run_all([(settings, coding)])[0]
+
+    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
+        """Return the outcome of `run` for each pair of settings and coding.
+
+        All trials run at once, so that a few large tiles keep all processors busy, too. What was
+        coded before is not coded again.
+        """
+        runs = [self._known.run(*trial) for trial in trials]
+        new = [trial for trial, run in zip(trials, runs, strict=True) if run is None]
+        jobs = [
+            _Job(tile, *trial, before)
+            for trial in new
+            for tile, before in zip(self.tiles, self._before(*trial), strict=True)
+        ]
+        results = list(self._ticking(self._pool.map(lambda job: job.run()[0], jobs)))
+        number = len(self.tiles)
+        fresh = [
+            Run(*trial, results[start : start + number])
+            for start, trial in zip(range(0, len(results), number), new, strict=True)
+        ]
+        for run in fresh:
+            self._known.keep(run)
+        found = iter(fresh)
+        whole = [next(found) if run is None else run for run in runs]
+        return [total([tile.outcome for tile in run.tiles], self.weights) for run in whole]
+
+    def coded(self, settings: TileSettings, coding: Coding) -> dict[Index, TileRun]:
+        """Return the tiles by their indices if they were coded so before, else nothing."""
+        run = self._known.run(settings, coding)
+        return {} if run is None else dict(zip(self.indices, run.tiles, strict=True))
+
+    def decoded(self, settings: TileSettings, coding: Coding) -> list[npt.NDArray[np.float32]]:
+        """Code and decode the tiles; the decoded values, float32."""
+        before = self._before(settings, coding)
+        jobs = [
+            _Job(tile, settings, coding, known)
+            for tile, known in zip(self.tiles, before, strict=True)
+        ]
+        runs = list(self._ticking(self._pool.map(_Job.run, jobs)))
+        self._known.keep(Run(settings, coding, [run for run, _ in runs]))
+        return [values.astype(np.float32) for _, values in runs]
+
+    def _before(self, settings: TileSettings, coding: Coding) -> Sequence[TileRun | None]:
+        """Return each tile as it was coded before, where it was, perhaps with another head."""
+        run = self._known.same_streams(settings, coding)
+        return [None] * len(self.tiles) if run is None else run.tiles
+
+    def _ticking(self, results: Iterable[Result]) -> Iterator[Result]:
+        """Yield results, and call `tick` after each has come."""
+        for result in results:
+            self.tick()
+            yield result
+
+
+def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list[tuple[int, int]]:
+    """Choose `count` of the tiles; pairs as of `strata`."""
+    if count == tiles:
+        return [(number, 1) for number in range(count)]
+    if costs is not None:
+        return strata(costs, count)
+    # In C order: a reader of a large series keeps one layer of tiles only.
+    weights = [tiles * (place + 1) // count - tiles * place // count for place in range(count)]
+    return list(zip(sorted(spread_order(tiles)[:count]), weights, strict=True))

@@ -1,0 +1,472 @@
+"""Tiles of a series: their blocks, their coding, and what is known of tiles coded before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import product
+from math import prod
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.features.features import Extent
+from fhash_codec.measure.errors import error_sums
+from fhash_codec.measure.value_range import power_of_two
+from fhash_formats.series import ArraySeries, Series
+from fhash_formats.support.threads import chunk_region
+from fhash_formats.transform import encoding
+from fhash_formats.transform.decoding import decode_tile
+from fhash_formats.transform.encoding import WEIGHT, CodedTile, encode_tile, exact_tile
+from fhash_formats.transform.tile_format import Shape, TileSettings
+from fhash_formats.transform.values import about_origin, cast
+
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+Index = tuple[int, int, int, int]
+"""Position (t, z, y, x) of a tile in the grid of tiles."""
+
+MAX_BYTES_IN_MEMORY = 1 << 30
+"""Largest size of a box that stays in memory, in bytes; a larger one is read by layers of tiles."""
+
+
+class Tile(NamedTuple):
+    """Values (t, z, y, x) of a tile, and which of its vertices count.
+
+    Vertices that count are those whose error is measured and bounded: in the coreset and finite.
+    The mask may still include values that are not finite; the coder leaves those out itself.
+    """
+
+    values: Values
+    counted: Mask | None
+    """Mask of the same shape, True where a vertex counts; None if all vertices count."""
+
+    @property
+    def counted_vertices(self) -> int:
+        """Number of vertices that count."""
+        if self.counted is None:
+            return self.values.size
+        return int(np.count_nonzero(self.counted))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no vertex counts."""
+        return self.counted is not None and not self.counted.any()
+
+
+def fits_memory(series: Series) -> bool:
+    """Whether a whole series would stay in memory as a box of vertices."""
+    itemsize = (series.source_dtype or series.dtype).itemsize
+    return prod(series.shape) * itemsize <= MAX_BYTES_IN_MEMORY
+
+
+class _BoxInMemory:
+    """Values and mask of the box over all steps once they were read, shared by all tilings."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.content: Tile | None = None
+
+
+class Blocks:
+    """The feature bounding box over all steps as a grid of tiles (t, z, y, x).
+
+    Attributes:
+        shape: vertices of the box over all steps.
+        tile: vertices of a tile; the last tile along an axis may reach beyond the box.
+        grid: number of tiles along each axis; along t, of all boxes together.
+        weights: of each box of this shape, one after the other: boxes of the series that it stands
+            for. A series itself is one box.
+        source_dtype: type of the source, in the byte order of this machine. It is an integer type
+            also where missing values made floats of integers.
+        origin: integer that is subtracted from the values of the source; 0 but for 64-bit integers
+            beyond 2^53.
+        dtype: type of the values: that of the source, or int64 for differences from the origin.
+        complete: whether all vertices of the box are in the coreset at all steps.
+    """
+
+    def __init__(self, series: Series, extent: Extent, tile: Shape, origin: int = 0) -> None:
+        self._series, self._extent, self.origin = series, extent, origin
+        self.source_dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
+        self.dtype: np.dtype[Any] = np.dtype(np.int64) if origin else self.source_dtype
+        self.shape: Shape = (series.shape[0], *extent.box.shape)
+        self.complete = extent.samples == prod(self.shape)
+        self.weights: tuple[int, ...] = (1,)
+        self._box = _BoxInMemory()
+        self._only_layers = False
+        self._cut(tile)
+
+    def _cut(self, tile: Shape) -> None:
+        self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
+        t, z, y, x = (-(-length // n) for length, n in zip(self.shape, self.tile, strict=True))
+        self.grid: Index = (t * len(self.weights), z, y, x)
+        self._last_layer: tuple[int, Tile] | None = None
+
+    def retile(self, tile: Shape) -> Blocks:
+        """Return the same series in other tiles; the box in memory is shared."""
+        other = copy(self)
+        other._cut(tile)
+        return other
+
+    def by_layers(self) -> Blocks:
+        """Return the same tiles, of which layer after layer is read and none is kept.
+
+        So nothing is read of the other layers, of a short series either.
+        """
+        other = copy(self)
+        other._only_layers, other._last_layer = True, None
+        return other
+
+    def forget(self) -> None:
+        """Free the memory of the values, which are read again when they are asked for."""
+        with self._box.lock:
+            self._box.content = None
+        self._last_layer = None
+
+    def window(self, shape: Shape) -> Blocks:
+        """Return a part of the box over some steps, as one tile in memory: where values vary most.
+
+        shape: of the part, at most that of the box.
+        """
+        first = (self.shape[0] - shape[0]) // 2
+        frame = self._step(first + shape[0] // 2)
+        places = product(
+            *(
+                sorted({0, (length - n) // 2, length - n})
+                for length, n in zip(self.shape[1:], shape[1:], strict=True)
+            )
+        )
+        z, y, x = max(
+            places, key=lambda place: _variation(frame, _region((0, *place), (1, *shape[1:]))[1:])
+        )
+        return self.boxes(shape, [(first, z, y, x)], [prod(self.shape) // prod(shape)])
+
+    def boxes(self, shape: Shape, places: Sequence[Index], weights: Sequence[int]) -> Blocks:
+        """Return parts of one shape as a series in memory of its own, each of them one tile.
+
+        places: first vertices of the parts; parts of the series' border end there.
+        weights: see the class.
+        """
+        values, masks = [], []
+        for place in places:
+            low = (min(at, m - n) for at, m, n in zip(place, self.shape, shape, strict=True))
+            steps, *region = _region((*low,), shape)
+            for step in range(steps.start, steps.stop):
+                frame = self._step(step)
+                values.append(frame.values[tuple(region)])
+                if frame.counted is not None:
+                    masks.append(frame.counted[tuple(region)])
+        counted = np.stack(masks) if masks else None
+        other = copy(self)
+        other._box, other.shape, other.weights = _BoxInMemory(), shape, tuple(weights)
+        other.complete = counted is None or bool(counted.all())
+        other._box.content = Tile(np.stack(values), None if other.complete else counted)
+        other._cut(shape)
+        return other
+
+    def weight(self, index: Index) -> int:
+        """Return the weight of the box that a tile is of."""
+        return self.weights[index[0] * len(self.weights) // self.grid[0]]
+
+    def _step(self, step: int) -> Tile:
+        """Return values and mask (z, y, x) of one step."""
+        if self.in_memory:
+            values, counted = self._whole()
+            return Tile(values[step], None if counted is None else counted[step])
+        values, counted = self._load(range(step, step + 1))
+        return Tile(values[0], None if counted is None else counted[0])
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether the box over all steps stays in memory."""
+        return not self._only_layers and (
+            self._box.content is not None
+            or prod(self.shape) * self.dtype.itemsize <= MAX_BYTES_IN_MEMORY
+        )
+
+    def indices(self) -> Iterator[Index]:
+        """Yield the indices of all tiles in C order."""
+        yield from product(*(range(n) for n in self.grid))
+
+    def read(self, index: Index) -> Tile:
+        """Return a tile of values less the origin; beyond the box, border values are repeated.
+
+        Vertices beyond the box do not count. Any thread may call this where the box is in memory.
+        Otherwise only one thread may, in C order, because just the last layer in t is kept.
+        """
+        layer = self._layer(index[0])
+        region = (slice(None), *chunk_region(index[1:], self.tile[1:], self.shape[1:]))
+        values = layer.values[region]
+        in_coreset = None
+        if layer.counted is not None:
+            in_coreset = layer.counted[region]
+        padding = [(0, n - m) for n, m in zip(self.tile, values.shape, strict=True)]
+        if not any(after for _, after in padding):
+            if in_coreset is None or in_coreset.all():
+                return Tile(np.ascontiguousarray(values), None)
+            return Tile(np.ascontiguousarray(values), np.ascontiguousarray(in_coreset))
+        if in_coreset is None:
+            in_coreset = np.ones(values.shape, bool)
+        return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
+
+    def counted_values(self) -> Iterator[Values]:
+        """Yield the values that count of each step, less the origin.
+
+        A series that does not stay in memory is read once, step by step.
+        """
+        for step in range(self.shape[0]):
+            frame, mask = self._step(step)
+            yield frame if mask is None else frame[mask]
+
+    def _whole(self) -> Tile:
+        """Return the box over all steps, which is read at the first call."""
+        with self._box.lock:
+            if self._box.content is None:
+                self._box.content = self._load(range(self.shape[0]))
+            return self._box.content
+
+    def _layer(self, t: int) -> Tile:
+        """Return one layer of tiles, (up to tile t, z, y, x of the box)."""
+        box, number = divmod(t, self.grid[0] // len(self.weights))
+        first, last = number * self.tile[0], min((number + 1) * self.tile[0], self.shape[0])
+        steps = range(box * self.shape[0] + first, box * self.shape[0] + last)
+        if self.in_memory:
+            values, in_coreset = self._whole()
+            span = slice(steps[0], steps[-1] + 1)
+            return Tile(values[span], None if in_coreset is None else in_coreset[span])
+        if self._last_layer is None or self._last_layer[0] != t:
+            self._last_layer = None  # frees its memory before the next layer is read
+            self._last_layer = (t, self._load(steps))
+        return self._last_layer[1]
+
+    def _load(self, steps: range) -> Tile:
+        """Read the box at some steps from the series; an array in memory is not copied."""
+        held = self._series.values if isinstance(self._series, ArraySeries) else None
+        if held is not None and held.dtype == self.source_dtype and not self.origin:
+            values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
+            values.flags.writeable = False  # it is the caller's
+            return Tile(values, self._masks(steps))
+        values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
+        for number, step in enumerate(steps):
+            frame = self._series.read(step)[self._extent.box.slices()]
+            if frame.dtype.kind == "f" and self.dtype.kind != "f":
+                # Missing values are outside the coreset; any integer may stand there.
+                frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
+                frame = cast(np.where(np.isfinite(frame), frame, 0.0), self.source_dtype)
+            values[number] = frame
+        values = about_origin(values, self.origin) if self.origin else values
+        return Tile(values, self._masks(steps))
+
+    def _masks(self, steps: range) -> Mask | None:
+        """Return which vertices of the box are in the coreset at some steps; None for all."""
+        if self.complete:
+            return None
+        return np.stack([self._extent.mask(step) for step in steps])
+
+
+def _region(place: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
+    """Return the slices of a part by its first vertices."""
+    return tuple(slice(low, low + n) for low, n in zip(place, shape, strict=True))
+
+
+def _variation(frame: Tile, region: tuple[slice, ...]) -> float:
+    """Return how much counted values of a region (z, y, x) of a step differ from neighbours."""
+    values, counted = frame
+    with np.errstate(all="ignore"):
+        part = values[region].astype(np.float64)
+        if counted is not None:
+            part[~counted[region]] = np.nan
+        return float(sum(np.nansum(np.abs(np.diff(part, axis=axis))) for axis in range(part.ndim)))
+
+
+MIN_STEP_SHARE = 2.0**-26
+"""Smallest quantiser step as a share of the value range: integers beyond 2^30 cannot be coded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BulkPart:
+    """The part of a promise that is about the bulk of the values, as tiles measure it."""
+
+    low: float
+    """Least value of the bulk, in data units."""
+    high: float
+    """Greatest value of the bulk, in data units."""
+    weight: float = 1.0
+    """Mean squared error that is promised of all values, as a multiple of that of the bulk."""
+    alone: bool = False
+    """Whether nothing is promised of the other values; the weight is then 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coding(encoding.Coding):
+    """Options of the encoder for the tiles of a series.
+
+    They change the bytes, but a decoder does not need them. What a decoder needs is in
+    `TileSettings`.
+    """
+
+    weight: float = WEIGHT
+    keep_missing: bool = False
+    exact: bool = False
+    """Whether tiles are stored without loss, by `exact_tile`; the other options are then unused."""
+    bulk: BulkPart | None = None
+    """Part of the promise about the bulk, which changes what is measured and no byte."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Size and error of some coded tiles."""
+
+    size: int
+    """Bytes of the streams."""
+    squares: float
+    """Sum of the squared errors over the vertices that count, in squared data units."""
+    count: int
+    """Number of finite values that count."""
+    max_error: float
+    """Largest absolute error, in data units."""
+    nonzero: int = 0
+    """Number of coefficients that are not 0."""
+    bulk_squares: float = 0.0
+    """Sum of the squared errors in the bulk times its weight; 0 without a promise about it."""
+    bulk_count: int = 0
+    """Number of the values that this sum is over."""
+
+    def psnr(self, data_range: float) -> float:
+        """Return the PSNR in dB; infinite without error.
+
+        Where a promise about the bulk is harder to keep than that about all values, it is the PSNR
+        over all values that would be as far from its promise.
+        """
+        mean = self.squares / self.count if self.count else 0.0
+        if self.bulk_count:
+            mean = max(mean, self.bulk_squares / self.bulk_count)
+        if mean == 0 or data_range == 0:
+            return math.inf
+        return 20 * math.log10(data_range) - 10 * math.log10(mean)
+
+
+def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile, Outcome]:
+    """Code one tile and measure its size and error."""
+    values, counted = tile
+    if coding.exact:
+        occupied = None
+        if settings.mask is not None:
+            occupied = np.ones(values.shape, bool) if counted is None else counted
+        coded = exact_tile(values, occupied=occupied, origin=settings.origin)
+        size = len(coded.data)
+        return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
+    coded = encode_tile(values, settings, coding, in_coreset=counted)
+    return coded, measured(tile, coded, settings, coding)
+
+
+def recoded(tile: Tile, data: bytes, settings: TileSettings, nonzero: int = 0) -> CodedTile:
+    """Return a tile whose stream is known, as these settings decode it."""
+    t, z, y, x = tile.values.shape
+    decoded = decode_tile(data, (t, z, y, x), tile.values.dtype, settings)
+    return CodedTile(data=data, decoded=decoded, nonzero=nonzero)
+
+
+def measured(tile: Tile, coded: CodedTile, settings: TileSettings, coding: Coding) -> Outcome:
+    """Return size and error of a tile that was coded with these settings."""
+    values, counted = tile
+    # Scaled, so that neither huge nor tiny ranges over- or underflow.
+    scale = power_of_two(settings.high - settings.low)
+    bulk = coding.bulk
+    ends = None if bulk is None else (bulk.low, bulk.high)
+    sums = error_sums(values, coded.decoded, counted, scale, ends)
+    squares, count = sums.squares, sums.number
+    bulk_squares, bulk_count = sums.bulk_squares, sums.bulk_count
+    if bulk is not None and bulk.alone:
+        squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
+    return Outcome(
+        size=len(coded.data),
+        # Divided twice: the square of the largest scale is no float.
+        squares=squares / scale / scale,
+        count=count,
+        max_error=sums.largest / scale,
+        nonzero=coded.nonzero,
+        bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale / scale,
+        bulk_count=bulk_count,
+    )
+
+
+def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> Outcome:
+    """Sum outcomes up to one. weights: number of tiles that each stands for (default 1)."""
+    pairs = list(zip(weights or [1] * len(outcomes), outcomes, strict=True))
+    return Outcome(
+        size=sum(weight * o.size for weight, o in pairs),
+        squares=math.fsum(weight * o.squares for weight, o in pairs),
+        count=sum(weight * o.count for weight, o in pairs),
+        max_error=max((o.max_error for o in outcomes), default=0.0),
+        nonzero=sum(weight * o.nonzero for weight, o in pairs),
+        bulk_squares=math.fsum(weight * o.bulk_squares for weight, o in pairs),
+        bulk_count=sum(weight * o.bulk_count for weight, o in pairs),
+    )
+
+
+MAX_BYTES = 64 << 20
+"""Bytes of streams that are kept; the oldest go first."""
+
+
+class TileRun(NamedTuple):
+    """A tile as it was coded once."""
+
+    stream: bytes
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Run:
+    """Tiles of a sample as they were coded once."""
+
+    settings: TileSettings
+    coding: Coding
+    tiles: list[TileRun]
+    """The tiles, in the order of the sample."""
+
+    def is_of(self, settings: TileSettings, coding: Coding) -> bool:
+        """Whether the tiles would be coded to these streams, and decode to the same values."""
+        return self.settings.head is settings.head and self.has_streams_of(settings, coding)
+
+    def has_streams_of(self, settings: TileSettings, coding: Coding) -> bool:
+        """Whether the tiles would be coded to these streams.
+
+        Without a bound, a head changes what streams decode to and no byte of them.
+        """
+        if self.coding != coding:
+            return False
+        if self.settings.head is not settings.head and coding.error is not None:
+            return False
+        return replace(self.settings, head=None) == replace(settings, head=None)
+
+
+class Known:
+    """The latest runs of a sample."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._runs: list[Run] = []
+
+    def run(self, settings: TileSettings, coding: Coding) -> Run | None:
+        """Return the run of these settings and coding; None where it was not kept."""
+        return next((run for run in self._runs if run.is_of(settings, coding)), None)
+
+    def same_streams(self, settings: TileSettings, coding: Coding) -> Run | None:
+        """Return a run of the same streams; None where none was kept."""
+        runs = self._runs
+        return next((run for run in runs if run.has_streams_of(settings, coding)), None)
+
+    def keep(self, run: Run) -> None:
+        """Keep a run, and forget the oldest of too many bytes."""
+        self._runs.insert(0, run)
+        total = 0
+        for number, each in enumerate(self._runs):
+            total += sum(len(tile.stream) for tile in each.tiles)
+            if total > MAX_BYTES:
+                del self._runs[number:]
+                break

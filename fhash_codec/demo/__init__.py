@@ -1,1 +1,0 @@
-"""The series and the picture of `fhash demo`."""

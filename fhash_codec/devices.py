@@ -1,0 +1,171 @@
+"""Devices and threads with which torch computes. Import this module before torch."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    import torch
+
+# Between two small operations OpenMP threads spin, by default for milliseconds. On a machine in
+# shared use the spinning threads keep off the core the very threads they wait for: training runs 8
+# times slower beside a second training. 10,000 rounds take some tens of microseconds, more than the
+# pause between operations, so an idle machine stays as fast.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+VERTICES_A_THREAD = 12_000
+"""Vertices of a training step per thread; with fewer, a further thread costs more than it saves."""
+_PROCESS = os.getpid()
+"""The process that imported this module."""
+
+
+def leave_threads_of_parent() -> None:
+    """Let torch compute in one thread in a process forked since the import of this module.
+
+    OpenMP believes there that it still has the threads of the parent, and waits for them for ever.
+    """
+    if os.getpid() != _PROCESS:
+        import torch
+
+        torch.set_num_threads(1)
+
+
+@contextmanager
+def threads_for(vertices: int) -> Iterator[int]:
+    """Limit torch's threads, while the context lasts, to those that pay for a training.
+
+    The number never exceeds the number before. The context yields it.
+
+    Args:
+        vertices: vertices of a training step.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    threads = max(1, min(before, vertices // VERTICES_A_THREAD))
+    torch.set_num_threads(threads)
+    try:
+        yield threads
+    finally:
+        torch.set_num_threads(before)
+
+
+# The matrix products of CUDA give the same bits in every run only with workspaces of one kind.
+# torch looks at this variable once, at the first product of the process.
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+
+CUDA_PAYS = 1 << 27
+"""Samples of all epochs from which on `auto` trains on CUDA.
+
+An unmeasured guess: some 2 s to start CUDA against 3e7 to 1e8 samples a second on a CPU.
+"""
+
+
+def has_torch() -> bool:
+    """Return whether torch is installed, without importing it."""
+    return find_spec("torch") is not None
+
+
+def need_torch(what: str) -> None:
+    """Import torch, or raise MissingDependencyError that names what needs it and the extra."""
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name == "torch"
+        reason = "" if absent else f" (the torch that is installed fails: {error})"
+        raise MissingDependencyError(
+            f"{what} needs torch: pip install 'fhash[train]'{reason}"
+        ) from error
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the torch device named cpu, cuda or auto; auto is CUDA where there is a device.
+
+    Raises InputError for cuda where torch finds no CUDA device, MissingDependencyError without
+    torch.
+    """
+    need_torch(f"device '{name}'")
+    import torch
+
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("device is 'cuda', but torch finds no CUDA device here; use --device cpu")
+    return torch.device(name)
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's text: CUDA adds advice for programmers to it."""
+    return str(error).strip().split("\n")[0]
+
+
+def training_device(name: str, samples: int, needed_bytes: int) -> torch.device:
+    """Return the torch device for a training; auto is CUDA where that pays and fits.
+
+    Args:
+        name: cpu, cuda or auto.
+        samples: samples that the training takes, those of all epochs.
+        needed_bytes: memory that it needs on a device of its own.
+
+    Raises:
+        InputError: cuda has no device, or one with too little free memory.
+        MissingDependencyError: torch is not installed.
+    """
+    device = choose_device(name)
+    import torch
+
+    if device.type == "cpu" or (name == "auto" and samples < CUDA_PAYS):
+        return torch.device("cpu")
+    free, _ = torch.cuda.mem_get_info(device)
+    if needed_bytes <= free:
+        return device
+    lack = (
+        f"training needs about {needed_bytes / 2**30:.1f} GiB on the CUDA device,"
+        f" of which {free / 2**30:.1f} GiB are free"
+    )
+    if name == "auto":
+        warnings.warn(f"{lack}; it takes the CPU", FhashWarning, stacklevel=2)
+        return torch.device("cpu")
+    raise InputError(f"{lack}; use --device cpu, or a feature or key frames that select less")
+
+
+@contextmanager
+def enough_memory(device: torch.device) -> Iterator[None]:
+    """Raise InputError where the memory of a CUDA device runs out while the context lasts."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise InputError(
+            f"the memory of the device {device} ran out in training ({first_line(error)});"
+            " use --device cpu, which goes on from a checkpoint, too"
+        ) from error
+
+
+@contextmanager
+def same_bits(device: torch.device, wanted: bool) -> Iterator[None]:
+    """Let torch compute the same bits in every run on a CUDA device while the context lasts.
+
+    Sums are then sorted instead of added by atomic operations in any order. An operation that has
+    no such way is a RuntimeError. On a CPU nothing changes.
+    """
+    import torch
+
+    if device.type == "cpu" or not wanted:
+        yield
+        return
+    before = torch.are_deterministic_algorithms_enabled()
+    only_warns = torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=only_warns)

@@ -1,1 +1,0 @@
-"""The paper profile's tables through the coder of the profile compact: `--tables transform`."""

@@ -1,1 +1,0 @@
-"""Training of the paper's model: the loop, restarts at a lower rate, and interruption."""

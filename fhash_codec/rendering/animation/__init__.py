@@ -1,1 +1,0 @@
-"""Several pictures: animations, films and tracked features."""

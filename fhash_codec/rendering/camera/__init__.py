@@ -1,1 +1,0 @@
-"""Cameras, poses and rays: where a picture is seen from."""

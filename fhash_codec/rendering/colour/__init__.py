@@ -1,1 +1,0 @@
-"""Colours and opacities of values: colour maps, presets, transfer functions."""

@@ -1,1 +1,0 @@
-"""One picture: planned, explained and finished."""

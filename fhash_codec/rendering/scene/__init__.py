@@ -1,1 +1,0 @@
-"""Scenes: what is asked of a picture, as records and text without arrays."""

@@ -1,1 +1,0 @@
-"""The march pass by pass over arrays, in numpy or torch."""

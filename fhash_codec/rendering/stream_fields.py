@@ -1,0 +1,400 @@
+"""Fields that streamed samples are read from: the network of a file, or another model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.paper.model import PaperModel, PointSampler, PointTables
+from fhash_codec.paper.network import Network
+from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
+from fhash_codec.rendering.grid import Warp
+from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Units
+from fhash_codec.volume import Volume
+from fhash_formats.errors import InputError
+from fhash_formats.support.threads import usable_threads
+
+
+class Inference(Protocol):
+    """A network at places (n, 3), float64, x, y, z in vertices of its box, within the box."""
+
+    def values(self, places: Array) -> Array:
+        """Normalised values, float32 (n,)."""
+        ...
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives by x, y and z per vertex, float32 (n, 3), as `sample_points` has them."""
+        ...
+
+
+def inference_in(arrays: Arrays, network: Network, key: float) -> Inference:
+    """Inference for places in arrays: fused kernels on a device, or the host, with a warning."""
+    if arrays.device is not None:
+        # Only tensors have a device, so torch is here.
+        from fhash_codec.paper.engines.fused.engine import start_points
+
+        fused = start_points(network, key, arrays.device)
+        if fused is not None:
+            return fused
+    return HostInference(network, key, arrays)
+
+
+class HostInference:
+    """Inference on the host, in several threads, for places in any arrays (paper/model.py).
+
+    The value of a place has the same bits whatever other places are evaluated with it; so it has by
+    fused kernels.
+
+    The tables of the whole box are held in memory. They are interpolated in time once, since a
+    picture has one key index.
+    """
+
+    def __init__(self, network: Network, key: float, arrays: Arrays) -> None:
+        self._arrays = arrays
+        self._sampler = PointSampler(PointTables.of_box(network, key), key)
+
+    def values(self, places: Array) -> Array:
+        return self._arrays.array(self._sampled(places, None))
+
+    def slopes(self, places: Array) -> Array:
+        slopes = np.empty((len(places), 4), np.float32)
+        self._sampled(places, slopes)
+        return self._arrays.array(slopes[:, :0:-1])
+
+    def _sampled(self, places: Array, slopes: Array | None) -> Array:
+        """Values (n,) at places; derivatives by t, z, y and x (n, 4) go into `slopes`."""
+        values = np.empty(len(places), np.float32)
+        x, y, z = self._arrays.host(places).T
+        self._sampler.sample((np.zeros(1), z, y, x), values, slopes, usable_threads())
+        return values
+
+
+CORNERS = tuple(product((0, 1), repeat=3))
+"""Corners (z, y, x) of a cell: 0 for the vertex before a place, 1 for the one after it."""
+
+
+class Field(Protocol):
+    """Values anywhere in the domain, in arrays of `arrays`.
+
+    Places (n, 3), float64, are x, y, z in vertices of the domain.
+    """
+
+    @property
+    def arrays(self) -> Arrays:
+        """The arrays that places and values are in."""
+        ...
+
+    @property
+    def bounds(self) -> Array:
+        """The box (3, 2), x, y, z, beyond which nothing has a value."""
+        ...
+
+    @property
+    def vertices(self) -> Array:
+        """The box (3, 2), x, y, z, from the first vertex to the last."""
+        ...
+
+    @property
+    def bricks(self) -> Bricks:
+        """Bricks with values at least as far apart as those of the field."""
+        ...
+
+    @property
+    def first(self) -> Array:
+        """The place (3,), x, y, z, at which the first brick and the first cell begin."""
+        ...
+
+    def visible(self, palette: Palette) -> Array:
+        """Cells (z, y, x), the first at `first`, in which a sample could have an opacity.
+
+        A few more may be among them.
+        """
+        ...
+
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
+        """Values, float64 (n,), NaN where there is none, and where none is wanted.
+
+        wanted: bool (n,). A device may wait in order to compute no others; without it a device
+            computes all and does not wait.
+        """
+        ...
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives by x, y and z per vertex, float64 (n, 3), 0 where there are none."""
+        ...
+
+
+def central_slopes(field: Field, places: Array) -> Array:
+    """Slopes (n, 3) at places (n, 3) by central differences.
+
+    They are over one vertex before and behind along each axis, clamped to those of the field. Where
+    one of the two has no value, the field's own slope along that axis stands.
+    """
+    arrays, xp, (low, high) = field.arrays, field.arrays.xp, field.vertices.T
+    slopes = arrays.empty((len(places), 3))
+    for axis in range(3):
+        ends = []
+        for offset in (-1.0, 1.0):
+            moved = arrays.copy(places)
+            moved[:, axis] = xp.clip(
+                xp.clip(places[:, axis], low[axis], high[axis]) + offset, low[axis], high[axis]
+            )
+            ends.append(field.values(moved))
+        slopes[:, axis] = (ends[1] - ends[0]) / 2
+    (missing,) = arrays.nonzero(xp.any(xp.isnan(slopes), axis=1))
+    if len(missing):
+        slopes[missing] = xp.where(
+            xp.isnan(slopes[missing]), field.slopes(places[missing]), slopes[missing]
+        )
+    return slopes
+
+
+class CoresetField:
+    """The box of a coreset, for fields that have values within the coreset alone.
+
+    A place has a value where all vertices of weight around it are in the coreset. Which one is not
+    known before the field is evaluated: any value of the range, with a margin.
+    """
+
+    def __init__(
+        self,
+        in_coreset: npt.NDArray[np.bool_],
+        first: npt.ArrayLike,
+        flat: npt.ArrayLike,
+        ends: tuple[float, float],
+        arrays: Arrays,
+    ) -> None:
+        """Prepare a box.
+
+        Args:
+            in_coreset: bool (z, y, x), its vertices.
+            first: (3,), x, y, z, the first of them in vertices of the domain.
+            flat: bool (3,), x, y, z, axes along which the domain has one vertex.
+            ends: of the range of values.
+            arrays: that places and values are in.
+        """
+        self.arrays = arrays
+        counts = np.array(in_coreset.shape[::-1])
+        low = np.array(first, np.float64)
+        vertices = np.stack([low, low + counts - 1], axis=-1)
+        widened = np.where(np.array(flat)[:, None], [-0.5, 0.5], 0.0)
+        self.first, self.vertices = arrays.array(low), arrays.array(vertices)
+        self.bounds = arrays.array(vertices + widened)
+        self._last, self._flat = arrays.array(counts - 1.0), arrays.array(flat)
+        self._jumps = (1, int(counts[0]), int(counts[0] * counts[1]))
+        with arrays.guarded():
+            self._in_coreset = arrays.array(in_coreset)
+        self.bricks = _possible(in_coreset, *ends)
+
+    def visible(self, palette: Palette) -> Array:
+        """Cells with a vertex of the coreset: their values are not known before evaluation."""
+        return _of_cells(self._in_coreset, self.arrays.xp.logical_or)
+
+    def inside(self, places: Array) -> tuple[Array, Array]:
+        """Places (n, 3) in vertices of the box, clipped to it, and whether they have a value."""
+        arrays, xp, last = self.arrays, self.arrays.xp, self._last
+        at = xp.where(self._flat, 0.0, places - self.first)
+        inside = xp.all((at >= 0) & (at <= last), axis=1)
+        at = xp.clip(at, 0 * last, last)
+        low = arrays.to_int64(at)
+        first = low[:, 0] + low[:, 1] * self._jumps[1] + low[:, 2] * self._jumps[2]
+        jumps = [
+            arrays.to_int64(at[:, axis] > low[:, axis]) * jump
+            for axis, jump in enumerate(self._jumps)
+        ]
+        in_coreset = self._in_coreset.reshape(-1)
+        for corner in CORNERS:
+            jump = sum(step for up, step in zip(corner[::-1], jumps, strict=True) if up)
+            inside &= xp.take(in_coreset, first + jump)
+        return at, inside
+
+
+class NetworkField(CoresetField):
+    """The network of a file of the profile paper, evaluated at every place.
+
+    Between vertices it has values of its own.
+    """
+
+    def __init__(self, volume: Volume, step: float, units: Units, arrays: Arrays = NUMPY) -> None:
+        model = volume._model
+        if not isinstance(model, PaperModel):
+            raise InputError(
+                f"{volume.path}: a file of the profile {volume.profile} has no network"
+            )
+        self._low, self._high = (
+            float(end) for end in units.to([volume.value_range.low, volume.value_range.high])
+        )
+        super().__init__(
+            np.ascontiguousarray(volume.occupancy(step, volume.box)),
+            [low for low, _ in reversed(volume.box)],
+            np.array(volume.shape[:0:-1]) == 1,
+            (self._low, self._high),
+            arrays,
+        )
+        with arrays.guarded():
+            self._inference = inference_in(arrays, model.network, volume.key_times.key_index(step))
+
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
+        arrays, (at, inside) = self.arrays, self.inside(places)
+        result = arrays.full(len(places), np.nan)
+        if wanted is None:
+            some = arrays.candidates(inside)
+        else:
+            (some,) = arrays.nonzero(inside & wanted)
+        if len(at := at[some]):
+            unit = arrays.xp.clip(arrays.to_float64(self._inference.values(at)), 0.0, 1.0)
+            values = self._low + unit * (self._high - self._low)
+            result[some] = arrays.kept(inside[some], values, np.nan)
+        return result
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives as `Field` has them, analytic, through interpolation and network."""
+        arrays, (at, inside) = self.arrays, self.inside(places)
+        result, some = arrays.full((len(places), 3), 0.0), arrays.candidates(inside)
+        if len(at := at[some]):
+            slopes = arrays.to_float64(self._inference.slopes(at)) * (self._high - self._low)
+            slopes = arrays.xp.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
+            result[some] = arrays.kept(inside[some], slopes, 0.0)
+        return result
+
+
+def _possible(in_coreset: npt.NDArray[np.bool_], low: float, high: float) -> Bricks:
+    """Bricks with the values that a field of a coreset may have: a range, with a margin."""
+    bricks = Bricks.of(
+        Frame(values=np.where(in_coreset, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
+    )
+    has_value = bricks.low <= bricks.high
+    return replace(
+        bricks,
+        low=np.where(has_value, np.float32(2 * low - high), np.float32(np.inf)),
+        high=np.where(has_value, np.float32(2 * high - low), np.float32(-np.inf)),
+    )
+
+
+def _of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
+    """Reduce the eight vertices of each cell (z, y, x) by a function of two arrays.
+
+    An axis of one vertex has one cell.
+    """
+    for axis in range(3):
+        if values.shape[axis] > 1:
+            before = (slice(None),) * axis
+            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
+    return values
+
+
+class WarpedField:
+    """A field on the even grid that is drawn, of a field on the uneven axes of the series.
+
+    Between two drawn vertices places run linearly. Bricks and cells take in all that they touch.
+    """
+
+    def __init__(self, field: Field, warp: Warp) -> None:
+        """Stand between a marcher and a field."""
+        self._field, self.arrays = field, field.arrays
+        arrays = field.arrays
+        counts = [
+            own if places is None else len(places)
+            for own, places in zip(warp.counts, warp.places, strict=True)
+        ]
+        self._places = [
+            np.arange(count, dtype=np.float64) if places is None else places
+            for count, places in zip(counts, warp.places, strict=True)
+        ]
+        self._tables = [None if places is None else arrays.array(places) for places in warp.places]
+        ends, inner = (arrays.host(box) for box in (field.bounds, field.vertices))
+        self.bounds = arrays.array(np.stack([self._drawn(end) for end in ends.T], axis=-1))
+        self.vertices = arrays.array(np.stack([self._drawn(end) for end in inner.T], axis=-1))
+        self._origin = np.floor(arrays.host(self.vertices)[:, 0]).astype(np.int64)
+        self._last = np.ceil(arrays.host(self.vertices)[:, 1]).astype(np.int64)
+        self.first = arrays.array(self._origin.astype(np.float64))
+        self.bricks = self._drawn_bricks()
+
+    def _drawn(self, places: Array) -> Array:
+        """Places (3,) of the series in drawn vertices, beyond the ends as far beyond."""
+        drawn = []
+        for at, own, table in zip(places, self._places, self._tables, strict=True):
+            drawn.append(
+                float(at) if table is None else float(np.interp(at, own, np.arange(len(own))))
+            )
+        return np.array(drawn)
+
+    def _drawn_bricks(self) -> Bricks:
+        """Bricks of drawn cells with the extreme values of all bricks that they touch."""
+        bricks = self._field.bricks
+        first = self.arrays.host(self._field.first)
+        low, high = bricks.low, bricks.high
+        for axis, number in ((0, 2), (1, 1), (2, 0)):
+            begin, end = self._touched(number, SIDE, low.shape[axis], float(first[number]))
+            low = _extremes(low, begin, end, axis, np.minimum)
+            high = _extremes(high, begin, end, axis, np.maximum)
+        return replace(bricks, low=low, high=high)
+
+    def _touched(
+        self, number: int, side: int, blocks: int, first: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """First and last block of the series that each block of drawn cells touches.
+
+        number: axis, 0 for x. side: cells of a block. blocks: of the series. first: where they
+        begin.
+        """
+        origin, last = int(self._origin[number]), int(self._last[number])
+        starts = np.arange(origin, max(last, origin + 1), side)
+        stops = np.minimum(starts + side, last)
+        own = self._places[number]
+        ends = [own[np.clip(at, 0, len(own) - 1)] - first for at in (starts, stops)]
+        begin = np.floor(ends[0] / side - 1e-9)
+        end = np.floor(ends[1] / side + 1e-9)
+        return (
+            np.clip(begin, 0, blocks - 1).astype(np.int64),
+            np.clip(end, 0, blocks - 1).astype(np.int64),
+        )
+
+    def visible(self, palette: Palette) -> Array:
+        """Drawn cells (z, y, x) that touch a visible cell of the series."""
+        seen = self.arrays.host(self._field.visible(palette))
+        first = self.arrays.host(self._field.first)
+        for axis, number in ((0, 2), (1, 1), (2, 0)):
+            begin, end = self._touched(number, 1, seen.shape[axis], float(first[number]))
+            seen = _extremes(seen, begin, end, axis, np.logical_or)
+        return self.arrays.array(seen)
+
+    def values(self, places: Array, wanted: Array | None = None) -> Array:
+        """Values (n,) at places (n, 3) in drawn vertices, NaN where there is none."""
+        return self._field.values(self._moved(places)[0], wanted)
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives (n, 3) by x, y and z per drawn vertex, 0 where there are none."""
+        moved, rates = self._moved(places)
+        return self._field.slopes(moved) * rates
+
+    def _moved(self, places: Array) -> tuple[Array, Array]:
+        """Places (n, 3) in vertices of the series, and vertices of it per drawn vertex (n, 3)."""
+        arrays, xp = self.arrays, self.arrays.xp
+        moved, rates = arrays.copy(places), arrays.full(places.shape, 1.0)
+        for axis, table in enumerate(self._tables):
+            if table is None:
+                continue
+            at = xp.clip(places[:, axis], 0.0, float(len(table) - 1))
+            before = arrays.to_int64(xp.clip(xp.floor(at), 0.0, float(max(len(table) - 2, 0))))
+            low = xp.take(table, before)
+            rate = xp.take(table, before + 1) - low
+            moved[:, axis] = low + (at - arrays.to_float64(before)) * rate
+            rates[:, axis] = rate
+        return moved, rates
+
+
+def _extremes(
+    values: np.ndarray, begin: np.ndarray, end: np.ndarray, axis: int, reduce: np.ufunc
+) -> np.ndarray:
+    """Reduce the spans `begin` to `end`, both included, of an axis."""
+    moved = np.moveaxis(values, axis, 0)
+    parts = [
+        reduce.reduce(moved[low : high + 1], axis=0) for low, high in zip(begin, end, strict=True)
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.stack(parts), 0, axis))

@@ -1,1 +1,0 @@
-"""The task and the frame that every marcher is given."""

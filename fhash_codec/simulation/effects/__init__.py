@@ -1,1 +1,0 @@
-"""Effects of a simulated scene, one file each, and the list of them all."""

@@ -1,1 +1,0 @@
-"""Adam, threads and devices for every training."""

@@ -1,0 +1,1 @@
+"""Views of a container for other programs: Zarr keys, HTTP, a store, packed Zarr stores."""

@@ -1,0 +1,715 @@
+"""CF conventions: packed values, names of axes, times, positions."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+import struct
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXES, Coordinate, Series, SourceMetadata, SourceVariable
+from fhash_formats.support.dates import (
+    CALENDARS,
+    MONTH_UNITS,
+    SINCE,
+    UNITS,
+    clock,
+    in_days,
+    of_texts,
+)
+from fhash_formats.support.values import STORED, json_attributes, text_of
+
+SCALING = frozenset(("scale_factor", "add_offset"))
+"""Attributes that make stored numbers counts of another unit."""
+
+AS_STORED = "; --raw-values reads the numbers as they are stored"
+"""Advice where attributes make no sense."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Packing:
+    """The packing of an array.
+
+    It has the stored type, the type of the values, the fill values, the scale and the offset (None:
+    none).
+    """
+
+    stored: np.dtype[Any]
+    dtype: np.dtype[Any]
+    fills: tuple[Any, ...] = ()
+    scale: float | None = None
+    offset: float | None = None
+
+    @property
+    def scaled(self) -> bool:
+        """Whether stored numbers are counts of another unit than the values."""
+        return self.scale is not None or self.offset is not None
+
+    @property
+    def integers(self) -> bool:
+        """Whether the values are integers, and only the missing ones made floats of them."""
+        return self.stored.kind in "iu" and not self.scaled and self.dtype != self.stored
+
+    def unpack(self, stored: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Physical values of stored ones; the same array where nothing is packed."""
+        numbers = stored.astype(stored.dtype.newbyteorder("="), copy=False).view(
+            self.stored
+        )  # the view is for _Unsigned
+        if self.dtype == self.stored:
+            # floats without scaling; the array is fresh and may be changed in place
+            for fill in self.fills:
+                numbers[numbers == fill] = np.nan
+            return numbers
+        values = numbers.astype(self.dtype)
+        if self.scale is not None:
+            values *= self.scale
+        if self.offset is not None:
+            values += self.offset
+        for fill in self.fills:
+            values[numbers == fill] = np.nan
+        return values
+
+
+def packing(
+    source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None
+) -> Packing:
+    """The packing that an array's attributes describe.
+
+    attributes: JSON values, or as h5py gives them. fill_value: a further fill value, from zarr's
+    own metadata. Raises InputError for an attribute that is not a number.
+    """
+    stored = dtype.newbyteorder("=")
+    signs = {"true": ("i", "u"), "false": ("u", "i")}.get(
+        text_of(_single(attributes.get("_Unsigned", ""))).lower()
+    )
+    other = signs is not None and stored.kind == signs[0]
+    if signs is not None and other:
+        stored = np.dtype(f"{signs[1]}{stored.itemsize}")
+    fills = []
+    for value in (fill_value, *(attributes.get(name) for name in ("_FillValue", "missing_value"))):
+        for each in value if isinstance(value, list | tuple | np.ndarray) else [value]:
+            if each is not None:
+                fills.append(_fill(source, each, stored, unsigned=other and stored.kind == "i"))
+    scale, offset = (_single(attributes.get(name)) for name in ("scale_factor", "add_offset"))
+    return _packing(
+        stored,
+        [fill for fill in fills if fill is not None and fill == fill],  # NaN marks itself
+        _number(source, "scale_factor", scale),
+        _number(source, "add_offset", offset),
+        _scaled_type(stored, scale, offset),
+    )
+
+
+def note_packing(series: Series, packed: Packing) -> None:
+    """Tell a series what stood for missing values in its source, and its integer type there."""
+    if packed.fills and not packed.scaled and series.fill is None:
+        series.fill = packed.fills[0].item()
+    if packed.scaled and packed.stored.kind == "i" and packed.stored.itemsize > 1:
+        lowest = np.iinfo(packed.stored).min + np.arange(3, dtype=packed.stored)
+        series.unlikely = frozenset(packed.unpack(lowest).tolist())
+    if packed.integers:
+        series.source_dtype = packed.stored
+
+
+def missing_values(source: str, dtype: np.dtype[Any], values: Sequence[float]) -> Packing:
+    """The packing of an array in which some numbers stand for missing values, and nothing else.
+
+    values: they occur nowhere if the type cannot hold them.
+    """
+    stored = dtype.newbyteorder("=")
+    fills = [_fill(source, value, stored) for value in values]
+    return _packing(
+        stored, [fill for fill in fills if fill is not None and fill == fill], None, None, stored
+    )
+
+
+def _packing(
+    stored: np.dtype[Any],
+    fills: Sequence[Any],
+    scale: float | None,
+    offset: float | None,
+    scaled: np.dtype[Any],
+) -> Packing:
+    dtype = stored
+    if scale is not None or offset is not None:
+        dtype = scaled
+    elif fills and stored.kind in "iu":
+        dtype = np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
+    return Packing(stored=stored, dtype=dtype, fills=tuple(fills), scale=scale, offset=offset)
+
+
+def _scaled_type(stored: np.dtype[Any], scale: Any, offset: Any) -> np.dtype[Any]:
+    """The type of scaled values, chosen as xarray does.
+
+    An offset alone, or of another type than the scale, is not CF and needs float64; so do integers
+    of 32 bits with both.
+    """
+    double = np.dtype(np.float64)
+    if not isinstance(scale, np.floating) or (
+        offset is not None and type(offset) is not type(scale)
+    ):
+        return double
+    wide = offset is not None and stored.kind in "iu" and stored.itemsize == 4
+    return double if wide or scale.dtype.itemsize > 8 else scale.dtype
+
+
+def _single(value: Any) -> Any:
+    """The only element of an attribute that is an array or list of one; else the attribute."""
+    if isinstance(value, np.ndarray):
+        return value.reshape(-1)[0] if value.size == 1 else value
+    return value[0] if isinstance(value, list | tuple) and len(value) == 1 else value
+
+
+def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = False) -> Any:
+    """A fill value in the stored type; None if that type cannot hold it, so that it never occurs.
+
+    unsigned: whether the value was written for unsigned numbers that are read as signed.
+
+    xarray writes the fill value of a float array of zarr format 3 as base64 of a little-endian
+    float64; others write a number or "NaN".
+    """
+    if isinstance(value, str | bytes):
+        value = text_of(value)
+        try:
+            value = float(value)
+        except ValueError:
+            try:
+                (value,) = struct.unpack("<d", base64.standard_b64decode(value))
+            except (ValueError, struct.error) as error:
+                raise InputError(
+                    f"{source}: the fill value {value!r} is not a number{AS_STORED}"
+                ) from error
+    if not isinstance(value, int | float | np.integer | np.floating):
+        raise InputError(f"{source}: the fill value {value!r} is not a number{AS_STORED}")
+    if stored.kind == "f":
+        with np.errstate(over="ignore"):
+            return stored.type(value)
+    if not math.isfinite(value) or value != int(value):
+        return None
+    integer = int(value)
+    limits = np.iinfo(stored)
+    if integer < 0 and stored.kind == "u":
+        integer += 2 ** (
+            8 * stored.itemsize
+        )  # the fill value of an _Unsigned array is written signed
+    if unsigned and integer > limits.max:
+        integer -= 2 ** (8 * stored.itemsize)
+    return stored.type(integer) if limits.min <= integer <= limits.max else None
+
+
+def _number(source: str, name: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise InputError(f"{source}: {name} is {value!r}, not a number{AS_STORED}")
+    return float(value)
+
+
+NAMES = {
+    "t": "time t times time_counter valid_time leadtime lead_time forecast_period forecast_time"
+    " date timestep timesteps time_step step steps record records frame frames",
+    "z": "z lev level levels height depth altitude alt plev pressure pressure_level isobaric"
+    " model_level_number bottom_top zc x3v x3 k",
+    "y": "y lat latitude rlat grid_latitude projection_y_coordinate south_north nlat yc x2v x2 j",
+    "x": "x lon longitude rlon grid_longitude projection_x_coordinate west_east nlon xc x1v x1 i",
+}
+"""Conventional names of coordinates, the most usual first; those of times before those of steps.
+
+x1v, x2v, x3v are Athena++'s, bottom_top and the like WRF's.
+"""
+
+ROLE_OF_NAME = {name: axis for axis, names in NAMES.items() for name in names.split()}
+
+AXIS_STANDARD_NAMES = (
+    ("t", re.compile(r"time|forecast_reference_time|forecast_period")),
+    (
+        "z",
+        re.compile(
+            r"(atmosphere|ocean)_.*_coordinate|height.*|altitude|depth.*|air_pressure"
+            r"|model_level_number|.*_sigma_.*"
+        ),
+    ),
+    (
+        "y",
+        re.compile(
+            r"latitude|grid_latitude|projection_y_coordinate|projection_y_angular_coordinate"
+        ),
+    ),
+    (
+        "x",
+        re.compile(
+            r"longitude|grid_longitude|projection_x_coordinate|projection_x_angular_coordinate"
+        ),
+    ),
+)
+AXIS_UNITS = (
+    ("t", re.compile(r"\S+ since \S.*")),
+    (
+        "z",
+        re.compile(
+            r"(pascal|pa|hpa|kpa|bar|millibar|mbar|mb|dbar|decibar|atm|layer|level|sigma_level)s?"
+        ),
+    ),
+    ("y", re.compile(r"degrees?_?n(orth)?")),
+    ("x", re.compile(r"degrees?_?e(ast)?")),
+)
+
+
+def role_of_name(name: str) -> str | None:
+    """The axis of a conventional name in any case, also with a trailing number ("time_0"), or
+    None."""
+    word = name.lower()
+    return ROLE_OF_NAME.get(word) or ROLE_OF_NAME.get(re.sub(r"(?<=..)_?\d+$", "", word))
+
+
+def role_of_coordinate(name: str, attributes: Mapping[str, Any]) -> str | None:
+    """The axis of a coordinate by CF, else by its name, or None.
+
+    CF 1.11, section 4: axis, standard_name, units, positive.
+    """
+    axis = str(attributes.get("axis", "")).lower()
+    if axis in AXES:
+        return axis
+    for key, table in (("standard_name", AXIS_STANDARD_NAMES), ("units", AXIS_UNITS)):
+        text = str(attributes.get(key, "")).strip().lower()
+        for role, pattern in table:
+            if pattern.fullmatch(text):
+                return role
+    if str(attributes.get("positive", "")).lower() in ("up", "down"):
+        return "z"
+    return role_of_name(name)
+
+
+def assign_axes(
+    what: str,
+    shape: Sequence[int],
+    hints: Sequence[str | None],
+    names: Sequence[str | None],
+    axes: tuple[str, ...] | None,
+) -> tuple[str, ...]:
+    """The axis of each of 3 or 4 dimensions.
+
+    `axes`, if the user gave it, decides. Otherwise the hints do. Dimensions without a hint take the
+    axes that are left in the order (t, z, y, x). 3 dimensions are (z, y, x) unless a hint says
+    time; then they are (t, y, x) first of all.
+
+    Raises InputError where that is ambiguous: two dimensions with one meaning, or an order that
+    cannot be completed with certainty.
+    """
+    if axes is not None:
+        if len(axes) != len(shape):
+            raise InputError(
+                f"{what}: --axes {','.join(axes)} names {len(axes)} axes, the array has"
+                f" {len(shape)} dimensions {tuple(shape)}"
+            )
+        return axes
+    said = [hint for hint in hints if hint is not None]
+    shown = ", ".join(f"{name or '?'}={length}" for name, length in zip(names, shape, strict=True))
+    if len(set(said)) != len(said):
+        raise InputError(
+            f"{what}: two dimensions of ({shown}) mean the same axis; say what they are with"
+            " --axes, such as t,z,y,x"
+        )
+    open_places = len(shape) - len(said)
+    if open_places > 1 and said != sorted(said, key=AXES.index):
+        raise InputError(
+            f"{what}: the order of the dimensions ({shown}) is not clear; say what they are with"
+            " --axes, such as x,y,z,t"
+        )
+    left = [axis for axis in (AXES if len(shape) == len(AXES) else AXES[1:]) if axis not in said]
+    fill = iter(left[len(left) - open_places :])
+    return tuple(hint if hint is not None else next(fill) for hint in hints)
+
+
+TIME_NAMES = ("time", "forecast_period", "forecast_reference_time")
+"""Standard names of CF for coordinates that count time."""
+
+
+MAX_LETTERS = 64
+"""Letters of a date."""
+
+NUMBERED = "step numbers stand for the times"
+
+LOSS = Fraction(1, 10**6)
+"""Largest change of a time that is counted anew, as a share of the distance of two times."""
+
+Parts = Sequence[tuple[Path, Coordinate]]
+
+
+class Described(Protocol):
+    """A stored array that may be a coordinate: its full name, attributes and values."""
+
+    @property
+    def name(self) -> str:
+        """Full name."""
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """Attributes as the library gives them."""
+
+    @property
+    def read(self) -> Callable[[], npt.NDArray[Any]]:
+        """Function that reads the values."""
+
+
+Kind = TypeVar("Kind", bound=Described)
+
+
+def is_time(name: str, attributes: Mapping[str, Any], dtype: np.dtype[Any]) -> bool:
+    """Whether a coordinate counts time, and not only steps: by its type, units or names."""
+    units = str(attributes.get("units", "")).strip()
+    if dtype.kind == "M" or SINCE.fullmatch(units) or units.lower() in UNITS:
+        return True
+    return str(attributes.get("standard_name", "")).strip().lower() in TIME_NAMES
+
+
+def counts_steps(values: npt.NDArray[Any]) -> bool:
+    """Whether values are whole numbers that rise by 1 from 0 or 1: numbers of steps."""
+    if values.dtype.kind not in "iuf" or not values.size:
+        return False
+    numbers = values.ravel()
+    return bool(
+        numbers[0] in (0, 1) and np.array_equal(numbers, numbers[0] + np.arange(numbers.size))
+    )
+
+
+def only_counts(column: Described) -> bool:
+    """Whether a coordinate of time only counts the steps."""
+    return not is_time(*_description(column)) and counts_steps(column.read())
+
+
+def real_time(named: Kind | None, others: Iterable[Kind]) -> Kind | None:
+    """The coordinate of the time dimension: its namesake, unless that only counts its steps.
+
+    Args:
+        named: the coordinate with the name of the dimension, None without one.
+        others: further coordinates along the dimension. One that counts time comes before numbers
+            of steps and before none: dates first, then other units of time, then a name of time.
+    """
+    if named is not None and is_time(*_description(named)):
+        return named
+    if named is not None and not counts_steps(named.read()):
+        return named
+    ranked = [(_rank(column), number, column) for number, column in enumerate(others)]
+    found = sorted((each for each in ranked if each[0] is not None), key=lambda each: each[:2])
+    return found[0][2] if found else named
+
+
+def _rank(column: Described) -> int | None:
+    """Place among coordinates of time, the first is best; None for one that is no time."""
+    name, attributes, dtype = _description(column)
+    if dtype.kind == "M" or SINCE.fullmatch(str(attributes.get("units", ""))):
+        # the start of a forecast is the same for all of its steps
+        return 3 if attributes.get("standard_name") == "forecast_reference_time" else 0
+    known = name.lower() in NAMES["t"].split() or role_of_coordinate(name, attributes) == "t"
+    if is_time(name, attributes, dtype):
+        return 1 if known else None
+    return 2 if known and not counts_steps(column.read()) else None
+
+
+def _description(column: Described) -> tuple[str, Mapping[str, Any], np.dtype[Any]]:
+    return column.name.rpartition("/")[2], column.attributes, column.read().dtype
+
+
+def settled(coordinate: Coordinate) -> tuple[Coordinate, str]:
+    """The times that stand for those of a file, and what is to be said of it, "" where nothing is.
+
+    Months, years and weeks are counted anew in days. Where a time is missing, the numbers of the
+    steps stand for all. Units that name no date are no `units` any more, since programs that decode
+    CF refuse them; the numbers stay.
+    """
+    name, attributes = coordinate.name, coordinate.attributes
+    missing = np.flatnonzero(~np.isfinite(coordinate.values))
+    if missing.size:
+        steps = np.arange(coordinate.values.size, dtype=np.float64)
+        told = f"{name} has no time at step {missing[0]}; {NUMBERED}"
+        return Coordinate(name=name, values=steps), told
+    if _decodable(attributes):
+        return coordinate, ""
+    units = attributes.get("units")
+    found = in_days(coordinate.values.tolist(), attributes)
+    if found is None:
+        told = f"{name} counts '{units}', which names no date; its numbers stand for the times"
+        return replace(coordinate, attributes=_undated(attributes)), told
+    how = "calendar months" if _unit(attributes) in MONTH_UNITS else "days"
+    told = f"{name} counts '{units}'; it is read as {how}, and given in {found[1]['units']}"
+    values = np.array(found[0], np.float64)
+    return replace(coordinate, values=values, attributes={**attributes, **found[1]}), told
+
+
+def is_numbered(remark: str) -> bool:
+    """Whether the numbers of steps stand for times of which something is said."""
+    return remark.endswith(NUMBERED)
+
+
+def with_times(metadata: SourceMetadata, time: Coordinate) -> SourceMetadata:
+    """The metadata of a variable whose times stand for those of its source; see `settled`.
+
+    The coordinate of the time dimension is then that of the times, and what the source had under
+    this name is kept as it was, under another.
+    """
+    dimension = metadata.along("t")
+    variables = []
+    for each in metadata.variables:
+        told = time.name == each.name or dimension in each.dimensions
+        if told and not _decodable(each.attributes):
+            each = replace(each, attributes=_undated(each.attributes))
+        if each.name == dimension and _is_replaced(metadata.named(each.name)):
+            name = f"{each.name}_in_source"
+            while metadata.named(name) is not None:
+                name += "_"
+            each = replace(each, name=name)
+        variables.append(each)
+    if dimension == time.name and dimension not in [each.name for each in variables]:
+        stamp = SourceVariable(
+            name=dimension,
+            dimensions=(dimension,),
+            values=time.values,
+            attributes=dict(time.attributes),
+            is_coordinate=True,
+        )
+        variables.insert(0, stamp)
+    return replace(metadata, variables=tuple(variables))
+
+
+def written_times(
+    dimension: str, columns: Iterable[tuple[str, npt.NDArray[Any], Mapping[str, Any]]]
+) -> Coordinate | None:
+    """The times that a column of texts along a dimension gives, None without such a column.
+
+    columns: name, texts (n,) and attributes of each.
+    """
+    for _, texts, attributes in columns:
+        calendar = str(attributes.get("calendar") or "proleptic_gregorian").strip().lower()
+        if calendar in CALENDARS:
+            known = CALENDARS[calendar]
+            found = of_texts([text_of(each) for each in texts.reshape(-1).tolist()], known)
+            if found is not None:
+                values = np.array(found[0], np.float64)
+                named = {"standard_name": "time", **found[1]}
+                return Coordinate(name=dimension, values=values, attributes=named)
+    return None
+
+
+def _unit(attributes: Mapping[str, Any]) -> str:
+    match = SINCE.fullmatch(str(attributes.get("units", "")))
+    return match[1].lower() if match else ""
+
+
+def _decodable(attributes: Mapping[str, Any]) -> bool:
+    """Whether programs that decode CF make dates of a coordinate, or take it as numbers."""
+    unit, known = _unit(attributes), clock(attributes) is not None
+    calendar = str(attributes.get("calendar") or "standard").strip().lower()
+    return known == bool(unit) and not unit.startswith("week") and calendar != "360"
+
+
+def _undated(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes without units and calendar, which have other names."""
+    return {
+        f"{key}_in_source" if key in ("units", "calendar") else key: value
+        for key, value in attributes.items()
+    }
+
+
+def _is_replaced(variable: SourceVariable | None) -> bool:
+    """Whether others stand for the times of a stored variable."""
+    if variable is None or variable.values.dtype.kind not in "iuf":
+        return variable is not None
+    attributes = variable.attributes
+    values = packing("", variable.values.dtype, attributes).unpack(variable.values.copy())
+    if not np.isfinite(values).all():
+        return True
+    return not _decodable(attributes) and in_days(values.tolist(), attributes) is not None
+
+
+def join_times(source: str, parts: Parts) -> Coordinate:
+    """The times of files one after the other, counted as in the first.
+
+    Files may count since different dates and in different units, in one calendar. Raises InputError
+    for times that cannot be compared, that do not increase, or that float64 cannot hold as counted
+    in the first file.
+    """
+    first_path, first = parts[0]
+    values = [
+        time.values
+        if _units(time) == _units(first)
+        else _converted(source, path, time, first_path, first)
+        for path, time in parts
+    ]
+    ends = zip(values, (path for path, _ in parts), strict=True)
+    for (before, path), (after, next_path) in pairwise(ends):
+        if not before[-1] < after[0]:
+            passed = f"{after[0]:g} in {next_path} after {before[-1]:g} in {path}"
+            raise InputError(
+                f"{source}: times do not increase in the order of the file names: {passed}"
+            )
+    joined = np.concatenate(values)
+    _check_exact(source, parts, joined)
+    return Coordinate(name=first.name, values=joined, attributes=first.attributes)
+
+
+def _check_exact(source: str, parts: Parts, joined: npt.NDArray[np.float64]) -> None:
+    """Raise InputError where counting in other units moved a time by more than LOSS of a step."""
+    first_path, first = parts[0]
+    common = clock(first.attributes)
+    if common is None or all(_units(time) == _units(first) for _, time in parts):
+        return
+    if not np.isfinite(joined).all():
+        raise InputError(f"{source}: the times in {first_path} are not all finite")
+    exact = []
+    for _, time in parts:
+        own = clock(time.attributes)
+        assert own is not None
+        exact += [own.instant(float(value)) for value in time.values]
+    gap = min(abs(after - before) for before, after in pairwise(exact) if before != after)
+    for value, instant in zip(joined, exact, strict=True):
+        if abs(common.instant(float(value)) - instant) > LOSS * gap:
+            raise InputError(
+                f"{source}: the times lie too close to be counted in the units of {first_path}"
+                f" ({first.attributes.get('units')}) without loss"
+            )
+
+
+def _converted(
+    source: str, path: Path, time: Coordinate, first_path: Path, first: Coordinate
+) -> npt.NDArray[np.float64]:
+    """Times of a file in the units of the first, each rounded once."""
+    own, common = clock(time.attributes), clock(first.attributes)
+    if own is None or common is None or own.calendar != common.calendar:
+        here, there = (" ".join(_units(each)).strip() or "none" for each in (time, first))
+        raise InputError(
+            f"{source}: the time in {path} has not the units of the time in {first_path}:"
+            f" {here} and {there}"
+        )
+    if not np.isfinite(time.values).all():
+        raise InputError(f"{source}: the times in {path} are not all finite")
+    return np.array([common.value(own.instant(float(value))) for value in time.values])
+
+
+def _units(time: Coordinate) -> tuple[str, str]:
+    """Units and calendar of a time; a calendar has a meaning beside a date only."""
+    units = str(time.attributes.get("units", "")).strip()
+    calendar = str(time.attributes.get("calendar") or "standard").strip().lower()
+    return units, CALENDARS.get(calendar, calendar) if SINCE.fullmatch(units) else ""
+
+
+TIME_UNITS = {
+    "D": "days",
+    "h": "hours",
+    "m": "minutes",
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """A stored 1-D array (or scalar, length 1) that may be a coordinate.
+
+    `read` gives its values, `along` is the name of its dimension. A column that is not `numeric`
+    holds labels, such as the names of members.
+    """
+
+    name: str
+    length: int
+    along: str | None = None
+    read: Callable[[], npt.NDArray[Any]]
+    attributes: Mapping[str, Any]
+    numeric: bool = True
+
+
+def coordinate(
+    source: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]
+) -> Coordinate:
+    """A Coordinate of stored values.
+
+    Numbers stay as they are; dates become numbers since the first of them, with `units` and
+    `calendar`. Raises InputError where float64 cannot tell two stored values apart, or where a date
+    is missing.
+    """
+    stored = np.atleast_1d(values)
+    extra: dict[str, Any] = {}
+    if stored.dtype.kind == "M":
+        unit = np.datetime_data(stored.dtype)[0]
+        if unit not in TIME_UNITS or np.isnat(stored).any():
+            raise InputError(
+                f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype},"
+                " or one is missing)"
+            )
+        # since the first date, and not since 1970: nanoseconds since then exceed what float64 can
+        # hold
+        extra = {
+            "units": f"{TIME_UNITS[unit]} since {stored[0]}",
+            "calendar": "proleptic_gregorian",
+        }
+        stored = (stored - stored[0]).astype(np.int64)
+    numbers = stored.astype(np.float64)
+    if stored.dtype.kind in "iu" and np.unique(numbers).size != np.unique(stored).size:
+        raise InputError(
+            f"{source}: coordinate {name} has values that 64-bit floats cannot tell apart, from"
+            f" {stored[0]} to {stored[-1]}"
+        )
+    return Coordinate(
+        name=name.rsplit("/", 1)[-1],
+        values=numbers,
+        attributes={**json_attributes(attributes, without=STORED), **extra},
+    )
+
+
+def usable(dtype: np.dtype[Any]) -> bool:
+    """Whether values of this type can be positions."""
+    return dtype.kind in "iufM" and dtype.itemsize <= 8
+
+
+def beside(
+    source: str,
+    axes: Sequence[str],
+    shape: Sequence[int],
+    places: Sequence[Mapping[str, Column]],
+    *,
+    certain: bool,
+    tied: Collection[str] = (),
+) -> dict[str, Coordinate]:
+    """Coordinates by conventional name for the axes of an array, from the nearest place first.
+
+    Places are its group, then the root. A column counts only if it has the axis's length; a length
+    alone is never taken for a meaning. An axis that the array lacks has length 1. Axes in `tied`
+    are skipped: the file itself says what belongs to them.
+
+    If the order of the axes was only assumed (not `certain`) and such a column has the length of
+    *another* dimension, the assumption is wrong: raises InputError that asks for --axes.
+    """
+    lengths = dict(zip(axes, shape, strict=True))
+    coords: dict[str, Coordinate] = {}
+    for axis in (axis for axis in AXES if axis not in tied):
+        columns = [place[name] for place in places for name in NAMES[axis].split() if name in place]
+        fitting = [column for column in columns if column.length == lengths.get(axis, 1)]
+        if fitting:
+            column = real_time(fitting[0], fitting[1:]) if axis == "t" else fitting[0]
+            assert column is not None
+            coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
+        elif columns and not certain and columns[0].length in shape and columns[0].length > 1:
+            column = columns[0]
+            assumed = (
+                f"axis {axis} of length {lengths[axis]}" if axis in lengths else f"no axis {axis}"
+            )
+            wrong = (
+                f"{column.name} has {column.length} values, but read as ({','.join(axes)})"
+                f" the array {tuple(shape)} has {assumed}"
+            )
+            raise InputError(
+                f"{source}: {wrong}; say what its dimensions are with --axes, such as t,z,y,x"
+            )
+    return coords

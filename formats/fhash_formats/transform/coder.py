@@ -1,0 +1,534 @@
+"""Entropy coding by the native library: integers, labels, masks, and the priors it begins with."""
+
+from __future__ import annotations
+
+import ctypes
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
+
+Table = npt.NDArray[np.int32]
+"""Bands in the order in which they are coded, int32 of shape (bands, COLUMNS)."""
+
+LOW = 0
+"""First of four columns: the lowest index of the band along t, z, y, x."""
+HIGH = 4
+"""First of four columns: one past the highest index of the band along t, z, y, x."""
+KIND = 8
+"""Column of the kind, 0 to 63; bands of one kind share their statistics."""
+REFERENCES = 9
+"""First column of the references: the earlier bands from which a band takes contexts."""
+REFERENCE_COUNT = 4
+"""References of a band: its parent, the bands before it along t and along z, and its sibling."""
+REFERENCE_COLUMNS = 5
+"""Columns of one reference: BAND, then SHIFT along t, z, y, x."""
+BAND = 0
+"""Column within a reference: number of the band referred to, or -1 for no band."""
+SHIFT = 1
+"""First of four columns within a reference: halvings between the two bands along t, z, y, x."""
+COLUMNS = REFERENCES + REFERENCE_COUNT * REFERENCE_COLUMNS
+"""Columns of the table."""
+
+NO_REFERENCE = [-1, 0, 0, 0, 0]
+"""Columns of a reference to no band."""
+
+
+def single_band(shape: Sequence[int]) -> Table:
+    """The table of integers (t, z, y, x) that were not transformed: one band of kind 0."""
+    row = [0, 0, 0, 0, *shape, 0, *NO_REFERENCE * REFERENCE_COUNT]
+    return np.array([row], dtype=np.int32)
+
+
+DECISIONS = 16
+"""Decisions of a magnitude, each with estimates and weights of its own."""
+LANES = 8
+"""Weights of a set: two per estimate."""
+KINDS = 64
+"""Kinds of bands."""
+LEVELS = 128
+"""Levels of the expected magnitude."""
+SIZES = (LEVELS, 729, 12 * 12 * 12, 7 * 7 * 7 * 7)
+"""Contexts of a decision, for each of the four estimates that are mixed."""
+SIGN_SIZES = tuple(KINDS * size for size in (27, 108, 81, 25))
+"""Contexts of a sign, for each of the four estimates that are mixed."""
+SIGN_SET = 16
+"""Weights of a sign: two per estimate, then that of the linear logit."""
+SIGN_INPUTS = 96
+"""Weights of a linear predictor of signs, each with a mean square of its gradient."""
+FIRST_SQUARE = 16
+"""Mean square of a gradient before anything is known, 1 is 16384."""
+SIMPLES = LEVELS * 64 + 8 + KINDS
+"""Simple estimates: of the escape code, of empty rows and of empty bands."""
+TRUST = 12
+"""Count of an estimate of a prior; it is low, so that a tile soon follows its own statistics."""
+LOGITS = 44
+"""Numbers of an estimate in a file of a prior."""
+WEIGHT_STEP = 512
+"""Unit of weights in a file of a prior, as differences from those of the blank state."""
+
+_PRIOR_FILE = Path(__file__).with_name("prior.bin")
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """Estimates and weights that a coder adapts.
+
+    Attributes:
+        slots: uint16 (n, 4), the estimates that are mixed: probability by a slow and by a fast
+            rate, number of observations, 0. Probabilities are in 1/65536.
+        weights: int32 (n,), of the mixing and of linear predictors, within 16 bits.
+        simples: uint16 (n, 2), estimates that are used alone: probability, number of observations.
+    """
+
+    slots: npt.NDArray[np.uint16]
+    weights: npt.NDArray[np.int32]
+    simples: npt.NDArray[np.uint16]
+
+    @classmethod
+    def even(cls, *, slots: int, weights: Sequence[tuple[int, int]], simples: int) -> State:
+        """A state of even odds.
+
+        Args:
+            slots: number of slots.
+            weights: runs of equal weights, each as its length and its value.
+            simples: number of simple estimates.
+        """
+        counts, values = zip(*weights, strict=True)
+        state = cls(
+            slots=np.zeros((slots, 4), dtype=np.uint16),
+            weights=np.repeat(np.array(values, dtype=np.int32), counts),
+            simples=np.zeros((simples, 2), dtype=np.uint16),
+        )
+        state.slots[:, :2] = state.simples[:, 0] = 32768
+        return state
+
+    def copy(self) -> State:
+        """A state with copies of the arrays."""
+        return State(
+            slots=self.slots.copy(), weights=self.weights.copy(), simples=self.simples.copy()
+        )
+
+    def frozen(self) -> State:
+        """This state, after making its arrays read-only."""
+        for array in (self.slots, self.weights, self.simples):
+            array.setflags(write=False)
+        return self
+
+
+def blank_state() -> State:
+    """A state that has learned nothing: even odds, and weights that believe the estimates."""
+    weights = [(KINDS * DECISIONS * LANES, 4423), (64 * DECISIONS * LANES, 0)]
+    weights += [(8, 2048), (1, 8192), (SIGN_SET - 9, 0)] * KINDS
+    weights += [(SIGN_INPUTS, 0), (SIGN_INPUTS, FIRST_SQUARE)] * KINDS
+    slots = sum(SIZES) * DECISIONS + sum(SIGN_SIZES)
+    return State.even(slots=slots, weights=weights, simples=SIMPLES)
+
+
+@cache
+def prior_state(trellis: bool) -> State:
+    """The prior of the coder of integers, or of those of two quantisers; it is read-only."""
+    if not trellis:
+        state = unpack_state(_PRIOR_FILE.read_bytes(), blank_state())
+        squares = state.weights[-2 * KINDS * SIGN_INPUTS :].reshape(KINDS, 2, SIGN_INPUTS)[:, 1]
+        # The file has the roots of mean squares.
+        squares[:] = ((squares - FIRST_SQUARE) // WEIGHT_STEP) ** 2
+        return state.frozen()
+    state = prior_state(False).copy()
+    # The decisions of class 1 of two quantisers, 14 and 15, begin as those of class 0.
+    slots = state.slots[: sum(SIZES) * DECISIONS].reshape(-1, DECISIONS, 4)
+    slots[:, 14:] = slots[:, :2]
+    of_kinds = KINDS * DECISIONS * LANES
+    for sets in (state.weights[:of_kinds], state.weights[of_kinds:][: 64 * DECISIONS * LANES]):
+        by_decision = sets.reshape(DECISIONS, -1)
+        by_decision[14:] = by_decision[:2]
+    return state.frozen()
+
+
+def unpack_state(data: bytes, blank: State) -> State:
+    """A state from the bytes of a file.
+
+    Args:
+        data: deflated, a byte for each number: of the slots and then of the simple estimates n > 0
+            for the logit (n - 22) / 2, seen TRUST times, and 0 for one that nothing is known of; of
+            the weights the difference from the blank state, signed, in WEIGHT_STEP.
+        blank: the state that has learned nothing.
+    """
+    state = blank.copy()
+    ends = np.cumsum([len(state.slots), len(state.simples), len(state.weights)])
+    slots, simples, steps, _ = np.split(np.frombuffer(zlib.decompress(data), np.uint8), ends)
+    # Table look-ups of whole numbers, so that every machine has the same.
+    state.slots[:, 0] = state.slots[:, 1] = _PROBABILITIES[slots]
+    state.slots[:, 2] = TRUST * (slots > 0)
+    state.simples[:, 0] = _PROBABILITIES[simples]
+    state.simples[:, 1] = TRUST * (simples > 0)
+    state.weights[:] += WEIGHT_STEP * steps.view(np.int8).astype(np.int32)
+    return state
+
+
+def _probabilities() -> npt.NDArray[np.uint16]:
+    """Probability in 1/65536 of each number of a file, rounded; even odds for 0."""
+    logits = (np.arange(LOGITS) - LOGITS // 2) / 2
+    rounded = np.floor(65536 / (1 + np.exp(-logits)) + 0.5)
+    rounded[0] = 32768
+    return rounded.astype(np.uint16)
+
+
+_PROBABILITIES = _probabilities()
+
+
+MAX_INTEGER = 2**30 - 1
+"""Largest magnitude of an integer."""
+
+NO_MEMORY = -2
+"""Code that a native function returns where it had no memory; twin of `NO_MEMORY` in guard.hpp."""
+
+NO_TRELLIS = -3
+"""Code of an encoder that met an integer which its quantiser does not have, as in
+native/coder_contexts.hpp."""
+
+Integers = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoded:
+    """Coded integers.
+
+    Attributes:
+        data: the bytes.
+        integers: what the bytes decode to; other than the integers given where the rate-distortion
+            optimisation changed some.
+    """
+
+    data: bytes
+    integers: Integers
+
+
+def encode_integers(
+    integers: Integers,
+    table: Table,
+    *,
+    scaled: npt.NDArray[np.float32] | None = None,
+    weight: float = 0.0,
+    state: State | None = None,
+    trellis: bool = False,
+) -> Encoded:
+    """Code integers in the bands of a table; integers outside the bands count as 0.
+
+    Args:
+        integers: int32 (t, z, y, x), magnitudes up to MAX_INTEGER.
+        table: the bands.
+        scaled: coefficients / quantiser step, float32, same shape. With it each magnitude is chosen
+            anew, from the nearest one, one less and zero: the one with the least squared error, in
+            steps, plus `weight` per bit.
+        weight: squared steps that a bit is worth.
+        state: state to begin from, which is adapted in place; None begins from the prior.
+        trellis: whether the integers are those of two quantisers (trellis.py). Raises InputError
+            for integers that are not, and does not go with `scaled`.
+    """
+    if trellis and scaled is not None:
+        raise InputError("integers of a trellis are chosen before they are coded")
+    keep = state is not None
+    state = prior_state(trellis) if state is None else state
+    given = np.ascontiguousarray(integers, dtype=np.int32)
+    chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
+    capacity = max(4096, given.size // 2)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        # The native coder writes to its integers only where it chooses them.
+        integers = given if chosen is None else given.copy()
+        size = native.library().fhash_encode(
+            _pointer(integers),
+            _pointer(chosen),
+            weight,
+            trellis,
+            (ctypes.c_int64 * 4)(*integers.shape),
+            *array_arguments(table),
+            *state_arguments(state),
+            keep,
+            *array_arguments(buffer),
+        )
+        if size == NO_TRELLIS:
+            raise InputError("an integer is not one of the quantiser whose turn it is")
+        if checked(size) <= capacity:
+            return Encoded(data=buffer[:size].tobytes(), integers=integers)
+        # Retry with the original integers. Coding the chosen ones would give other bytes, because
+        # rows that became empty are signalled differently.
+        capacity = size
+
+
+def decode_integers(
+    data: bytes | memoryview,
+    shape: tuple[int, ...],
+    table: Table,
+    *,
+    trellis: bool = False,
+) -> Integers:
+    """The integers (t, z, y, x) of a shape, int32; `trellis` as for the encoder.
+
+    Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
+    """
+    integers = np.zeros(shape, dtype=np.int32)
+    source = np.frombuffer(data, dtype=np.uint8)
+    code = native.library().fhash_decode(
+        _pointer(integers),
+        trellis,
+        (ctypes.c_int64 * 4)(*shape),
+        *array_arguments(table),
+        *state_arguments(prior_state(trellis)),
+        *array_arguments(source),
+    )
+    if checked(code) < 0:
+        raise DamagedFileError("the coded integers are damaged")
+    return integers
+
+
+def encode_block(integers: Integers) -> bytes:
+    """Code a small block of int32 integers (four axes) that stands alone."""
+    return encode_integers(integers, single_band(integers.shape)).data if integers.size else b""
+
+
+def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
+    """The block that `encode_block` coded; raises DamagedFileError as `decode_integers` does."""
+    if prod(shape) == 0:
+        if len(data):
+            raise DamagedFileError("bytes where nothing is coded")
+        return np.zeros(shape, dtype=np.int32)
+    return decode_integers(data, shape, single_band(shape))
+
+
+def checked(code: int) -> int:
+    """The code that a native function returned; raises MemoryError where it is NO_MEMORY."""
+    if code == NO_MEMORY:
+        raise MemoryError("no memory for the work of a native function")
+    return code
+
+
+def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
+    # The pointer object also keeps the array alive. When threads build the prior at the same time,
+    # only one of their copies is cached, and nothing else refers to the others.
+    return ctypes.c_void_p(None) if array is None else array.ctypes.data_as(ctypes.c_void_p)
+
+
+def array_arguments(array: npt.NDArray[Any]) -> tuple[ctypes.c_void_p, int]:
+    """An array and its length along the first axis, as the native functions take them."""
+    return _pointer(array), len(array)
+
+
+def state_arguments(state: State) -> list[Any]:
+    """The arrays of a state, each with its length, as the native functions take them."""
+    return [
+        *array_arguments(state.slots),
+        *array_arguments(state.weights),
+        *array_arguments(state.simples),
+    ]
+
+
+MAX_LABELS = 65536
+"""Most labels of a tile."""
+
+Labels = npt.NDArray[np.uint16]
+
+
+def encode_labels(labels: npt.NDArray[Any], count: int) -> bytes:
+    """Code labels (t, z, y, x), each below `count`, of which there are 1 to MAX_LABELS."""
+    # The coder writes to its labels, also in encoding, but does not change them.
+    work = np.array(labels, dtype=np.uint16, order="C")
+    capacity = max(4096, work.size // 8)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        size = native.library().fhash_encode_labels(
+            work.ctypes.data,
+            count,
+            (ctypes.c_int64 * 4)(*work.shape),
+            *array_arguments(buffer),
+        )
+        if checked(size) <= capacity:
+            return buffer[:size].tobytes()
+        capacity = size
+
+
+def decode_labels(data: bytes | memoryview, count: int, shape: tuple[int, ...]) -> Labels:
+    """The labels of a shape (t, z, y, x) that `encode_labels` coded.
+
+    Any other bytes give some labels below `count`.
+    """
+    labels = np.zeros(shape, dtype=np.uint16)
+    source = np.frombuffer(data, dtype=np.uint8)
+    code = native.library().fhash_decode_labels(
+        labels.ctypes.data, count, (ctypes.c_int64 * 4)(*shape), *array_arguments(source)
+    )
+    checked(code)
+    return labels
+
+
+MAX_EDGES = 15
+"""Most edges between classes of values."""
+MAX_REACH = 64
+"""Largest reach, in vertices."""
+MAX_SCORE = 4095
+"""Largest score, and largest sum of scores."""
+MAX_FLOAT = float(np.finfo(np.float64).max)
+"""Largest magnitude of an edge."""
+UNIT = 128
+"""Scores per bit."""
+Levels = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskLevels:
+    """Scores of the decoded values; raises InputError for values that are not allowed.
+
+    Attributes:
+        edges: at most MAX_EDGES ascending numbers; class i holds the values from edge i - 1 on and
+            below edge i.
+        scores: score of each class, 0 to MAX_SCORE, in 1/UNIT bit.
+        others: scores for the second level; without them it is the level of the vertex alone by
+            `scores`.
+        reach: vertices along z, y and x by which a feature was grown, 0 to MAX_REACH.
+    """
+
+    edges: tuple[float, ...] = ()
+    scores: tuple[int, ...] = (0,)
+    others: tuple[int, ...] = ()
+    reach: int = 0
+
+    def __post_init__(self) -> None:
+        numbers = all(type(edge) in (int, float) and abs(edge) <= MAX_FLOAT for edge in self.edges)
+        if (
+            len(self.edges) > MAX_EDGES
+            or not numbers
+            or any(low >= high for low, high in pairwise(self.edges))
+        ):
+            raise InputError(
+                f"edges of a mask are {self.edges!r:.80}; "
+                f"at most {MAX_EDGES} ascending numbers are needed"
+            )
+        for scores in (self.scores, *([self.others] if self.others else [])):
+            if len(scores) != len(self.edges) + 1 or not all(
+                type(n) is int and 0 <= n <= MAX_SCORE for n in scores
+            ):
+                raise InputError(
+                    f"scores of a mask are {scores!r:.80}; "
+                    f"{len(self.edges) + 1} whole numbers to {MAX_SCORE} are needed"
+                )
+        if type(self.reach) is not int or not 0 <= self.reach <= MAX_REACH:
+            raise InputError(
+                f"reach of a mask is {self.reach!r:.40}; a whole number to {MAX_REACH} is needed"
+            )
+
+    def levels(self, values: npt.NDArray[Any]) -> tuple[Levels, Levels]:
+        """The level, 0 to 31, and the second level, 0 to 15, of each vertex (t, z, y, x), uint8.
+
+        values: the decoded values, finite, in the type in which the tile is transformed.
+        """
+        first, second = np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.uint8)
+        if not values.size or not (any(self.scores) or any(self.others)):
+            return first, second
+        with np.errstate(over="ignore"):
+            edges = np.array(self.edges, dtype=values.dtype)
+        source = np.ascontiguousarray(values)
+        scores = (ctypes.c_int32 * len(self.scores))(*self.scores)
+        others = (ctypes.c_int32 * len(self.others))(*self.others) if self.others else None
+        function = getattr(native.library(), f"fhash_mask_levels_f{8 * values.dtype.itemsize}")
+        code = function(
+            source.ctypes.data,
+            (ctypes.c_int64 * 4)(*values.shape),
+            *array_arguments(edges),
+            scores,
+            others,
+            self.reach,
+            first.ctypes.data,
+            second.ctypes.data,
+        )
+        checked(code)
+        return first, second
+
+
+Mask = npt.NDArray[np.bool_]
+
+MASK_LEVELS = 32
+"""Levels of a vertex; each has a set of mixing weights."""
+MASK_CONTEXTS = 10
+"""Estimates that are mixed for a bit."""
+MASK_NEAR = 16
+"""Patterns of the four nearest bits; each has a set of mixing weights."""
+MASK_SIZES = (512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048)
+"""Contexts of each estimate."""
+MASK_LANES = 2 * MASK_CONTEXTS
+"""Weights of a set."""
+MASK_SIMPLES = 30
+"""Simple estimates, those of the flags of segments: by the state around, the levels, and the number
+of segments around."""
+
+_MASK_PRIOR_FILE = Path(__file__).with_name("mask_prior.bin")
+
+
+def blank_mask_state() -> State:
+    """A state that has learned nothing: even odds, and weights that believe the estimates."""
+    return State.even(
+        slots=sum(MASK_SIZES),
+        weights=[(MASK_LEVELS * MASK_LANES, 3277), (MASK_NEAR * MASK_LANES, 0)],
+        simples=MASK_SIMPLES,
+    )
+
+
+@cache
+def mask_prior_state() -> State:
+    """The prior of masks; its arrays are read-only."""
+    return unpack_state(_MASK_PRIOR_FILE.read_bytes(), blank_mask_state()).frozen()
+
+
+def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | None = None) -> bytes:
+    """Code a mask.
+
+    Args:
+        mask: bool (t, z, y, x), at least one vertex.
+        levels: two levels of each vertex, 0 to 31 and 0 to 15, uint8, from `MaskLevels.levels`.
+        state: state to begin from, which is adapted in place; None begins from the prior.
+    """
+    keep = state is not None
+    state = mask_prior_state() if state is None else state
+    bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
+    capacity = max(4096, mask.size // 8)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        size = native.library().fhash_encode_mask(
+            *(array.ctypes.data for array in (bits, first, second)),
+            (ctypes.c_int64 * 4)(*mask.shape),
+            *state_arguments(state),
+            keep,
+            *array_arguments(buffer),
+        )
+        if checked(size) <= capacity:
+            return buffer[:size].tobytes()
+        capacity = size
+
+
+def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
+    """The mask, bool (t, z, y, x), that `encode_mask` coded with the same levels.
+
+    Any other bytes give some mask: the caller must check a digest.
+    """
+    shape = levels[0].shape
+    mask = np.empty(shape, dtype=np.uint8)
+    first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in levels)
+    source = np.frombuffer(data, dtype=np.uint8)
+    code = native.library().fhash_decode_mask(
+        *(array.ctypes.data for array in (mask, first, second)),
+        (ctypes.c_int64 * 4)(*shape),
+        *state_arguments(mask_prior_state()),
+        *array_arguments(source),
+    )
+    checked(code)
+    return mask.view(np.bool_)

@@ -1,1 +1,0 @@
-"""Integers and masks to bytes, and back."""

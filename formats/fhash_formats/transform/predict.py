@@ -1,0 +1,334 @@
+"""Prediction of values from those before them, in place of a transform."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.coder import State, array_arguments, checked, state_arguments
+from fhash_formats.transform.values import pieces
+
+CLASSES = 16
+"""Kinds of passes, each with statistics of its own.
+
+Kind 0 is the last pass, 1 the one before, and so on; the earliest passes share kind CLASSES - 2,
+and the first lattice has kind CLASSES - 1.
+"""
+WEIGHT_UNIT = 4096
+"""Weight of a tap that counts in full."""
+MAX_WEIGHT = 32767
+"""Largest magnitude of a weight."""
+MAX_LEVELS = 8
+"""Most halvings along an axis."""
+MAX_REACH = 2
+"""Largest reach of the taps."""
+
+Axes = tuple[int, int, int, int]
+"""A number of each axis (t, z, y, x)."""
+Tap = tuple[int, int, int, int, int]
+"""A vertex that a prediction uses: the lattice, then offsets along t, z, y, x in that lattice.
+
+The lattice is 1 for the vertices of the pass itself and 0 for the lattice known before the pass.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pass:
+    """A pass over a tile.
+
+    Attributes:
+        axis: axis along which it doubles the resolution, -1 for the first lattice.
+        kind: 0 to CLASSES - 1.
+        taps: the vertices that it uses besides those of the base.
+    """
+
+    axis: int
+    kind: int
+    taps: tuple[Tap, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictor:
+    """Settings with which a tile is coded by prediction.
+
+    Raises InputError for settings that do not fit together.
+
+    Attributes:
+        step: distance of neighbouring values, above 0, in units of the values: nearly twice the
+            bound on the error.
+        origin: value of the integer 0.
+        levels: halvings along t, z, y, x, 0 to MAX_LEVELS.
+        order: order of the axes within a level.
+        reach: 0 to MAX_REACH; a larger reach has more taps.
+        weights: weight of each tap of each pass, in 1/WEIGHT_UNIT.
+    """
+
+    step: float
+    origin: float
+    levels: Axes
+    order: Axes
+    reach: int
+    weights: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("step", "origin"):
+            value = getattr(self, name)
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | float)
+                or not math.isfinite(value)
+            ):
+                raise InputError(f"predictor: {name} is {value!r:.40}; a finite number is needed")
+        if self.step <= 0:
+            raise InputError(f"predictor: step is {self.step}; it must be above 0")
+        count = tap_count(self.levels, self.order, self.reach)
+        if not _are_integers(self.weights, count, -MAX_WEIGHT, MAX_WEIGHT):
+            raise InputError(f"predictor: {count} weights within +-{MAX_WEIGHT} are needed")
+
+    @property
+    def passes(self) -> tuple[Pass, ...]:
+        """The passes, in order."""
+        return passes_of(self.levels, self.order, self.reach)
+
+
+def tap_count(levels: Axes, order: Axes, reach: int) -> int:
+    """The number of weights of a predictor; raises InputError for what is no lattice."""
+    if not _are_integers(levels, 4, 0, MAX_LEVELS):
+        raise InputError(
+            f"predictor: levels are {levels!r:.60}; "
+            f"four whole numbers from 0 to {MAX_LEVELS} are needed"
+        )
+    if not _is_order(order):
+        raise InputError(f"predictor: order is {order!r:.60}; 0, 1, 2, 3 in some order are needed")
+    if type(reach) is not int or not 0 <= reach <= MAX_REACH:
+        raise InputError(f"predictor: reach is {reach!r:.40}; 0 to {MAX_REACH} is possible")
+    return sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))
+
+
+@lru_cache(maxsize=64)
+def passes_of(levels: Axes, order: Axes, reach: int) -> tuple[Pass, ...]:
+    """The passes of a predictor: the first lattice, then each level along the axes in order."""
+    axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
+    first = Pass(axis=-1, kind=CLASSES - 1, taps=_first_taps())
+    others = (
+        Pass(axis=axis, kind=min(len(axes) - 1 - i, CLASSES - 2), taps=_taps(axis, reach))
+        for i, axis in enumerate(axes)
+    )
+    return (first, *others)
+
+
+def pass_arrays(
+    predictor: Predictor,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], npt.NDArray[np.int16]]:
+    """The passes as the native coder takes them.
+
+    Returns:
+        Passes, int32 (n, 4): axis, kind, number of the first tap, number of taps.
+        Taps of all passes, int32 (m, 5), see `Tap`.
+        Weights of the taps, int16 (m,).
+    """
+    rows: list[tuple[int, ...]] = []
+    taps: list[Tap] = []
+    for a_pass in predictor.passes:
+        rows.append((a_pass.axis, a_pass.kind, len(taps), len(a_pass.taps)))
+        taps += a_pass.taps
+    return (
+        np.array(rows, dtype=np.int32),
+        np.array(taps, dtype=np.int32),
+        np.array(predictor.weights, dtype=np.int16),
+    )
+
+
+def _at(lattice: int, *moves: tuple[int, int]) -> Tap:
+    """The tap of a lattice at these moves, each an axis and an offset along it."""
+    offsets = dict(moves)
+    t, z, y, x = (offsets.get(axis, 0) for axis in range(4))
+    return (lattice, t, z, y, x)
+
+
+@lru_cache(maxsize=1)
+def _first_taps() -> tuple[Tap, ...]:
+    """Taps of the first lattice; all its vertices before this one are known."""
+    taps = [_at(1, (axis, -1)) for axis in range(4)]
+    taps += [_at(1, (a, -1), (b, -1)) for a, b in combinations(range(4), 2)]
+    taps += [_at(1, (axis, -2)) for axis in range(4)]
+    taps += [_at(1, (a, -1), (b, 1)) for a, b in combinations(range(4), 2)]
+    return tuple(taps)
+
+
+def _taps(axis: int, reach: int) -> tuple[Tap, ...]:
+    """Taps of a pass along an axis.
+
+    Vertices 0 and 1 of the known lattice lie beside the vertex. Vertices of the pass itself are
+    known if they come before it in C order.
+    """
+    others = [other for other in range(4) if other != axis]
+    taps = [_at(0, (axis, 1)), _at(0, (axis, -1)), _at(0, (axis, 2))]
+    taps += [
+        _at(0, (axis, near), (other, side))
+        for other in others
+        for near in (0, 1)
+        for side in (-1, 1)
+    ]
+    taps += [_at(1, (axis, -1)), *(_at(1, (other, -1)) for other in others)]
+    if reach > 0:
+        taps += [_at(1, (other, -2)) for other in others]
+        pairs = [
+            *combinations(others, 2),
+            *((min(axis, other), max(axis, other)) for other in others),
+        ]
+        taps += [_at(1, (first, -1), (second, side)) for first, second in pairs for side in (-1, 1)]
+    if reach > 1:
+        sides = [(near, a, b) for near in (0, 1) for a in (-1, 1) for b in (-1, 1)]
+        taps += [
+            _at(0, (axis, near), (first, a), (second, b))
+            for first, second in combinations(others, 2)
+            for near, a, b in sides
+        ]
+    return tuple(taps)
+
+
+def _is_order(values: Any) -> bool:
+    return _are_integers(values, 4, 0, 3) and sorted(values) == [0, 1, 2, 3]
+
+
+def _are_integers(values: Any, count: int, low: int, high: int) -> bool:
+    """Whether `values` is a tuple of so many ints from `low` to `high`."""
+    return (
+        isinstance(values, tuple)
+        and len(values) == count
+        and all(type(value) is int and low <= value <= high for value in values)
+    )
+
+
+MAX_PREDICTED_INTEGER = 1 << 27
+"""Largest magnitude of an integer that is coded by prediction."""
+DECISIONS = 16
+"""Decisions of a difference, each with estimates and weights of its own."""
+LANES = 14
+"""Weights of a set."""
+LEVELS = 48
+"""Levels of the expected difference; each has a set of weights per decision."""
+SIZES = (LEVELS * 5, 32 * 27, CLASSES * 24 * 5, 3125, 81 * 5 * 8, 81 * 24, 32 * 24 * 5)
+"""Contexts of each of the seven estimates that are mixed; each context has a slot per decision."""
+SIMPLES = 200
+"""Simple estimates: of low bits, of the escape code and of rows without a difference."""
+
+Integers = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+Values = npt.NDArray[Any]
+
+
+@cache
+def blank_state() -> State:
+    """A state that has learned nothing: even odds, and weights that believe the estimates.
+
+    The arrays are read-only.
+    """
+    weights = [(CLASSES * DECISIONS * LANES, 4096), (LEVELS * DECISIONS * LANES, 0)]
+    return State.even(slots=sum(SIZES) * DECISIONS, weights=weights, simples=SIMPLES).frozen()
+
+
+def integers_of(values: Values, counted: Mask | None, predictor: Predictor) -> Integers | None:
+    """The integers nearest to values, int32; None if one would exceed MAX_PREDICTED_INTEGER.
+
+    Args:
+        values: any shape and real type.
+        counted: mask of the same shape; the other integers are 0. None counts all.
+        predictor: origin and step.
+    """
+    result = np.empty(values.shape, np.int32)
+    flat, out = values.reshape(-1), result.reshape(-1)
+    flat_counted = None if counted is None else counted.reshape(-1)
+    for piece in pieces(flat.size):
+        with np.errstate(all="ignore"):
+            # 64-bit whole numbers are subtracted as float64: near the ends of their range an error
+            # may exceed the bound, which the encoder checks.
+            nearest = np.rint((flat[piece].astype(np.float64) - predictor.origin) / predictor.step)
+        if flat_counted is not None:
+            nearest = np.where(flat_counted[piece], nearest, 0.0)
+        if not np.all(np.abs(nearest) <= MAX_PREDICTED_INTEGER):
+            return None
+        out[piece] = nearest
+    return result
+
+
+def values_of(integers: Integers, predictor: Predictor) -> npt.NDArray[np.float64]:
+    """The values origin + step * integer, float64: one product, one sum."""
+    with np.errstate(all="ignore"):
+        values = integers * np.float64(predictor.step)
+        values += np.float64(predictor.origin)
+    return values
+
+
+def encode_predicted(
+    integers: Integers, counted: Mask | None, predictor: Predictor
+) -> tuple[bytes, Integers]:
+    """Code integers: the bytes, and the integers that they decode to.
+
+    Args:
+        integers: (t, z, y, x), each within +-MAX_PREDICTED_INTEGER.
+        counted: mask (bool, same shape) of the integers that must come back; the others become
+            their predictions. None counts all.
+        predictor: the passes and their weights.
+    """
+    marks = None if counted is None else np.ascontiguousarray(counted, dtype=np.uint8)
+    capacity = max(4096, integers.size)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        result = np.array(integers, dtype=np.int32, order="C")
+        size = native.library().fhash_encode_predicted(
+            result.ctypes.data,
+            None if marks is None else marks.ctypes.data,
+            *_geometry(integers.shape, predictor),
+            *state_arguments(blank_state()),
+            *array_arguments(buffer),
+        )
+        if checked(size) <= capacity:
+            return buffer[:size].tobytes(), result
+        capacity = size
+
+
+def decode_predicted(
+    data: bytes | memoryview, shape: tuple[int, ...], predictor: Predictor
+) -> Integers:
+    """The integers (t, z, y, x) of a shape, int32.
+
+    Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
+    """
+    integers = np.zeros(shape, dtype=np.int32)
+    source = np.frombuffer(data, dtype=np.uint8)
+    code = native.library().fhash_decode_predicted(
+        integers.ctypes.data,
+        *_geometry(shape, predictor),
+        *state_arguments(blank_state()),
+        *array_arguments(source),
+    )
+    if checked(code) < 0:
+        raise DamagedFileError("the predicted integers of a tile are damaged")
+    return integers
+
+
+def _geometry(shape: tuple[int, ...], predictor: Predictor) -> list[Any]:
+    """Shape, levels, passes, taps and weights as the native functions take them.
+
+    The pointers keep their arrays alive.
+    """
+    passes, taps, weights = pass_arrays(predictor)
+    four = ctypes.c_int64 * 4
+    return [
+        four(*shape),
+        four(*predictor.levels),
+        *array_arguments(passes),
+        taps.ctypes.data_as(ctypes.c_void_p),
+        weights.ctypes.data_as(ctypes.c_void_p),
+    ]

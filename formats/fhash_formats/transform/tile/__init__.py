@@ -1,1 +1,0 @@
-"""One tile to bytes and back: settings, sections of the stream, encoder, decoder."""

@@ -1,1 +1,0 @@
-"""Operations on each value of a tile by itself: quantising, comparing, casting."""

@@ -1,0 +1,514 @@
+"""Regions to write, their labels and surroundings, and the interface of a writer."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.series import (
+    AXES,
+    COORDINATES,
+    NO_AXIS,
+    Coordinate,
+    Series,
+    SourceMetadata,
+    SourceVariable,
+    check_coords,
+    check_values,
+    plain_form,
+    references,
+)
+from fhash_formats.support.files import signals_held
+from fhash_formats.support.threads import slab_shape
+from fhash_formats.support.values import PACKING, PLUMBING, REFERENCES, json_attributes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Region:
+    """A decoded part of a time-varying volume, without its values.
+
+    Attributes:
+        name: name of the variable, such as "density".
+        units: units of the values, "" where unknown.
+        dtype: type of the frames, an integer or float of at most 64 bits; kept in the native byte
+            order.
+        shape: (t, z, y, x), every length at least 1.
+        coords: a Coordinate for each of "t", "z", "y", "x", cut to the region and as long as the
+            axis.
+        attributes: attributes of the variable, JSON values.
+        fill: number of `dtype` that stands where there is no value; None where every vertex has one
+            or NaN stands there.
+        metadata: what belongs to the variable in its source, cut to the region; None where that is
+            unknown. NetCDF and Zarr give it back.
+
+    Raises:
+        InputError: one of these does not hold.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, int, int, int]
+    coords: Mapping[str, Coordinate]
+    units: str = ""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    fill: int | float | None = None
+    metadata: SourceMetadata | None = None
+
+    @classmethod
+    def of(cls, series: Series) -> Self:
+        """The region that is all of a series."""
+        return cls(
+            name=series.name,
+            units=series.units,
+            dtype=series.dtype,
+            shape=series.shape,
+            coords=series.coords,
+            attributes=series.attributes,
+            metadata=series.metadata,
+        )
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("region: the variable has no name; give one, such as 'values'")
+        dtype = np.dtype(self.dtype).newbyteorder("=")
+        shape = check_values(f"region {self.name!r}", self.shape, dtype)
+        object.__setattr__(self, "dtype", dtype)
+        object.__setattr__(self, "shape", shape)
+        check_coords(f"region {self.name!r}", self.coords, shape)
+
+
+DROPPED = PACKING | PLUMBING | REFERENCES | {""}
+"""Attributes that are left out.
+
+Values are physical, so packing no longer holds; other variables of the source are not in the
+output; no format has an attribute without a name.
+"""
+
+# HDF5 keeps an attribute of at most 64 KiB in the header; text is not bound by it.
+ATTRIBUTE_BYTES = 32 * 2**10
+
+
+def printable(text: str, instead: str = "_") -> str:
+    """The text on one line, with `instead` for each control character."""
+    return "".join(char if char.isprintable() else instead for char in text)
+
+
+def safe_name(name: str) -> str:
+    """A name that HDF5, NetCDF and Zarr take as one name; see `plain_form`."""
+    return plain_form(name, default="values")
+
+
+def safe_names(region: Region) -> tuple[str, dict[str, str]]:
+    """Names of the variable and of its coordinates by axis, all different."""
+    variable = safe_name(region.name)
+    used = {variable}
+    names = {}
+    for axis in AXES:
+        names[axis] = unused_name(region.coords[axis].name or axis, used)
+    return variable, names
+
+
+def unused_name(name: str, used: set[str]) -> str:
+    """A safe name that is not in use; it is put among those that are."""
+    unique = plain_form(name, used, default="values")
+    used.add(unique)
+    return unique
+
+
+def variable_attributes(region: Region) -> dict[str, Any]:
+    """Attributes of the values, as JSON values.
+
+    They are the region's own, its units, and its name where that had to be changed.
+    """
+    kept = json_attributes(region.attributes, without=DROPPED)
+    if region.units:
+        kept["units"] = region.units
+    if safe_name(region.name) != region.name:
+        kept.setdefault("long_name", region.name)
+    return kept
+
+
+def coordinate_attributes(axis: str, coordinate: Coordinate) -> dict[str, Any]:
+    """Attributes of a coordinate, as JSON values.
+
+    The CF attribute `axis` ("T", "Z", "Y", "X") is added where it is missing.
+    """
+    return {"axis": axis.upper(), **json_attributes(coordinate.attributes, without=DROPPED)}
+
+
+def hdf5_value(value: Any) -> Any:
+    """A JSON value as an attribute of HDF5 and NetCDF.
+
+    It is text, a number, a list of one kind of them, or else JSON text.
+    """
+    if isinstance(value, str):
+        return value.replace("\0", "")
+    if isinstance(value, bool):
+        return np.int8(value)  # NetCDF has no boolean
+    if isinstance(value, float):
+        return np.float64(value)
+    if isinstance(value, int) and -(2**63) <= value < 2**63:
+        return np.int64(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value if value.dtype.kind in "iufSU" else hdf5_value(value.tolist())
+    if isinstance(value, list) and value and len(value) * 8 <= ATTRIBUTE_BYTES:
+        kinds = {type(item) for item in value}
+        if kinds == {str}:
+            return [item.replace("\0", "") for item in value]
+        if kinds == {float} or (kinds == {int} and all(-(2**63) <= item < 2**63 for item in value)):
+            return np.array(value)
+    return json.dumps(value)
+
+
+# Of the axis's extent. Coordinates are often stored as float32, which is good to 6e-8 of their
+# size: that must pass. And on an axis of a thousand vertices the largest deviation that passes is a
+# thousandth of a cell, which no picture shows.
+TOLERANCE = 1e-6
+
+
+def even_spacing(values: npt.NDArray[np.float64]) -> float | None:
+    """The step of evenly spaced coordinates (n,); None where they are uneven.
+
+    The step is negative for descending coordinates and 1.0 for one vertex. Even means that no value
+    is further than 1e-6 of the extent from the straight line between the first and the last.
+    """
+    if not np.all(np.isfinite(values)):
+        return None
+    if len(values) == 1:
+        return 1.0
+    extent = float(values[-1] - values[0])
+    line = np.linspace(values[0], values[-1], len(values))
+    if extent == 0 or np.max(np.abs(values - line)) > TOLERANCE * abs(extent):
+        return None
+    return extent / (len(values) - 1)
+
+
+Frame = npt.NDArray[Any]
+Put = Callable[[int, Frame], None]
+Open = Callable[
+    [Sequence[Region], Sequence[Path], Sequence[Path]], AbstractContextManager[Sequence[Put]]
+]
+OpenOne = Callable[[Region, Sequence[Path], Sequence[Path]], AbstractContextManager[Put]]
+
+CHUNK_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Writer:
+    """One format.
+
+    Attributes:
+        name: name for messages.
+        suffixes: suffixes of its outputs, lower case with the dot.
+        outputs: (path, region) -> every path that will be written, in the order in which they take
+            their names; raises InputError where the format cannot hold the region.
+        open: (regions, outputs, temporaries) -> context manager that gives the functions for the
+            frames; the temporaries stand for the outputs one by one. Safe names of regions differ.
+        directory: whether the output is a directory.
+        several: whether an output holds several variables; `outputs` then depends on none.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    outputs: Callable[[Path, Region], list[Path]]
+    open: Open
+    directory: bool = False
+    several: bool = False
+
+
+def of_one(open_one: OpenOne) -> Open:
+    """The `open` of a format whose outputs hold one variable."""
+
+    @contextmanager
+    def opened(
+        regions: Sequence[Region], outputs: Sequence[Path], temporaries: Sequence[Path]
+    ) -> Iterator[Sequence[Put]]:
+        (region,) = regions
+        with open_one(region, outputs, temporaries) as put:
+            yield [put]
+
+    return opened
+
+
+def one_output(path: Path, region: Region) -> list[Path]:
+    """The outputs of a format that writes only the path it is given."""
+    return [path]
+
+
+def little_endian(dtype: np.dtype[Any], *, half: bool = False) -> np.dtype[Any]:
+    """The type in which values are stored: little-endian.
+
+    float16 becomes float32, exactly, unless the format has half precision (`half`).
+    """
+    stored = np.dtype(np.float32) if dtype == np.float16 and not half else dtype
+    return stored.newbyteorder("<")
+
+
+def write_frame(handle: BinaryIO, frame: Frame, dtype: np.dtype[Any]) -> None:
+    """Write the values of a frame (z, y, x) in `dtype`, x fastest.
+
+    They are converted one z at a time, so that there is no second frame in memory.
+    """
+    for plane in frame:
+        handle.write(np.ascontiguousarray(plane, dtype=dtype).data)
+
+
+def chunk_shape(region: Region) -> tuple[int, int, int, int]:
+    """Shape of chunks (1, z, y, x).
+
+    A chunk is one frame; frames above 16 MiB are cut into equal slabs along z, then y, then x. So
+    one access reads one step, and no reader has to hold a huge chunk for a small region.
+    """
+    z, y, x = slab_shape(region.shape[1:], region.dtype.itemsize, CHUNK_BYTES)
+    return 1, z, y, x
+
+
+class HeldFile(io.FileIO):
+    """A new, writable binary file whose writes never fail; `check` raises the first failure."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "x+")
+        self.failure: Exception | None = None
+
+    def write(self, data: Any, /) -> int:
+        """Write all of `data`, or nothing once a write has failed."""
+        view = memoryview(data).cast("B")
+        length = len(view)
+        try:
+            while self.failure is None and len(view):
+                view = view[super().write(view) :]
+        except Exception as error:
+            self.failure = error
+        return length
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the length, unless a write has failed."""
+        try:
+            if self.failure is None:
+                return super().truncate(size)
+        except Exception as error:
+            self.failure = error
+        return size or 0
+
+    @contextmanager
+    def calling(self) -> Iterator[None]:
+        """A block that calls HDF5.
+
+        Signals wait until the block ends; then the first failure of the file is raised.
+        """
+        with signals_held():
+            try:
+                yield
+            except Exception:
+                self.check()  # what HDF5 says after a write that was dropped is only a consequence
+                raise
+        self.check()
+
+    def check(self) -> None:
+        """Raise the first failure."""
+        if self.failure is not None:
+            raise self.failure
+
+
+@contextmanager
+def held_hdf5(path: Path, opening: Callable[[HeldFile], Any]) -> Iterator[tuple[HeldFile, Any]]:
+    """A new file at `path`, and the object that `opening` (h5py, h5netcdf) makes of it.
+
+    The object is closed before the file in every case.
+    """
+    root = None
+    with HeldFile(path) as file:
+        try:
+            with file.calling():
+                root = opening(file)
+            yield file, root
+        finally:
+            if root is not None:
+                with file.calling():
+                    root.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """An output without its values.
+
+    Attributes:
+        name: of the variable.
+        dimensions: of the variable in the order of the output, each with its axis or NO_AXIS.
+        lengths: of every dimension.
+        attributes: of the variable, JSON values or numpy's; no packing.
+        variables: the arrays beside it.
+        file_attributes: of the file.
+    """
+
+    name: str
+    dimensions: Mapping[str, str]
+    lengths: Mapping[str, int]
+    attributes: Mapping[str, Any]
+    variables: tuple[SourceVariable, ...]
+    file_attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, region: Region) -> Outline:
+        """The outline of a region."""
+        if region.metadata is not None:
+            return _as_in_source(region, region.metadata)
+        name, names = safe_names(region)
+        return cls(
+            name=name,
+            dimensions={names[axis]: axis for axis in AXES},
+            lengths={names[axis]: n for axis, n in zip(AXES, region.shape, strict=True)},
+            attributes=variable_attributes(region),
+            variables=tuple(_positions(region, axis, names[axis]) for axis in AXES),
+            file_attributes={},
+        )
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of each dimension of the variable."""
+        return tuple(self.lengths[name] for name in self.dimensions)
+
+    def ordered(self, by_axis: tuple[int, ...]) -> tuple[int, ...]:
+        """Numbers for t, z, y and x, such as a chunk's lengths, in the order of the dimensions."""
+        numbers = dict(zip(AXES, by_axis, strict=True))
+        return tuple(numbers.get(axis, 1) for axis in self.dimensions.values())
+
+    def place(self, step: int, frame: npt.NDArray[Any]) -> tuple[Any, npt.NDArray[Any]]:
+        """The index of a frame (z, y, x) in the variable, and the values that belong there."""
+        present = list(self.dimensions.values())
+        index = tuple(
+            step if axis == "t" else 0 if axis == NO_AXIS else slice(None) for axis in present
+        )
+        space = [axis for axis in AXES[1:] if axis in present]
+        values = frame.reshape(
+            [n for axis, n in zip(AXES[1:], frame.shape, strict=True) if axis in present]
+        )
+        order = [space.index(axis) for axis in present if axis in space]
+        return index, values.transpose(order)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beside:
+    """The rest of an output of several variables, each part once.
+
+    Attributes:
+        lengths: of every dimension.
+        variables: arrays that no outline is of.
+        attributes: of the file.
+    """
+
+    lengths: Mapping[str, int]
+    variables: tuple[SourceVariable, ...]
+    attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, outlines: Sequence[Outline]) -> Beside:
+        """The rest of an output of some variables.
+
+        outlines: of different names. Raises InputError where two do not agree on a length or an
+        array: they cannot share an output.
+        """
+        lengths: dict[str, int] = {}
+        variables: dict[str, SourceVariable] = {}
+        attributes: dict[str, Any] = {}
+        names = [outline.name for outline in outlines]
+        for outline in outlines:
+            for name, length in outline.lengths.items():
+                if lengths.setdefault(name, length) != length:
+                    raise _apart(outline, f"{length} of {name}, another {lengths[name]}")
+            for each in outline.variables:
+                if each.name not in names and not _same(
+                    variables.setdefault(each.name, each), each
+                ):
+                    raise _apart(outline, f"another {each.name} than the one before")
+            attributes = {**outline.file_attributes, **attributes}
+        return cls(lengths=lengths, variables=tuple(variables.values()), attributes=attributes)
+
+
+def _same(one: SourceVariable, other: SourceVariable) -> bool:
+    """Whether two arrays beside variables have the same dimensions and values."""
+    if tuple(one.dimensions) != tuple(other.dimensions):
+        return False
+    floats = one.values.dtype.kind == other.values.dtype.kind == "f"
+    return bool(np.array_equal(one.values, other.values, equal_nan=floats))
+
+
+def _apart(outline: Outline, what: str) -> InputError:
+    return InputError(f"variable {outline.name} has {what}; write the variables one by one")
+
+
+def _as_in_source(region: Region, metadata: SourceMetadata) -> Outline:
+    """The outline of a region whose source is known, with its dimensions and all beside it."""
+    name = safe_name(region.name)
+    by_axis = dict(zip(AXES, region.shape, strict=True))
+    lengths = {each: by_axis.get(axis, 1) for each, axis in metadata.dimensions.items()}
+    variables = [each for each in metadata.variables if each.name != name]
+    for each, axis in metadata.dimensions.items():
+        if axis != NO_AXIS and metadata.named(each) is None and _is_told(region, axis):
+            variables.append(_positions(region, axis, each))
+    for variable in variables:
+        lengths |= dict(zip(variable.dimensions, variable.values.shape, strict=True))
+    names = {each.name for each in variables}
+    attributes = _without_missing(metadata.variable_attributes, names)
+    listed = str(attributes.pop(COORDINATES, "")).split()
+    listed += [
+        each.name
+        for each in variables
+        if each.is_coordinate and each.name not in (*listed, *metadata.dimensions)
+    ]
+    if listed:
+        attributes[COORDINATES] = " ".join(listed)
+    if region.units:
+        attributes["units"] = region.units
+    if name != region.name:
+        attributes.setdefault("long_name", region.name)
+    return Outline(
+        name=name,
+        dimensions=metadata.dimensions,
+        lengths=lengths,
+        attributes={key: value for key, value in attributes.items() if key not in PACKING},
+        variables=tuple(variables),
+        file_attributes=_without_plumbing(metadata.attributes),
+    )
+
+
+def _is_told(region: Region, axis: str) -> bool:
+    """Whether positions of an axis tell more than that there are so many."""
+    values = region.coords[axis].values
+    return not np.array_equal(values, np.arange(values.size))
+
+
+def _positions(region: Region, axis: str, name: str) -> SourceVariable:
+    """The coordinate of an axis as float64."""
+    coordinate = region.coords[axis]
+    return SourceVariable(
+        name=name,
+        dimensions=(name,),
+        values=coordinate.values,
+        attributes=coordinate_attributes(axis, coordinate),
+        is_coordinate=True,
+    )
+
+
+def _without_missing(attributes: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
+    """Attributes without those that name variables which are not in the output."""
+    missing = {key for key, name in references(attributes) if name not in names}
+    kept = {key: value for key, value in attributes.items() if key not in missing - {COORDINATES}}
+    if COORDINATES in missing:
+        kept[COORDINATES] = " ".join(
+            name for key, name in references(attributes) if key == COORDINATES and name in names
+        )
+    return _without_plumbing(kept)
+
+
+def _without_plumbing(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in attributes.items() if key not in PLUMBING and key}

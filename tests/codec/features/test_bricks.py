@@ -1,0 +1,280 @@
+"""The coreset against a direct crop of the data."""
+
+from __future__ import annotations
+
+from math import prod
+
+import numpy as np
+import pytest
+
+from fhash_codec.features.bricks import brick_shape, build_coreset, parse_brick
+from fhash_codec.features.features import Everything, Interval, Isosurface, Segmentation, dilate
+from fhash_codec.features.occupancy import unpack
+from fhash_codec.features.scan import scan
+from fhash_codec.progress import silent
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.series import ArraySeries
+
+EVERYTHING = (Everything(),)
+SHAPES = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70, 5)]
+
+
+def unpack_frame(coreset, key):
+    """The samples of a key frame, put back into the box: float32 (z, y, x), NaN elsewhere."""
+    shape, grid = coreset.brick_shape, coreset.brick_grid
+    first, last = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
+    mask = np.unpackbits(coreset.mask_bits[first:last], axis=1, count=prod(shape)).view(np.bool_)
+    held = np.full(mask.shape, np.nan, dtype=np.float32)
+    held[mask] = coreset.values[coreset.offsets[first] : coreset.offsets[last]]
+    tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
+    _, z, y, x = coreset.bricks[first:last].T
+    tiles[z, y, x] = held.reshape(-1, *shape)
+    frame = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
+        [count * step for count, step in zip(grid, shape, strict=True)]
+    )
+    z_size, y_size, x_size = coreset.box.shape
+    return frame[:z_size, :y_size, :x_size]
+
+
+def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):
+    """Blobs that drift with the steps."""
+    axes = np.meshgrid(*((np.arange(size) + 0.5) / size * 2 - 1 for size in shape), indexing="ij")
+    frames = [
+        np.exp(-6 * sum((axis - 0.3 * np.sin(step + k)) ** 2 for k, axis in enumerate(axes)))
+        for step in range(steps)
+    ]
+    return (low + span * np.stack(frames)).astype(dtype)
+
+
+def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
+    series = ArraySeries(array)
+    seen = scan(series, silent)
+    keys = tuple(range(series.shape[0])) if keys is None else keys
+    return build_coreset(series, seen, keys, features, dilation, silent, **kwargs), seen
+
+
+def check_against_direct_crop(array, features, keys, dilation, **kwargs) -> None:
+    coreset, seen = build(array, features, keys, dilation, **kwargs)
+    selected = [
+        np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys
+    ]
+    masks = [
+        dilate(mask, dilation) & np.isfinite(array[step])
+        for mask, step in zip(selected, keys, strict=True)
+    ]
+    everywhere = np.argwhere(np.any(masks, axis=0))
+    assert coreset.box == tuple(
+        zip(everywhere.min(axis=0), everywhere.max(axis=0) + 1, strict=True)
+    )
+    for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
+        expected = np.where(mask, seen.value_range.to_unit(array[step]), np.float32(np.nan))
+        np.testing.assert_array_equal(unpack_frame(coreset, key), expected[coreset.box.slices()])
+        np.testing.assert_array_equal(
+            unpack(coreset.occupancy[key], coreset.box.shape), mask[coreset.box.slices()]
+        )
+    assert coreset.fraction == pytest.approx(np.mean(masks))
+    left = [
+        array[step][~mask & np.isfinite(array[step])]
+        for step, mask in zip(keys, masks, strict=True)
+    ]
+    left = np.concatenate(left).astype(np.float64)
+    assert coreset.background / 2 == pytest.approx(
+        (left / 2 / left.size).sum() if left.size else seen.mean / 2, rel=1e-12
+    )
+    check_structure(coreset)
+    return coreset
+
+
+def check_structure(coreset) -> None:
+    vertices = prod(coreset.brick_shape)
+    counts = np.unpackbits(coreset.mask_bits, axis=1)[:, :vertices].sum(axis=1)
+    assert (counts > 0).all()
+    assert (np.diff(coreset.offsets) == counts).all()
+    assert (coreset.offsets[0], coreset.offsets[-1]) == (0, coreset.values.size)
+    assert coreset.mask_bits.shape == (len(coreset.bricks), -(-vertices // 8))
+    assert [
+        array.dtype
+        for array in (coreset.bricks, coreset.mask_bits, coreset.values, coreset.offsets)
+    ] == ["i4", "u1", "f4", "i8"]
+    assert ((coreset.values >= 0) & (coreset.values <= 1)).all()
+    assert (coreset.bricks.max(axis=0) < (len(coreset.key_frames), *coreset.brick_grid)).all()
+    order = np.ravel_multi_index(coreset.bricks.T, (len(coreset.key_frames), *coreset.brick_grid))
+    assert (np.diff(order) > 0).all()
+    grid = tuple(
+        -(-size // step) for size, step in zip(coreset.box.shape, coreset.brick_shape, strict=True)
+    )
+    assert coreset.brick_grid == grid
+
+
+@pytest.mark.filterwarnings("ignore:feature .* selects nothing")
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "features",
+    [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))],
+    ids=["all", "interval", "two"],
+)
+@pytest.mark.parametrize("dilation", [0, 1, 2])
+def test_bricks_hold_the_direct_crop(shape, features, dilation) -> None:
+    array = smooth(4, shape)
+    check_against_direct_crop(array, features, (0, 2, 3), dilation)
+
+
+@pytest.mark.parametrize("brick", [(1, 1, 1), (4, 2, 8), (16, 16, 16), (3, 5, 7)])
+def test_any_brick_shape_holds_the_same(brick) -> None:
+    coreset = check_against_direct_crop(
+        smooth(2, (11, 13, 19)), (Interval(0.3, 0.8),), (0, 1), 1, brick=brick
+    )
+    assert coreset.brick_shape == brick
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "span"),
+    [
+        (np.uint8, 0, 200),
+        (np.int16, -300, 500),
+        (np.float64, 1e8, 1e-3),
+        (np.float64, -1.7e308, 1.7e308),
+    ],
+)
+def test_number_types_and_narrow_ranges(dtype, low, span) -> None:
+    array = smooth(2, (5, 6, 7), dtype, low, span)
+    feature = Segmentation(float(low) + 0.5 * span)
+    check_against_direct_crop(array, (feature,), (0, 1), 1)
+
+
+def test_missing_values_are_neither_samples_nor_background() -> None:
+    array = smooth(4, (5, 9, 20))
+    array[:, :, :3], array[1, 2, 4, 10], array[2] = np.nan, np.inf, np.nan
+    coreset = check_against_direct_crop(array, (Interval(0.2, 2.0),), (0, 1, 2, 3), 1)
+    assert np.isnan(unpack_frame(coreset, 2)).all()
+    assert 2 not in coreset.bricks[:, 0]
+    assert np.isfinite(coreset.background)
+
+
+def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not() -> None:
+    array = np.zeros((3, 4, 5, 6))
+    array[1, 2, 2, 2] = 1.0
+    coreset = check_against_direct_crop(array, (Interval(0.5, 1.0),), (0, 1, 2), 1)
+    assert coreset.box == ((1, 4), (1, 4), (1, 4))
+    assert len(coreset.occupancy) == 3
+    with pytest.raises(
+        InputError,
+        match=r"feature interval:2:3, isosurface:9 selects nothing; values range from 0 to 1",
+    ):
+        build(array, (Interval(2.0, 3.0), Isosurface(9.0)))
+
+
+def test_a_coreset_of_everything_has_the_mean_of_all_as_background() -> None:
+    coreset, seen = build(smooth(2, (4, 5, 6)), keys=(0,))
+    assert (coreset.fraction, coreset.background) == (1.0, seen.mean)
+    assert coreset.box == ((0, 4), (0, 5), (0, 6))
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((64, 64, 64), (8, 8, 16)),
+        ((1, 200, 200), (1, 29, 29)),
+        ((200, 1, 200), (29, 1, 29)),
+        ((200, 200, 1), (29, 29, 1)),
+        ((200, 200, 9), (8, 8, 9)),
+        ((200, 200, 5), (8, 16, 5)),
+        ((1, 1, 5000), (1, 1, 1000)),
+        ((1, 1, 1), (1, 1, 1)),
+        ((3, 3, 3), (3, 3, 3)),
+        ((2, 100, 100), (2, 15, 25)),
+        ((25, 125, 125), (7, 8, 16)),
+    ],
+)
+def test_thin_axes_hand_their_factors_to_the_others(size, expected) -> None:
+    assert brick_shape(size) == expected
+
+
+def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box() -> None:
+    for size in np.random.default_rng(0).integers(1, 60, size=(300, 3)).tolist():
+        brick = brick_shape(size)
+        counts = [-(-length // edge) for edge, length in zip(brick, size, strict=True)]
+        assert prod(brick) <= 1024
+        assert all(
+            count * edge - length < count
+            for edge, length, count in zip(brick, size, counts, strict=True)
+        )
+        assert prod(brick) >= 200 or prod(counts) < 40
+
+
+def test_progress_has_two_stages() -> None:
+    calls = []
+    series = ArraySeries(smooth(3, (2, 2, 2)))
+    build_coreset(
+        series,
+        scan(series, silent),
+        (0, 2),
+        (Everything(),),
+        0,
+        lambda *call: calls.append(call[:3]),
+    )
+    assert calls == [
+        ("selecting", 1, 2),
+        ("selecting", 2, 2),
+        ("gathering", 1, 2),
+        ("gathering", 2, 2),
+    ]
+
+
+def test_a_feature_that_selects_nothing_beside_others_is_warned_of() -> None:
+    with pytest.warns(FhashWarning, match="feature isosurface:99 selects nothing; the others do"):
+        build(smooth(2, (5, 6, 7)), (Interval(0.2, 2.0), Isosurface(99.0)), (0, 1), 1)
+
+
+def test_the_fringe_is_sampled_and_no_part_of_the_coreset() -> None:
+    values = np.random.default_rng(1).random((3, 5, 6, 7)).astype(np.float32)
+    plain, seen = build(values, [Interval(0.8, 1.0)], dilation=0)
+    fringed, _ = build(values, [Interval(0.8, 1.0)], dilation=0, fringe=True)
+    masks = [unpack(bits, plain.box.shape) for bits in plain.occupancy]
+    for key, grown in enumerate(
+        (masks[0] | masks[1], masks[0] | masks[1] | masks[2], masks[1] | masks[2])
+    ):
+        unit = seen.value_range.to_unit(values[key])[plain.box.slices()]
+        np.testing.assert_array_equal(
+            unpack_frame(fringed, key), np.where(grown, unit, np.float32(np.nan))
+        )
+        np.testing.assert_array_equal(fringed.occupancy[key], plain.occupancy[key])
+    assert (fringed.fraction, fringed.background) == (plain.fraction, plain.background)
+
+
+def test_samples_of_the_fringe_are_told_and_not_counted() -> None:
+    values = np.random.default_rng(1).random((3, 5, 20, 40)).astype(np.float32)
+    plain, _ = build(values, [Interval(0.95, 1.0)], dilation=0)
+    fringed, _ = build(values, [Interval(0.95, 1.0)], dilation=0, fringe=True)
+    assert plain.fringe is None
+    np.testing.assert_array_equal(plain.counts, np.diff(plain.offsets))
+    assert fringed.fringe.shape == fringed.values.shape
+    np.testing.assert_array_equal(fringed.values[~fringed.fringe], plain.values)
+    assert fringed.counts.sum() == len(plain.values) < len(fringed.values)
+    chosen = np.array([3, 0, 2])
+    places = fringed.places(chosen)
+    np.testing.assert_array_equal(
+        np.add.reduceat(~fringed.fringe[places], np.cumsum([0, *np.diff(fringed.offsets)[[3, 0]]])),
+        fringed.counts[chosen],
+    )
+    assert not fringed.places(chosen[:0]).size
+
+
+def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:
+    values = np.zeros((3, 2, 3, 4), np.float32)
+    values[0, 0], values[2, 1] = 0.75, 0.5
+    values[1] = np.nan
+    values[1, 0, 0, 0] = 1.0
+    coreset, seen = build(values, [Interval(0.25, 1.0)], dilation=0, fringe=True)
+    middle = unpack_frame(coreset, 1)
+    expected = np.stack([np.full((3, 4), 0.75), np.full((3, 4), 0.5)]).astype(np.float32)
+    expected[0, 0, 0] = 1.0
+    np.testing.assert_array_equal(middle, seen.value_range.to_unit(expected))
+
+
+def test_bricks_are_named_by_their_shape():
+    assert parse_brick("auto") is None
+    assert parse_brick("4x2x16") == (4, 2, 16)
+    for text in ("4x2", "4x0x2", "axbxc", "64x64x64"):
+        with pytest.raises(InputError, match=f"brick is '{text}'; allowed"):
+            parse_brick(text)

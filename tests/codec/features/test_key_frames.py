@@ -1,0 +1,267 @@
+"""Key frames: which steps, and where times lie between them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from fhash_codec.features.key_frames import (
+    KeyTimes,
+    gram_matrix,
+    optimal_steps,
+    segment_costs,
+    select_key_frames,
+    strictly_monotonic,
+    time_axis,
+    vertex_stride,
+)
+from fhash_codec.progress import silent
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import ArraySeries
+
+UNEVEN = np.array([0.0, 1.0, 1.5, 4.0, 4.25, 9.0, 9.5, 10.0])
+
+
+def series_of(steps, seed=0, shape=(2, 3, 4)):
+    rng = np.random.default_rng(seed)
+    return ArraySeries(rng.random((steps, *shape)).cumsum(axis=0))
+
+
+def pick(spec, series, times=None):
+    return select_key_frames(
+        spec, series, np.arange(series.shape[0], dtype=float) if times is None else times, silent
+    )
+
+
+def interpolation_error(array, times, keys):
+    """Summed squared error of all frames, straight from the definition."""
+    flat = array.reshape(len(array), -1)
+    sign = -1 if times[-1] < times[0] else 1
+    rebuilt = np.stack(
+        [
+            np.interp(sign * times, sign * times[list(keys)], column[list(keys)])
+            for column in flat.T
+        ],
+        axis=1,
+    )
+    return ((rebuilt - flat) ** 2).sum()
+
+
+@pytest.mark.parametrize(
+    ("spec", "steps", "expected"),
+    [
+        ("all", 4, (0, 1, 2, 3)),
+        ("every:1", 3, (0, 1, 2)),
+        ("every:3", 7, (0, 3, 6)),
+        ("every:3", 8, (0, 3, 6, 7)),
+        ("every:99", 5, (0, 4)),
+        ("every:2", 1, (0,)),
+        ("0,4,9", 10, (0, 4, 9)),
+        (" 1, 3 ", 5, (1, 3)),
+        ("2", 5, (2,)),
+        ("auto:1", 1, (0,)),
+        ("auto:9", 4, (0, 1, 2, 3)),
+        ("auto:2", 6, (0, 5)),
+    ],
+)
+def test_what_a_spec_names(spec, steps, expected) -> None:
+    assert pick(spec, series_of(steps)) == expected
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("", "allowed: all, every:K, auto:N or a list such as 0,4,9"),
+        ("some", "allowed: all"),
+        ("0,,1", "allowed: all"),
+        ("-1,2", "allowed: all"),
+        ("every:0", "write every:K with K >= 1"),
+        ("every", "write every:K"),
+        ("every:x", "write every:K"),
+        ("auto:0", "write auto:N with N >= 2"),
+        ("auto:2.5", "write auto:N"),
+        ("auto:1", "at least 2"),
+        ("0,5", r"ascend without repeats within 0\.\.4"),
+        ("2,1", "ascend without repeats"),
+        ("1,1", "ascend without repeats"),
+    ],
+)
+def test_what_a_spec_may_not_be(spec, message) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        pick(spec, series_of(5))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 7])
+@pytest.mark.parametrize(
+    "times", [np.arange(8.0), UNEVEN, -UNEVEN, UNEVEN * 1e-300, UNEVEN * 1e300, 1e9 + UNEVEN]
+)
+def test_auto_is_the_best_of_all_subsets(count, times) -> None:
+    series = series_of(8, seed=count)
+    chosen = pick(f"auto:{count}", series, times)
+    subsets = [(0, *inner, 7) for inner in itertools.combinations(range(1, 7), count - 2)]
+    best = min(interpolation_error(series.values, times, subset) for subset in subsets)
+    assert len(chosen) == count
+    assert interpolation_error(series.values, times, chosen) == pytest.approx(best, rel=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_auto_does_not_depend_on_scale_or_offset(scale, offset) -> None:
+    series = series_of(9, seed=4)
+    assert pick("auto:4", ArraySeries((series.values + offset) * scale)) == pick("auto:4", series)
+
+
+def test_auto_finds_the_kinks_of_a_piecewise_linear_series() -> None:
+    times = np.array([0.0, 1, 3, 4, 7, 8, 9, 12])
+    a, b = np.random.default_rng(0).random((2, 3, 4, 5))
+    array = np.stack([a * np.interp(t, [0, 4, 9, 12], [0, 1, -1, 3]) + b for t in times])
+    assert pick("auto:4", ArraySeries(array), times) == (0, 3, 6, 7)
+    assert pick("auto:4", ArraySeries(array[::-1]), times[::-1]) == (0, 1, 4, 7)
+
+
+def test_auto_bears_missing_values_and_integers() -> None:
+    array = np.random.default_rng(0).integers(0, 100, (6, 2, 3, 4))
+    assert len(pick("auto:3", ArraySeries(array.astype(np.uint8)))) == 3
+    holed = array.astype(np.float32)
+    holed[:, 0, 0, 0], holed[2], holed[3, 1, 1, 1] = np.nan, np.nan, np.inf
+    assert len(pick("auto:3", ArraySeries(holed))) == 3
+    assert pick("auto:2", ArraySeries(np.full((3, 1, 1, 2), np.nan))) == (0, 2)
+
+
+def test_auto_needs_times_that_go_one_way() -> None:
+    with pytest.raises(InputError, match="step numbers"):
+        pick("auto:2", series_of(4), np.array([0.0, 1, 1, 2]))
+
+
+def test_costs_of_segments_are_the_definition() -> None:
+    series = series_of(8, seed=7)
+    frames = list(series.values.reshape(8, -1))
+    unit = np.stack(frames) * 2.0 ** -np.frexp(np.abs(frames).max())[1]
+    costs = segment_costs(gram_matrix(frames), UNEVEN)
+    for a, b in itertools.combinations(range(8), 2):
+        expected = interpolation_error(unit[a : b + 1], UNEVEN[a : b + 1], (0, b - a))
+        assert costs[a, b] == pytest.approx(expected, abs=1e-13)
+    assert np.isinf(costs[np.tril_indices(8)]).all()
+    assert optimal_steps(costs, 2) == (0, 7)
+
+
+@pytest.mark.parametrize(
+    ("shape", "limit", "stride"),
+    [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)],
+)
+def test_the_lattice_is_the_finest_that_fits(shape, limit, stride) -> None:
+    assert vertex_stride(shape, limit) == stride
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([3], True),
+        ([0, 1, 5], True),
+        ([5, 1, 0], True),
+        ([0, 1, 1], False),
+        ([0, 2, 1], False),
+        ([0, np.nan], False),
+        ([np.inf, np.inf], False),
+    ],
+)
+def test_strictly_monotonic(times, expected) -> None:
+    times = np.array(times, dtype=float)
+    assert strictly_monotonic(times) is expected
+    np.testing.assert_array_equal(time_axis(times), times if expected else np.arange(times.size))
+
+
+@pytest.mark.parametrize(
+    "times",
+    [UNEVEN, -UNEVEN, UNEVEN[::-1].copy(), 1e9 + UNEVEN],
+    ids=["up", "down", "back", "late"],
+)
+@pytest.mark.parametrize("key_frames", [(0, 7), (0, 2, 3, 7), (1, 4, 5), tuple(range(8)), (3,)])
+def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_frames) -> None:
+    keys = KeyTimes(times=times, key_frames=key_frames)
+    assert [keys.key_index(step) for step in key_frames] == list(range(len(key_frames)))
+    steps = np.linspace(0, 7, 141)
+    indices = keys.key_indices(steps)
+    assert (np.diff(indices) >= 0).all()
+    assert (indices[0], indices[-1]) == (0, len(key_frames) - 1)
+    for a, b in itertools.pairwise(key_frames):
+        for step in np.linspace(a, b, 7):
+            time = np.interp(step, range(8), times)
+            inside = (time - times[a]) / (times[b] - times[a])
+            assert keys.key_index(step) - key_frames.index(a) == pytest.approx(
+                inside, abs=1e-6 if times[0] > 1e6 else 1e-12
+            )
+
+
+def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere() -> None:
+    keys = KeyTimes(times=UNEVEN, key_frames=(2, 5))
+    assert [keys.key_index(step) for step in (0, 1.5, 2, 5, 6.5, 7)] == [0, 0, 0, 1, 1, 1]
+    assert [KeyTimes(times=UNEVEN, key_frames=(4,)).key_index(step) for step in (0, 3.3, 7)] == [
+        0,
+        0,
+        0,
+    ]
+    assert KeyTimes(times=np.array([5.0]), key_frames=(0,)).key_index(0) == 0
+
+
+@pytest.mark.parametrize("times", [UNEVEN, UNEVEN[::-1].copy(), -UNEVEN])
+def test_step_of_time_inverts_the_times(times) -> None:
+    keys = KeyTimes(times=times, key_frames=(0, 7))
+    assert [keys.step_of_time(time) for time in times] == list(range(8))
+    assert keys.step_of_time((times[2] + times[3]) / 2) == pytest.approx(2.5)
+    np.testing.assert_allclose(keys.steps_of_times(times.reshape(2, 4)), np.arange(8).reshape(2, 4))
+
+
+CLOSE = {
+    "next to each other": 3.5e5 + 2.0**-34 * np.arange(4),
+    "smallest": 5e-324 * np.arange(4),
+    "largest": 1.7e308 * np.array([-1.0, 0.0, 0.5, 1.0]),
+    "both": np.array([0.0, 5e-324, 1.0, 1.7e308]),
+}
+"""Times between which float64 has none, or whose differences it has not."""
+
+
+@pytest.mark.parametrize("times", CLOSE.values(), ids=CLOSE)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(
+    times, sign
+) -> None:
+    every = KeyTimes(times=sign * times, key_frames=(0, 1, 2, 3))
+    steps = np.linspace(0, 3, 25)
+    np.testing.assert_array_equal(every.key_indices(steps), steps)
+    assert every.steps_of_times(sign * times).tolist() == [0, 1, 2, 3]
+    few = KeyTimes(times=sign * times, key_frames=(0, 3))
+    assert [few.key_index(0), few.key_index(3)] == [0, 1]
+    assert (np.diff(few.key_indices(steps)) >= 0).all()
+
+
+def test_times_whose_difference_overflows_have_a_middle() -> None:
+    ends = KeyTimes(times=1.7e308 * np.array([-1.0, 0.0, 1.0]), key_frames=(0, 2))
+    assert ends.key_index(1) == 0.5
+    assert KeyTimes(times=1.7e308 * np.array([-1.0, 1.0]), key_frames=(0, 1)).step_of_time(0) == 0.5
+
+
+def test_what_lies_outside_is_refused() -> None:
+    keys = KeyTimes(times=UNEVEN[::-1].copy(), key_frames=(0, 7))
+    for time in (-0.1, 10.5, np.nan, np.inf):
+        with pytest.raises(RegionError, match=r"outside 0\.\.10"):
+            keys.step_of_time(time)
+    for step in (-0.5, 7.01, np.nan):
+        with pytest.raises(RegionError, match=r"outside 0\.\.7"):
+            keys.key_index(step)
+    with pytest.raises(InputError, match="step numbers"):
+        KeyTimes(times=np.array([0.0, 0.0]), key_frames=(0,))
+
+
+@pytest.mark.parametrize("key_frames", [(0, 3, 7), (2, 5), (4,)])
+def test_one_step_has_the_bits_of_the_same_step_among_many(key_frames) -> None:
+    times = KeyTimes(times=UNEVEN, key_frames=key_frames)
+    steps = np.linspace(0, 7, 57)
+    assert [times.key_index(step) for step in steps] == times.key_indices(steps).tolist()
+    with pytest.raises(RegionError):
+        times.key_index(7.5)
+    with pytest.raises(RegionError):
+        times.key_index(float("nan"))

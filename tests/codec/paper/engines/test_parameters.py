@@ -1,0 +1,226 @@
+"""The start of every training."""
+
+from __future__ import annotations
+
+from math import prod
+
+import numpy as np
+import pytest
+import torch
+from pretended_cuda import CUDA, pretended_cuda
+from readable_paper import interpolate
+
+from fhash_codec.paper.engines.parameters import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    SPREAD,
+    Upsampling,
+    adam_step,
+    adam_step_on_device,
+    axis_matrices,
+    catch_up,
+    catch_up_numbers,
+    corrections,
+    initial_parameters,
+    true_positions,
+)
+from fhash_codec.paper.network import Architecture
+
+
+def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
+    coreset = noise_coreset((2, 5, 6, 7))
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    one, same, other = (initial_parameters(architecture, coreset, seed) for seed in (4, 4, 5))
+    assert torch.equal(one.fine, same.fine)
+    assert torch.equal(one.coarse, same.coarse)
+    assert torch.equal(one.network, same.network)
+    assert not torch.equal(one.network, other.network)
+    assert (
+        one.coarse.numel() + one.network.numel() + prod(architecture.levels[0]) * 2
+        == architecture.parameters
+    )
+
+
+def test_parameters_are_within_their_bounds_and_split_by_level_and_layer(noise_coreset) -> None:
+    coreset = noise_coreset((2, 5, 6, 7))
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    parameters = initial_parameters(architecture, coreset, 0)
+    tables, layers = parameters.dense(architecture)
+    assert [tuple(table.shape) for table in tables] == [
+        (prod(level), 2) for level in architecture.levels[1:]
+    ]
+    for table in (parameters.fine, *tables):
+        assert 0.5 * SPREAD < float(table.abs().max()) <= SPREAD
+    for (weight, bias), (outputs, inputs) in zip(layers, architecture.layer_shapes, strict=True):
+        assert (weight.shape, bias.shape) == ((outputs, inputs), (outputs,))
+        assert max(float(weight.abs().max()), float(bias.abs().max())) <= inputs**-0.5
+
+
+def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
+    noise_coreset, in_coreset, monkeypatch
+) -> None:
+    coreset = noise_coreset((2, 9, 10, 20), 0.7)
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    shape = (len(coreset.bricks), 2, prod(coreset.brick_shape))
+    random = torch.Generator().manual_seed(3)
+    whole = torch.empty(shape).uniform_(-SPREAD, SPREAD, generator=random)
+    expected = whole.transpose(0, 1)[:, torch.from_numpy(in_coreset(coreset))]
+    for bricks in (1, 3, 1024):
+        monkeypatch.setattr("fhash_codec.paper.engines.parameters.BRICKS_AT_A_TIME", bricks)
+        assert torch.equal(initial_parameters(architecture, coreset, 3).fine, expected)
+
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize(
+    ("size", "corners", "length", "count"),
+    [(1, 1, 1, 1), (5, 5, 5, 1), (5, 3, 2, 3), (20, 7, 6, 4), (9, 2, 4, 3)],
+)
+def test_axis_matrices_give_every_vertex_its_position(size, corners, length, count) -> None:
+    start, weights = axis_matrices(size, corners, length, count)
+    assert (start >= 0).all()
+    assert (start + weights.shape[2] <= corners).all()
+    np.testing.assert_allclose(weights.sum(axis=2), 1, rtol=1e-15)
+    position = (weights * (start[:, None, None] + np.arange(weights.shape[2]))).sum(axis=2)
+    vertex = np.minimum(np.arange(count * length), size - 1)
+    expected = vertex * (corners - 1) / max(size - 1, 1)
+    np.testing.assert_allclose(position.ravel(), expected, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize(("shape", "low"), [((3, 9, 10, 20), 0.3), ((2, 20, 30, 40), 0.9995)])
+def test_upsampling_equals_the_sixteen_corners(noise_coreset, shape, low) -> None:
+    coreset = noise_coreset(shape, low)
+    architecture = Architecture.for_box(coreset.box.shape, shape[0])
+    upsampling = Upsampling(architecture, coreset, CPU)
+    random = torch.Generator().manual_seed(0)
+    numbers = sum(prod(level) for level in architecture.levels[1:]) * 2
+    tables = torch.randn(numbers, generator=random)
+    bricks = torch.from_numpy(coreset.bricks.astype(np.int64))[:40]
+    lattices = upsampling.lattices(bricks)
+    levels = len(architecture.levels) - 1
+    embeddings = torch.empty(levels, 2, len(bricks), *coreset.brick_shape)
+    lattices.interpolate(tables[upsampling.used], embeddings)
+
+    inside = torch.cartesian_prod(*(torch.arange(n) for n in coreset.brick_shape))
+    space = bricks[:, None, 1:] * torch.tensor(coreset.brick_shape) + inside
+    points = torch.cat([bricks[:, None, :1].expand(-1, len(inside), 1), space], dim=2)
+    last = torch.tensor(architecture.sizes) - 1
+    points = torch.minimum(points, last).double().reshape(-1, 4)
+    start = 0
+    for level, out in zip(architecture.levels[1:], embeddings, strict=True):
+        table = tables[start : start + prod(level) * 2].view(-1, 2).double()
+        start += prod(level) * 2
+        expected = interpolate(table, points, architecture.sizes, level)
+        ours = out.flatten(2).permute(1, 2, 0).reshape(-1, 2)
+        torch.testing.assert_close(ours.double(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_transpose_is_the_transpose(noise_coreset) -> None:
+    coreset = noise_coreset((3, 9, 10, 20))
+    architecture = Architecture.for_box(coreset.box.shape, 3)
+    upsampling = Upsampling(architecture, coreset, CPU)
+    lattices = upsampling.lattices(torch.from_numpy(coreset.bricks.astype(np.int64)))
+    random = torch.Generator().manual_seed(0)
+    tables = torch.randn(len(upsampling.used), generator=random)
+    out = torch.empty(len(architecture.levels) - 1, 2, len(coreset.bricks), *coreset.brick_shape)
+    gradient = torch.randn(out.shape, generator=random)
+    lattices.interpolate(tables, out)
+    transposed = torch.zeros_like(tables)
+    lattices.add_transposed(transposed, gradient)
+    # <A tables, gradient> = <tables, A' gradient>
+    one = float((out.double() * gradient.double()).sum())
+    other = float((tables.double() * transposed.double()).sum())
+    size = float((out.double() * gradient.double()).abs().sum())
+    assert one == pytest.approx(other, abs=1e-6 * size)
+
+
+def test_a_step_is_that_of_torch() -> None:
+    random = torch.Generator().manual_seed(0)
+    ours = torch.randn(100, generator=random, dtype=torch.float64)
+    theirs = torch.nn.Parameter(ours.clone())
+    adam = torch.optim.Adam([theirs], lr=0.01, betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+    mean, square = torch.zeros_like(ours), torch.zeros_like(ours)
+    for step in range(1, 6):
+        gradient = torch.randn(100, generator=random, dtype=torch.float64)
+        adam_step(ours, gradient, mean, square, step, 0.01)
+        theirs.grad = gradient
+        adam.step()
+    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-10, atol=1e-12)
+
+
+def test_a_step_by_numbers_on_the_device_is_the_same() -> None:
+    random = torch.Generator().manual_seed(1)
+    here = [torch.rand(50, generator=random) for _ in range(4)]
+    there = [tensor.clone() for tensor in here]
+    for step in (1, 2, 30):
+        adam_step(*here, step, 0.01)
+        correction, pace = (torch.tensor(number) for number in corrections(step, 0.01))
+        adam_step_on_device(*there, correction, pace)
+    for ours, theirs in zip(here, there, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)
+    before = there[0].clone()
+    adam_step_on_device(*there, torch.tensor(1.0), torch.tensor(0.0))  # the end of a schedule
+    assert torch.equal(there[0], before)
+
+
+def test_catching_up_equals_stepping_without_gradient() -> None:
+    rates = 0.01 * (0.5 + 0.5 * np.cos(np.linspace(0, np.pi, 400)))
+    visited = np.array([0, 1, 5, 100, 250, 299])
+    for scale in (1e-2, 1e-6, 1e-9):
+        m, v = 0.3 * scale, scale**2
+        effect = catch_up(visited, 299, rates)
+        for number, first in enumerate(visited):
+            mean, square, moved = m, v, 0.0
+            for step in range(first + 1, 300) if first else ():
+                mean, square = BETA1 * mean, BETA2 * square
+                moved -= (
+                    rates[step]
+                    * mean
+                    / (1 - BETA1**step)
+                    / ((square / (1 - BETA2**step)) ** 0.5 + EPSILON)
+                )
+            ours = -float(effect.factor[number]) * m / (v**0.5 + float(effect.epsilon[number]))
+            # The one approximation shows only where sqrt(v) is near eps within Adam's first steps,
+            # while its correction still moves.
+            assert ours == pytest.approx(
+                moved, rel=0.05 if scale < 1e-8 and first < 100 else 2e-3, abs=1e-12
+            )
+            assert effect.mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
+            assert effect.square_decay[number] == pytest.approx(square / v, rel=1e-5)
+
+
+def test_numbers_that_catch_up_move_by_the_effect_and_their_moments_decay() -> None:
+    random = torch.Generator().manual_seed(2)
+    numbers = torch.rand(3, 2, 4, generator=random)
+    effect = catch_up(np.array([0, 3, 5, 9]), 9, np.full(10, 0.01))
+    factor, epsilon, mean_decay, square_decay = map(torch.from_numpy, effect)
+    parameter, mean, square = numbers.clone()
+    catch_up_numbers(numbers, torch.from_numpy(np.stack(effect)))
+    moved = parameter - factor * mean / (square.sqrt() + epsilon)
+    torch.testing.assert_close(numbers[0], moved)
+    torch.testing.assert_close(numbers[1], mean * mean_decay)
+    torch.testing.assert_close(numbers[2], square * square_decay)
+    # Without steps, or without a gradient before them, nothing changes.
+    assert torch.equal(numbers[0][:, [0, 3]], parameter[:, [0, 3]])
+    assert not torch.equal(numbers[0][:, 1], parameter[:, 1])
+
+
+MASKS = [[], [0], [1], [0, 1, 1, 0, 0, 1], [1, 1, 1], [0, 0, 0]]
+
+
+@pytest.mark.parametrize("mask", MASKS)
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
+def test_positions_are_those_of_nonzero_without_a_wait(mask: list[int], dtype: torch.dtype) -> None:
+    expected = np.nonzero(mask)[0]
+    here = true_positions(torch.tensor(mask, dtype=dtype), len(expected))
+    with pretended_cuda() as pretended:
+        on_device = torch.tensor(mask, dtype=dtype, device="cuda")
+        there = true_positions(on_device, len(expected))
+        assert pretended.counts["waits"] == 0
+        assert there.device == CUDA
+        there = there.cpu()
+    for found in (here, there):
+        assert found.dtype == torch.int64
+        np.testing.assert_array_equal(found.numpy(), expected)

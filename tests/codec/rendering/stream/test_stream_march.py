@@ -1,0 +1,421 @@
+"""Streamed marches, with numpy and torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from frame_field import FrameField
+
+import fhash_codec
+from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering.image import Image
+from fhash_codec.rendering.march import march
+from fhash_codec.rendering.march_task import NUMPY, Arrays, Marched, Surface, Task
+from fhash_codec.rendering.plan import arrays_on
+from fhash_codec.rendering.stream_fields import Field
+from fhash_codec.rendering.stream_march import Projection, crossings, stream
+from fhash_codec.rendering.stream_rays import Beams
+from fhash_formats.errors import InputError
+
+FrameTask = Callable[..., tuple[FrameField, Task]]
+Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Any, Task]]
+FramePicture = Callable[[str, dict[str, Any]], Marched]
+
+
+def picture(
+    renderer: Renderer, mode: str, scene: dict[str, Any], size: tuple[int, int] = (48, 40)
+) -> Image:
+    return renderer.render(
+        Scene.from_dict({**scene, "size": size, "march": {**scene.get("march", {}), "mode": mode}})
+    )
+
+
+@pytest.fixture
+def frame_picture(planned: Planned, volume: Volume) -> Callable[[str, dict[str, Any]], Marched]:
+    """A function that draws a decoded frame of the compact file in a mode of marching."""
+
+    def of(mode: str, scene: dict[str, Any]) -> Marched:
+        field, task = planned(volume, {"size": [48, 40], **scene}, NUMPY)
+        if mode == "cache":
+            return march(field.frame, task)
+        return stream(
+            field,
+            task,
+            adaptive=mode == "arm",
+            budget=scene.get("march", {}).get("samples_per_pass"),
+        )
+
+    return of
+
+
+def test_three_ways_make_one_picture(frame_picture: FramePicture, scene: dict[str, Any]) -> None:
+    cache, streamed, adaptive = (frame_picture(mode, scene) for mode in ("cache", "stream", "arm"))
+    assert cache.rgba[..., 3].max() > 0.05
+    np.testing.assert_array_equal(streamed.rgba, adaptive.rgba)
+    np.testing.assert_allclose(streamed.rgba, cache.rgba, atol=1e-3)
+    if cache.depth is not None and streamed.depth is not None:
+        np.testing.assert_allclose(streamed.depth, cache.depth, atol=1e-3)
+    if cache.normal is not None and streamed.normal is not None:
+        np.testing.assert_allclose(streamed.normal, cache.normal, atol=1e-3)
+
+
+def test_adaptive_marching_takes_at_most_half_the_passes(frame_picture: FramePicture) -> None:
+    streamed, adaptive, large = (
+        frame_picture(mode, {"march": march})
+        for mode, march in (("stream", {}), ("arm", {}), ("arm", {"samples_per_pass": 10**6}))
+    )
+    assert adaptive.counters["passes"] <= streamed.counters["passes"] / 2
+    assert large.counters["passes"] < adaptive.counters["passes"]
+    np.testing.assert_array_equal(large.rgba, streamed.rgba)
+
+
+def test_a_small_budget_is_plain_streaming(frame_picture: FramePicture) -> None:
+    streamed, adaptive = (
+        frame_picture(mode, {"march": {"samples_per_pass": 1}}) for mode in ("stream", "arm")
+    )
+    assert streamed.counters == adaptive.counters
+
+
+@pytest.mark.parametrize("mode", ["stream", "arm"])
+def test_counters_prove_that_nothing_else_is_done(frame_picture: FramePicture, mode: str) -> None:
+    plain = frame_picture(mode, {}).counters
+    assert plain["gradients"] == plain["secondary_rays"] == 0
+    assert plain["evaluations"] == plain["samples"] > 0
+    shaded = frame_picture(mode, {"effects": {"shading": True}}).counters
+    assert 0 < shaded["gradients"] <= shaded["samples"]
+    assert {**shaded, "gradients": 0} == plain
+    around = frame_picture(mode, {"effects": {"box": True}}).counters
+    assert around == plain
+    strips = {"effects": {"axes": True, "colour_bar": True, "time_label": True}}
+    assert frame_picture(mode, strips).counters["gradients"] == 0
+    depth = frame_picture(mode, {"effects": {"buffers": ["depth"]}}).counters
+    assert depth == plain
+
+
+def test_bricks_that_cannot_be_seen_cost_nothing(frame_picture: FramePicture) -> None:
+    narrow: dict[str, Any] = {"transfer_function": {"opacity": [[6, 0], [7, 0.5], [8, 0]]}}
+    skipping, marching = (
+        frame_picture("arm", {**narrow, "march": {"skipping": on}}) for on in (True, False)
+    )
+    np.testing.assert_array_equal(skipping.rgba, marching.rgba)
+    assert skipping.counters["skipped_bricks"] > 0
+    assert marching.counters["skipped_bricks"] == 0
+    assert skipping.counters["samples"] < marching.counters["samples"] / 3
+
+
+def test_only_samples_in_visible_cells_are_evaluated(
+    frame_picture: FramePicture, planned: Planned, volume: Volume
+) -> None:
+    narrow = {"transfer_function": {"opacity": [[4, 0], [4.2, 0.1], [4.4, 0]]}}
+    found, everything = (
+        frame_picture("arm", {**narrow, "march": {"skipping": on, "threshold": 0.0}})
+        for on in (True, False)
+    )
+    np.testing.assert_array_equal(found.rgba, everything.rgba)
+    frame = volume.read(0)
+    corners = [
+        frame[tuple(slice(up, n - 1 + up) for up, n in zip(corner, frame.shape, strict=True))]
+        for corner in np.ndindex(2, 2, 2)
+    ]
+    visible = (np.min(corners, axis=0) < 4.4) & (np.max(corners, axis=0) > 4)
+    _, task = planned(volume, {**narrow, "size": [48, 40]}, NUMPY)
+    beams = Beams.of(task, task.rays.grid.bounds, range(40))
+    sample = np.arange(beams.end.max())[None]
+    row, column = np.nonzero(sample < beams.end[:, None])
+    x, y, z = np.minimum(beams.places(row, column).astype(int), np.array(visible.shape[::-1]) - 1).T
+    inside = int(visible[z, y, x].sum())
+    assert inside <= found.counters["evaluations"] <= 1.1 * inside
+
+
+def test_rays_end_where_no_light_is_left(frame_picture: FramePicture) -> None:
+    opaque: dict[str, Any] = {"transfer_function": {"opacity": "opaque"}}
+    ending, going = (
+        frame_picture("stream", {**opaque, "march": {"threshold": threshold}})
+        for threshold in (1 / 1024, 0.0)
+    )
+    assert ending.counters["samples"] < going.counters["samples"] / 4
+    np.testing.assert_allclose(ending.rgba, going.rgba, atol=1 / 1024)
+
+
+NETWORK: dict[str, Any] = {
+    "effects": {"shading": True, "isosurfaces": [{"value": 5, "opacity": 0.5}]}
+}
+
+
+@pytest.mark.parametrize("step", [0.0, 0.7])
+def test_both_ways_make_the_same_picture_of_a_network(files: dict[str, Path], step: float) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        streamed, adaptive = (
+            picture(Renderer(network), mode, {**NETWORK, "step": step})
+            for mode in ("stream", "arm")
+        )
+    assert streamed.rgba[..., 3].max() > 0.05
+    np.testing.assert_array_equal(streamed.rgba, adaptive.rgba)
+
+
+def test_a_network_is_evaluated_at_every_sample(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        cache, streamed = (
+            picture(Renderer(network), mode, NETWORK).counters for mode in ("cache", "stream")
+        )
+    assert cache["evaluations"] == 0
+    assert 0 < streamed["evaluations"] <= streamed["samples"]
+
+
+@pytest.mark.parametrize("step", [0.0, 0.7])
+def test_the_picture_of_a_network_is_near_that_of_its_vertices(
+    files: dict[str, Path], step: float
+) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        cache, streamed = (
+            picture(Renderer(network), mode, {**NETWORK, "step": step}).rgba
+            for mode in ("cache", "stream")
+        )
+    assert np.isfinite(streamed).all()
+    # Between vertices the network has values of its own: they make all the difference.
+    assert np.mean(np.abs(streamed - cache)) < 0.02
+
+
+@pytest.mark.parametrize("fog", [1e-9, 1e-3, 0.3])
+@pytest.mark.parametrize("step", [0.02, 0.37, 5.0])
+def test_a_slab_of_fog_is_as_opaque_as_its_length(
+    frame_task: FrameTask, fog: float, step: float
+) -> None:
+    field, task = frame_task(np.full((9, 7, 7), 0.5), step=step, fog=fog)
+    rgba = stream(field, task, adaptive=True).rgba
+    np.testing.assert_allclose(rgba, -np.expm1(-fog * 8), rtol=1e-6)
+
+
+@pytest.mark.parametrize("budget", [1, 10**6])
+@pytest.mark.parametrize("value", [0.381, 0.395, 0.405, 0.81, 0.795, 0.99])
+@pytest.mark.parametrize(("count", "step"), [(11, 0.5), (10, 3.9)])
+def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
+    frame_task: FrameTask, value: float, count: int, step: float, budget: int
+) -> None:
+    ramp = np.broadcast_to(np.linspace(0, 1, count)[:, None, None], (count, 7, 7))
+    field, task = frame_task(
+        ramp, step=step, surfaces=(Surface(value=value, colour=np.ones(3), opacity=0.5),)
+    )
+    for skipping in (True, False):
+        found = stream(field, replace(task, skipping=skipping), adaptive=True, budget=budget)
+        np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("budget", [1, 10**6])
+@pytest.mark.parametrize("level", [0.0625, 0.3, 0.6, 0.9375])
+def test_every_crossing_of_a_wave_is_seen(frame_task: FrameTask, level: float, budget: int) -> None:
+    wave = np.abs((np.arange(97) + 12) % 24 - 12.0) / 12
+    field, task = frame_task(
+        np.broadcast_to(wave[:, None, None], (97, 7, 7)),
+        step=0.9,
+        surfaces=(Surface(value=level, colour=np.ones(3), opacity=0.1),),
+    )
+    np.testing.assert_allclose(
+        stream(field, task, adaptive=True, budget=budget).rgba, 1 - 0.9**8, atol=1e-6
+    )
+
+
+def test_nothing_is_seen_of_what_has_no_value(frame_task: FrameTask) -> None:
+    field, task = frame_task(np.full((9, 7, 7), np.nan), fog=1.0)
+    found = stream(field, task, adaptive=False)
+    assert not found.rgba.any()
+    assert found.counters["samples"] == 0
+
+
+VALUES = np.array([[0.2, 0.9, np.nan, 0.4], [np.nan, 0.1, 0.6, 0.6], [np.nan] * 4])
+LENGTHS = np.array([[1.0, 1.0, 1.0, 0.5]] * 3)
+OPACITIES = np.where(np.isnan(VALUES), 0.0, 0.5 * np.nan_to_num(VALUES))
+
+
+@pytest.mark.parametrize("pace", [1, 3, 4])
+@pytest.mark.parametrize(
+    ("kind", "values", "at"),
+    [
+        ("maximum", [0.9, 0.6], [1, 2]),
+        ("minimum", [0.2, 0.1], [0, 1]),
+        ("average", [1.3 / 2.5, 1.0 / 2.5], [0, 1]),
+        ("attenuated", [0.9 * 0.9, 0.6 * 0.95], [1, 2]),
+    ],
+)
+def test_values_and_places(kind: str, values: list[float], at: list[int], pace: int) -> None:
+    projection = Projection(kind, (0.0, 1.0), 3, NUMPY)
+    alive = np.arange(3)
+    for first in range(0, 4, pace):
+        part = slice(first, min(first + pace, 4))
+        sample = np.broadcast_to(np.arange(4)[part], VALUES[:, part].shape)
+        projection.add(alive, sample, VALUES[:, part], LENGTHS[:, part], OPACITIES[:, part])
+    np.testing.assert_allclose(projection.values[:2], values, rtol=1e-14)
+    assert not np.isfinite(projection.values[2])
+    np.testing.assert_array_equal(projection.at[:2], at)
+
+
+def test_only_an_attenuated_maximum_can_be_finished_early() -> None:
+    for kind in ("maximum", "minimum", "average", "attenuated"):
+        projection = Projection(kind, (0.0, 1.0), 1, NUMPY)
+        projection.add(
+            np.array([0]), np.array([[0]]), np.array([[0.7]]), np.ones((1, 1)), np.full((1, 1), 0.5)
+        )
+        assert projection.finished(np.array([0]))[0] == (kind == "attenuated")
+
+
+def test_roots_are_exact() -> None:
+    sample = np.arange(6.0)[None]
+    found = crossings(
+        lambda row, at, counted: (at - 2.3) ** 3,
+        sample,
+        (sample - 2.3) ** 3,
+        (
+            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
+            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
+        ),
+    )
+    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
+    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
+    assert found.which[0, 1:3, 0].tolist() == [1, 0]
+
+
+def test_nothing_is_crossed_where_a_value_is_missing() -> None:
+    """Neither between samples of which one has no value, nor where the search meets none."""
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
+    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
+    assert not missing.opacity.any()
+    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
+    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
+    assert there.at[0, 2, 0] == 2.5
+
+
+Planned_stream_torch = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
+
+
+def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:
+    """Equal counters, but for the turns of the search for surfaces, which rounding decides."""
+    searched = here.counters["evaluations"] - there.counters["evaluations"]
+    assert abs(searched) <= (
+        0.05 * here.counters["evaluations"] if "isosurfaces" in scene.get("effects", {}) else 0
+    )
+    alike = {
+        **there.counters,
+        **{count: there.counters[count] + searched for count in ("samples", "evaluations")},
+    }
+    assert alike == here.counters
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_torch_makes_the_picture_of_numpy(
+    planned: Planned_stream_torch,
+    volume: Volume,
+    tensors: Arrays,
+    scene: dict[str, Any],
+    adaptive: bool,
+) -> None:
+    here, there = (
+        stream(*planned(volume, scene, arrays), adaptive=adaptive, budget=3000)
+        for arrays in (NUMPY, tensors)
+    )
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-5)
+    assert_same_work(here, there, scene)
+    for mine, other in ((here.depth, there.depth), (here.normal, there.normal)):
+        assert (mine is None) == (other is None)
+        if mine is not None and other is not None:
+            np.testing.assert_allclose(other, mine, atol=1e-5)
+
+
+def test_nothing_leaves_the_device_before_the_picture(
+    planned: Planned_stream_torch, volume: Volume, tensors: Arrays
+) -> None:
+    import torch
+    from torch.overrides import TorchFunctionMode
+
+    taken = []
+
+    class Watched(type(tensors)):  # type: ignore[misc]
+        def host(self, array: Any) -> np.ndarray:
+            taken.append(array.numel())
+            with torch._C.DisableTorchFunction():
+                return super().host(array)
+
+    class Watch(TorchFunctionMode):
+        def __torch_function__(
+            self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            name = function.__name__
+            assert name not in ("cpu", "numpy", "__array__", "cuda"), name
+            assert name != "tolist" or args[0].numel() <= 2  # the counts of a pass
+            assert function.__name__ == "from_numpy" or not any(
+                isinstance(each, (np.ndarray, np.generic)) for each in args
+            ), function
+            return function(*args, **(kwargs or {}))
+
+    effects = {
+        "shadows": True,
+        "shading": {"gradient": "central"},
+        "isosurfaces": [{"value": 5, "opacity": 0.5}],
+    }
+    scene = {"effects": {**effects, "buffers": ["depth", "normal"], "jitter": True}}
+    field, task = planned(volume, scene, Watched(torch.device("cpu")))
+    with Watch():
+        marched = stream(field, task, adaptive=True, budget=3000)
+    assert marched.rgba.any()
+    rays = 40 * 34
+    assert sorted(taken) == [rays, 3 * rays, 4 * rays]
+
+
+def test_torch_marches_through_a_network_as_numpy_does(
+    planned: Planned_stream_torch,
+    files: dict[str, Path],
+    tensors: Arrays,
+    network_scene: dict[str, Any],
+) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        here, there = (
+            stream(*planned(network, network_scene, arrays), adaptive=True)
+            for arrays in (NUMPY, tensors)
+        )
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
+    assert there.counters["evaluations"] > 0
+    assert_same_work(here, there, network_scene)
+    if here.normal is not None:
+        assert here.normal.any()
+        np.testing.assert_allclose(there.depth, here.depth, atol=1e-3)
+        np.testing.assert_allclose(there.normal, here.normal, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["compact", "paper"])
+def test_cuda_makes_the_picture_of_numpy(
+    files: dict[str, Path], planned: Planned_stream_torch, central_scene: dict[str, Any], kind: str
+) -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    with fhash_codec.open(files[kind]) as opened:
+        here, there = (
+            stream(*planned(opened, central_scene, arrays_on(device)), adaptive=True)
+            for device in ("cpu", "cuda")
+        )
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
+    np.testing.assert_allclose(there.normal, here.normal, atol=1e-3)
+    assert there.counters["rays"] == here.counters["rays"]
+
+
+def test_a_device_without_enough_memory_says_so(
+    planned: Planned_stream_torch, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import torch
+
+    def full(places: object, wanted: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    field, task = planned(volume, {}, tensors)
+    monkeypatch.setattr(field, "values", full)
+    with pytest.raises(InputError, match="memory of the device"):
+        stream(field, task, adaptive=True)

@@ -1,0 +1,302 @@
+"""The task of a marcher: arrays, units, frames of uneven axes."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.rendering.grid import Grid, Warp
+from fhash_codec.rendering.march_task import (
+    COUNTERS,
+    DENSEST,
+    LARGE_OFFSET,
+    NUMPY,
+    Array,
+    Arrays,
+    Frame,
+    Units,
+    complete,
+    extinctions_in,
+    rows,
+    warped,
+)
+from fhash_codec.rendering.plan import arrays_on
+from fhash_codec.volume import Volume
+from fhash_formats.errors import InputError
+
+
+@pytest.fixture(params=["numpy", "torch"])
+def arrays_arrays(request: pytest.FixtureRequest) -> Arrays:
+    if request.param == "numpy":
+        return NUMPY
+    import torch
+
+    from fhash_codec.rendering.torch_arrays import TorchArrays
+
+    return TorchArrays(torch.device("cpu"))
+
+
+def test_arrays_come_back_as_they_went(arrays_arrays: Arrays) -> None:
+    for kind in ("float32", "float64", "int64", "bool"):
+        values = np.arange(6).reshape(2, 3).astype(kind)
+        back = arrays_arrays.host(arrays_arrays.array(values))
+        np.testing.assert_array_equal(back, values)
+        assert back.dtype == values.dtype
+    assert arrays_arrays.host(arrays_arrays.array([1, 2], "float32")).dtype == np.float32
+    assert arrays_arrays.host(arrays_arrays.full(2, 1.5)).tolist() == [1.5, 1.5]
+    assert arrays_arrays.host(arrays_arrays.full((1, 2), 3, "int64")).tolist() == [[3, 3]]
+    assert arrays_arrays.host(arrays_arrays.empty((2, 3), "float32")).shape == (2, 3)
+    assert arrays_arrays.host(arrays_arrays.range(3)).tolist() == [0, 1, 2]
+
+
+def test_numbers_are_converted_towards_zero(arrays_arrays: Arrays) -> None:
+    values = arrays_arrays.array([-1.7, -0.5, 1.7])
+    assert arrays_arrays.host(arrays_arrays.to_int64(values)).tolist() == [-1, 0, 1]
+    assert arrays_arrays.host(arrays_arrays.to_float32(values)).dtype == np.float32
+    assert arrays_arrays.host(arrays_arrays.to_float64(arrays_arrays.range(2))).dtype == np.float64
+
+
+def test_a_copy_has_memory_of_its_own(arrays_arrays: Arrays) -> None:
+    first = arrays_arrays.array([1.0, 2.0])
+    second = arrays_arrays.copy(first)
+    second[0] = 5.0
+    assert arrays_arrays.host(first).tolist() == [1.0, 2.0]
+
+
+def test_elements_are_found_and_picked(arrays_arrays: Arrays) -> None:
+    array = arrays_arrays.array([[0.0, 3.0], [4.0, 0.0]])
+    rows, columns = arrays_arrays.nonzero(array)
+    assert arrays_arrays.host(rows).tolist() == [0, 1]
+    assert arrays_arrays.host(columns).tolist() == [1, 0]
+    picked = arrays_arrays.take_along(array, arrays_arrays.array([[1], [0]]), 1)
+    assert arrays_arrays.host(picked).tolist() == [[3.0], [4.0]]
+
+
+def test_rows_that_are_named_twice_are_added_twice(arrays_arrays: Arrays) -> None:
+    total = arrays_arrays.full((3, 2), 1.0)
+    values = arrays_arrays.array([[1.0, 2.0], [10.0, 20.0], [100.0, 200.0]])
+    arrays_arrays.add_rows(total, arrays_arrays.array([2, 0, 2]), values)
+    assert arrays_arrays.host(total).tolist() == [[11.0, 21.0], [1.0, 1.0], [102.0, 203.0]]
+
+
+def test_candidates_are_those_of_the_mask_on_the_host_and_all_on_a_device(
+    arrays_arrays: Arrays,
+) -> None:
+    mask = arrays_arrays.array([False, True, True, False])
+    values = arrays_arrays.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]])
+    some = arrays_arrays.candidates(mask)
+    assert (
+        arrays_arrays.host(values[some]).tolist()
+        == arrays_arrays.host(values[mask] if arrays_arrays is NUMPY else values).tolist()
+    )
+    result = arrays_arrays.full((4, 2), 0.0)
+    result[some] = arrays_arrays.kept(mask[some], values[some], 0.0)
+    assert arrays_arrays.host(result)[:, 0].tolist() == [0.0, 2.0, 3.0, 0.0]
+    other = arrays_arrays.array([9.0, 9.0, 9.0, 9.0])
+    kept = arrays_arrays.kept(mask[some], values[:, 1][some], other[some])
+    assert arrays_arrays.host(kept)[arrays_arrays.host(mask[some])].tolist() == [2.0, 3.0]
+
+
+def test_counts_come_together_and_positions_by_their_count(arrays_arrays: Arrays) -> None:
+    mask = arrays_arrays.array([False, True, True, False, True])
+    count, largest = arrays_arrays.counts(
+        arrays_arrays.xp.count_nonzero(mask), arrays_arrays.range(7).max()
+    )
+    assert (count, largest) == (3, 6)
+    assert arrays_arrays.host(arrays_arrays.chosen(mask, count)).tolist() == [1, 2, 4]
+    assert len(arrays_arrays.chosen(mask & False, 0)) == 0
+
+
+def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert arrays_on("cpu") is arrays_on("auto") is NUMPY
+    with pytest.raises(InputError, match="no CUDA device"):
+        arrays_on("cuda")
+    with pytest.raises(InputError, match="'gpu'; allowed: auto, cpu, cuda"):
+        arrays_on("gpu")
+
+
+def test_marching_on_the_processor_loads_no_torch() -> None:
+    code = (
+        "import sys; from fhash_codec.rendering import plan as devices; "
+        "import fhash_codec.rendering.stream_march; devices._driver_exists = lambda: False; "
+        "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )
+
+
+VALUES = np.array([[0.0, -1.75, 2.5], [3.25, 0.0, -0.5]])
+
+
+def results(arrays: Arrays) -> dict[str, Array]:
+    """The result of each operation, on the host."""
+    values = arrays.array(VALUES)
+    order = arrays.array([[2, 0, 1], [0, 0, 2]], "int64")
+    sums = arrays.full((3, 2), 1.0)
+    rows = arrays.array([2, 0, 2], "int64")
+    arrays.add_rows(sums, rows, arrays.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
+    copy = arrays.copy(values)
+    copy[0] = 9.0
+    found = {
+        "array": values,
+        "float32": arrays.to_float32(values),
+        "int64": arrays.to_int64(values),
+        "float64": arrays.to_float64(arrays.to_int64(values)),
+        "range": arrays.range(4),
+        "full": arrays.full((2, 2), 7, "int64"),
+        "row": arrays.nonzero(values)[0],
+        "column": arrays.nonzero(values)[1],
+        "taken": arrays.take_along(values, order, 1),
+        "sums": sums,
+        "copied from": values,
+    }
+    return {name: arrays.host(array) for name, array in found.items()}
+
+
+def test_operations_equal_those_of_numpy(tensors: Arrays) -> None:
+    expected, result = results(NUMPY), results(tensors)
+    for name, array in expected.items():
+        assert result[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(result[name], array, err_msg=name)
+
+
+def test_empty_arrays_have_the_type_and_shape_asked_for(tensors: Arrays) -> None:
+    for arrays in (NUMPY, tensors):
+        empty = arrays.host(arrays.empty((2, 3), "float32"))
+        assert (empty.shape, empty.dtype) == ((2, 3), np.dtype("float32"))
+
+
+def test_a_device_without_memory_is_an_input_error(tensors: Arrays) -> None:
+    import torch
+
+    with pytest.raises(InputError, match="smaller"), tensors.guarded():
+        raise torch.OutOfMemoryError("too much")
+
+
+GRID = Grid(counts=(11, 9, 1), origin=np.zeros(3), spacing=np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("first", "shape", "stride", "bounds"),
+    [
+        ((0, 0, 0), (1, 9, 11), 1, [[0, 10], [0, 8], [-0.5, 0.5]]),
+        ((0, 2, 3), (1, 4, 5), 1, [[3, 7], [2, 5], [-0.5, 0.5]]),
+        # No further vertex would fit: the last values stand up to the end.
+        ((0, 0, 0), (1, 3, 4), 3, [[0, 10], [0, 8], [-0.5, 0.5]]),
+        ((0, 0, 0), (1, 2, 3), 3, [[0, 6], [0, 3], [-0.5, 0.5]]),
+    ],
+)
+def test_the_bounds_of_a_frame_reach_to_where_it_has_values(
+    first: tuple[int, int, int], shape: tuple[int, ...], stride: int, bounds: list[list[float]]
+) -> None:
+    frame = Frame(values=np.zeros(shape, dtype=np.float32), first=first, stride=stride)
+    np.testing.assert_array_equal(frame.bounds(GRID), bounds)
+
+
+def test_extinctions_in_another_length_stay_finite() -> None:
+    extinctions = np.array([0.0, 2.0, 1e300])
+    np.testing.assert_array_equal(extinctions_in(extinctions, 1e20), [0.0, 2e20, DENSEST])
+
+
+def test_counters_are_summed_in_one_order() -> None:
+    total = complete({"samples": 3, "rays": 1}, {"samples": 4})
+    assert list(total) == list(COUNTERS)
+    assert total == {**dict.fromkeys(COUNTERS, 0), "rays": 1, "samples": 7}
+    with pytest.raises(KeyError):
+        complete({"photons": 1})
+
+
+def test_every_counter_has_a_row() -> None:
+    assert [name for name, _, _ in rows({})] == [name.replace("_", " ") for name in COUNTERS]
+    assert ("secondary rays", "1,234", COUNTERS["secondary_rays"]) in rows({"secondary_rays": 1234})
+
+
+def volume(low: float, high: float, dtype: str) -> Volume:
+    fields = SimpleNamespace(value_range=ValueRange(low, high), float_dtype=np.dtype(dtype))
+    return cast(Volume, fields)
+
+
+def test_float32_data_are_marched_as_they_are() -> None:
+    assert Units.of(volume(-1.0, 3.0, "float32")) == Units()
+    edge = LARGE_OFFSET
+    assert Units.of(volume(edge - 2, edge, "float32")) == Units()
+    assert Units.of(volume(edge, edge + 2, "float32")) != Units()
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(0.0, 1.0), (1e6, 1e6 + 1), (-1e-300, 1e-300), (-1e300, 1e300), (5.0, 5.0)],
+)
+def test_converted_values_have_a_size_near_one(low: float, high: float) -> None:
+    units = Units.of(volume(low, high, "float64"))
+    assert math.frexp(units.factor)[0] == 0.5, "a power of two"
+    ends = units.to([low, high])
+    assert np.isfinite(ends).all()
+    assert np.abs(ends).max() <= 1
+
+
+def test_integers_that_are_one_float_cannot_be_drawn() -> None:
+    top = 2**64 - 1
+    with pytest.raises(InputError, match=f"cannot tell values from {top - 998} to {top} apart"):
+        Units.of(volume(top - 998, top, "float64"))
+    assert Units.of(volume(2**60, 2**60 + 998, "float64")).factor == 2.0**-10
+    assert Units.of(volume(top, top, "float64")).factor > 0
+
+
+PLACES = np.array([0, 0.25, 0.5, 1, 1.5, 2, 3, 4.0])
+WARP = Warp(counts=(5, 2, 3), places=(PLACES, None, None))
+
+
+def frame(values: np.ndarray, first: tuple[int, int, int] = (0, 0, 0), stride: int = 1) -> Frame:
+    return Frame(values=values.astype(np.float32), first=first, stride=stride)
+
+
+def test_without_a_warp_nothing_happens() -> None:
+    given = frame(np.zeros((2, 2, 2)))
+    assert warped(given, None) is given
+
+
+def test_values_are_linear_between_the_vertices_of_the_series() -> None:
+    z, y, x = np.meshgrid(range(3), range(2), range(5), indexing="ij")
+    drawn = warped(frame(100 * z + 10 * y + x), WARP)
+    assert drawn.values.shape == (3, 2, 8)
+    np.testing.assert_allclose(drawn.values[2, 1], 210 + PLACES)
+    assert drawn.values.flags.c_contiguous
+
+
+def test_a_vertex_without_a_value_takes_those_beside_it_along() -> None:
+    values = np.arange(5.0)
+    values[2] = np.nan
+    line = warped(frame(np.broadcast_to(values, (3, 2, 5)).copy()), WARP).values[0, 0]
+    np.testing.assert_array_equal(line, [0, 0.25, 0.5, 1, np.nan, np.nan, 3, 4])
+    np.testing.assert_array_equal(values, [0, 1, np.nan, 3, 4])
+
+
+def test_a_region_keeps_its_place() -> None:
+    drawn = warped(frame(np.arange(1.0, 4.0)[None, None].repeat(2, axis=1), (1, 0, 1)), WARP)
+    assert drawn.first == (1, 0, 3)
+    np.testing.assert_allclose(drawn.values[0, 0], [1, 1.5, 2, 3])
+    nothing = warped(frame(np.ones((1, 1, 1)), (0, 0, 4)), WARP)
+    assert nothing.values.shape == (1, 1, 1)
+    assert nothing.first == (0, 0, 7)
+
+
+def test_a_coarse_frame_reaches_to_the_end() -> None:
+    warp = Warp(counts=(6, 1, 1), places=(np.linspace(0, 5, 11), None, None))
+    drawn = warped(frame(np.array([0.0, 2, 4])[None, None], stride=2), warp)
+    assert drawn.stride == 2
+    np.testing.assert_allclose(drawn.values[0, 0], [0, 1, 2, 3, 4, 4])

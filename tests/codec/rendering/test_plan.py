@@ -1,0 +1,517 @@
+"""The plan of a picture, and its reasons."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from frame_field import by_stream
+
+import fhash_codec
+from fhash_codec import EncodeConfig, Renderer, Scene, Volume
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import NUMPY, Units
+from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_at, plan_picture
+from fhash_codec.rendering.transfer_function import Histogram
+from fhash_formats.errors import FhashWarning, InputError, RegionError
+from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
+
+
+def plan(volume: Volume, **scene: Any) -> Plan:
+    return plan_picture(volume, Scene.from_dict(scene))
+
+
+def test_what_no_effect_asks_for_is_not_in_the_task(volume: Volume) -> None:
+    planned = plan(volume)
+    task = planned.task
+    assert task.lighting is None
+    assert task.light is None
+    assert not planned.lights
+    on = [task.shaded, task.surfaces, task.projection, task.depth, task.normal, task.jitter]
+    assert not any(on)
+    assert planned.to_dict()["gradient"] == "none: no effect asks for it"
+    assert planned.to_dict()["secondary rays"] == "none: no effect asks for them"
+
+
+def test_each_effect_changes_its_own_part_of_the_task(volume: Volume) -> None:
+    shaded = plan(volume, effects={"shading": {"light": [0, 0, 2]}}).task
+    assert shaded.shaded
+    np.testing.assert_allclose(shaded.lighting.lamp, [0, 0, 1])  # type: ignore[union-attr]
+    assert plan(volume, effects={"shading": True}).task.lighting.lamp is None  # type: ignore[union-attr]
+    surfaces = plan(
+        volume,
+        effects={
+            "isosurfaces": [{"value": 4, "colour": "red"}, {"value": 5}, {"value": 6, "opacity": 0}]
+        },
+    )
+    assert [surface.value for surface in surfaces.task.surfaces] == [4, 5]
+    np.testing.assert_allclose(surfaces.task.surfaces[0].colour, [1, 0, 0])
+    np.testing.assert_allclose(surfaces.task.surfaces[1].colour, surfaces.function.colour(5))
+    assert not surfaces.task.shaded
+    assert plan(volume, effects={"buffers": ["normal"]}).task.normal
+    assert plan(volume, effects={"shadows": {"strength": 0}}).shadows is None
+
+
+def test_a_surface_beyond_the_values_is_told(volume: Volume) -> None:
+    low, high = volume.value_range.low, volume.value_range.high
+    for beyond in (low - 1, high + 1):
+        with pytest.warns(FhashWarning, match=rf"isosurface {beyond:.6g}: .* reaches from") as told:
+            plan(volume, effects={"isosurfaces": [{"value": beyond}, {"value": high}]})
+        assert len(told) == 1
+    plan(volume, effects={"isosurfaces": [{"value": low}, {"value": high}]})  # and no warning
+
+
+def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
+    planned = plan(volume, effects={"shading": True, "shadows": True})
+    rays, spacing = planned.task.rays, planned.task.rays.grid.spacing
+    assert planned.lamp is not None
+    assert planned.lamp @ (rays.forward * spacing) < 0
+    assert planned.lamp @ (rays.up * spacing) > 0
+    assert planned.lamp @ (rays.right * spacing) < 0
+    assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
+
+
+def test_the_step_is_in_spacings_of_what_is_marched(volume: Volume) -> None:
+    fine, coarse = (plan(volume, march={"lod": lod, "step": 0.25}) for lod in (0, 2))
+    assert (
+        coarse.task.step
+        == pytest.approx(4 * fine.task.step)
+        == pytest.approx(Grid.of(volume.coords).vertex_spacing)
+    )
+
+
+def test_far_away_the_level_of_detail_is_coarse(volume: Volume) -> None:
+    assert plan(volume).lod == 0
+    assert plan(volume, size=[8, 8]).lod == 1
+    assert plan(volume, size=[4, 4]).lod == 2
+    assert plan(volume, size=[8, 8], march={"lod": 0}).lod == 0
+
+
+def test_a_network_has_no_levels_of_detail(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        assert plan(network, size=[4, 4]).lod == 0
+        with pytest.raises(InputError, match="no levels of detail"):
+            plan(network, march={"lod": 1})
+
+
+def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]) -> None:
+    asked = []
+
+    def histogram() -> Histogram:
+        asked.append(1)
+        return np.linspace(0, 10, 11), np.arange(10)
+
+    for name, scene, expected in (
+        ("compact", {}, 1),
+        ("compact", {"transfer_function": {"opacity": "linear"}}, 0),
+        ("feature", {}, 0),
+    ):
+        with fhash_codec.open(files[name]) as opened:
+            asked.clear()
+            plan_picture(opened, Scene.from_dict(scene), histogram=histogram)
+            assert len(asked) == expected
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ({"step": 2.5}, "outside the series"),
+        ({"size": [16384, 16384]}, f"more than {MAX_RAYS:,} rays"),
+        ({"size": [4096, 4096], "effects": {"antialiasing": 8}}, "smaller picture"),
+        ({"transfer_function": {"nothing": True}}, "shows nothing"),
+        (
+            {
+                "transfer_function": {"nothing": True},
+                "effects": {"maximum_intensity": True, "isosurfaces": [{"value": 1}]},
+            },
+            "take one",
+        ),
+        (
+            {"effects": {"maximum_intensity": True, "minimum_intensity": True}},
+            "names maximum and minimum intensity; leave one of them",
+        ),
+        (
+            {
+                "transfer_function": {"gradient_opacity": [[0, 1]]},
+                "effects": {"average_intensity": True},
+            },
+            "has no opacity that 'gradient_opacity' could change",
+        ),
+        ({"transfer_function": {"gradient_opacity": [[1, 0], [0, 1]]}}, "do not ascend"),
+        ({"transfer_function": {"gradient_opacity": [[0, 0], [1, 2]]}}, "reach to 2; allowed"),
+        ({"transfer_function": {"gradient_opacity": [[0, 0], [1, 0]]}}, "one of them above 0"),
+        ({"effects": {"clip": {"x": [99, 100]}}}, "x 99 to 100 leaves nothing of the volume"),
+        ({"transfer_function": {"opacity": [[0, 0], [9, 0]]}}, "shows nothing"),
+        ({"transfer_function": {"density": 0}}, "shows nothing"),
+        ({"background": "wite"}, "did you mean 'white'"),
+        ({"effects": {"shading": {"light": [0, 0, 0]}}}, "no length"),
+        (
+            {"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}},
+            "one lamp",
+        ),
+        ({"march": {"mode": "arm"}}, "march 'arm' is for a network, and .*compact, has none"),
+        ({"march": {"mode": "stream"}}, "march 'stream' is for a network"),
+        ({"march": {"device": "cuda"}}, "device 'cuda' is for a network"),
+        ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
+        ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
+        ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(volume: Volume, scene: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        plan(volume, **scene)
+
+
+def test_a_time_outside_is_refused(volume: Volume) -> None:
+    with pytest.raises(RegionError):
+        plan(volume, time=1e9)
+    assert plan(volume, time=1.5).step == 1.5
+
+
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
+def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> None:
+    field = 101325 + 1e-3 * np.random.default_rng(1).random((1, 6, 7, 8))
+    fhash_codec.encode(field, tmp_path / "wide.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "wide.fhz") as wide:
+        assert wide.dtype == np.float64
+        units = Units.of(wide)
+        marched = units.to(wide.read(0)).astype(np.float32)
+        assert np.abs(marched).max() <= 2
+        assert np.ptp(marched) > 0.5
+        table = plan(wide).task.table
+        assert table is not None
+        assert -2 <= table.low < table.high <= 2
+
+
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
+def test_single_precision_with_a_large_offset_is_marched_without_it(tmp_path: Path) -> None:
+    z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
+    field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
+    fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "far.fhz") as far:
+        assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
+        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("fhash_codec.rendering.march.march_native", by_stream)
+            other = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
+    np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
+
+
+def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
+    volume: Volume, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vertices = int(np.prod(volume.shape[1:]))
+    monkeypatch.setattr("fhash_codec.rendering.plan.MAX_VALUES", vertices - 1)
+    march = {"lod": 0}
+    with pytest.raises(InputError, match=f"{vertices:,} vertices is too large to march; allowed"):
+        plan(volume, march=march)
+    assert plan(volume, march={"lod": 1}).lod == 1
+    monkeypatch.setattr("fhash_codec.rendering.plan.MAX_VALUES", 1)
+    with fhash_codec.open(files["paper"]) as network:
+        assert plan(network, march={"mode": "arm"}).mode == "arm"
+        with pytest.raises(InputError, match="too large to march"):
+            plan(network, march={"mode": "arm"}, effects={"shadows": True})
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ordinary_single_precision_stays_what_it_is(tmp_path: Path, dtype: type) -> None:
+    field = np.linspace(200, 300, 5 * 6 * 7).reshape(1, 5, 6, 7).astype(dtype)
+    fhash_codec.encode(field, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (Units.of(volume) == Units()) is (dtype is np.float32)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("value", [0.0, 5.0, 1e-320, -1.7976931348623157e308])
+def test_constant_values_have_a_table_that_single_precision_holds(
+    tmp_path: Path, value: float
+) -> None:
+    fhash_codec.encode(
+        np.full((1, 5, 6, 7), value), tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1)
+    )
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        table = plan(volume).task.table
+        assert table is not None
+        assert np.float32(table.low) < np.float32(table.high)
+        assert np.isfinite(
+            fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba
+        ).all()
+
+
+def test_a_picture_that_would_take_ages_is_told(volume: Volume) -> None:
+    for scene in ({"scale": [1e6, 1, 1e-6]}, {"march": {"step": 1e-5}}):
+        with pytest.warns(FhashWarning, match="a ray takes up to .* samples"):
+            plan(volume, **scene)
+
+
+def test_a_picture_that_would_never_end_is_refused(volume: Volume) -> None:
+    with pytest.raises(
+        InputError, match=r"a ray takes up to .* samples, .*at most 1e\+08 are taken"
+    ):
+        plan(volume, scale=[1e5, 1, 1e-5], march={"step": 1e-6})
+
+
+def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Volume) -> None:
+    with pytest.raises(
+        InputError,
+        match=r"no ray can be placed that finely, at most 1e\+14 times; stretch the axes",
+    ):
+        plan(volume, scale=[8e29, 2.4e29, 1e-30])
+
+
+def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
+    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
+    return path
+
+
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
+    shape = [2, 9, 10, 11]
+    shape[axis] = 1
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
+        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
+        assert not lit.task.shaded
+        assert not lit.lights
+        assert lit.function.opacity(0.5) == 1
+        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
+        # What the user says goes before.
+        given = plan(
+            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
+        )
+        assert given.function.opacity(0.5) == 0.25
+        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
+
+
+@pytest.mark.parametrize(("thickness", "seen"), [(2, True), (8, True), (9, False)])
+def test_thin_volumes_show_every_value(tmp_path: Path, thickness: int, seen: bool) -> None:
+    values = np.zeros((1, thickness, 20, 20), dtype=np.float32)
+    values[:, :, :4, :4] = np.random.default_rng(0).random((1, thickness, 4, 4))
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as volume:
+        function = Renderer(volume).plan(Scene()).function
+    assert (function.opacity(0.0) > 0) is np.bool_(seen)
+    assert function.opacity(1.0) > 0
+
+
+def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
+    spec = {"range": [1, 6], "opacity": [[3, 0], [4, 1], [5, 0]]}
+    for effect, low in ((None, 3.0), ("minimum_intensity", 1.0), ("average_intensity", 1.0)):
+        effects = {} if effect is None else {effect: True}
+        scene = Scene.from_dict({"transfer_function": spec, "effects": effects})
+        table = plan_picture(volume, scene).task.table
+        assert table is not None
+        assert table.low == pytest.approx(low)
+
+
+def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
+    clip = {"z": [5, 7.5], "x": [9, 12]}
+    for effects in ({}, {"shadows": True}):
+        scene = Scene.from_dict({"effects": {"clip": clip, **effects}})
+        region = plan_picture(volume, scene).region
+        for (low, high), tile, ends in zip(
+            region, volume.chunks[1:], ((5, 8), (0, 23), (9, 12)), strict=True
+        ):
+            assert low == ends[0] // tile * tile
+            assert high >= ends[1] + 1
+            assert high - ends[1] <= tile
+        coarse = replace(scene, march=replace(scene.march, lod=2))
+        wide = plan_picture(volume, coarse).region
+        assert all(a <= c and d <= b for (a, b), (c, d) in zip(wide, region, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("march", "gpu", "mode"),
+    [
+        ({}, True, "arm"),
+        ({}, False, "cache"),
+        ({"device": "cpu"}, True, "cache"),
+        ({"mode": "cache"}, True, "cache"),
+        ({"mode": "arm"}, False, "arm"),
+        ({"device": "cuda"}, False, "arm"),
+    ],
+)
+def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
+    volume: Volume,
+    files: dict[str, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    march: dict[str, str],
+    gpu: bool,
+    mode: str,
+) -> None:
+    def arrays_on(device: str) -> object:
+        return object() if gpu and device == "auto" else NUMPY
+
+    monkeypatch.setattr("fhash_codec.rendering.plan.arrays_on", arrays_on)
+    with fhash_codec.open(files["paper"]) as network:
+        planned = plan(network, march=march)
+    assert planned.mode == mode
+    if march.get("mode", "auto") != "arm" and march.get("device") != "cuda":
+        assert plan(volume, march=march).mode == "cache"
+    line = planned.to_dict()["march"]
+    assert line.startswith(f"{mode}: ")
+    chosen = "mode" not in march
+    assert ("chosen for the GPU" in line) == (chosen and mode == "arm")
+    assert ("fastest on a CPU" in line) == (chosen and mode == "cache")
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
+    tmp_path: Path, volume: Volume, monkeypatch: pytest.MonkeyPatch, few: bool
+) -> None:
+    """Both sides of the number; a compact file, and light, need the frame in any case."""
+    module = "fhash_codec.rendering.plan"
+    monkeypatch.setattr(f"{module}.arrays_on", lambda device: NUMPY)
+    path = tmp_path / "a.fhz"
+    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
+    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    samples = 16 * 16 * np.sqrt(4**2 + 5**2 + 6**2) / 0.5
+    limit = 4 * 5 * 6 / samples
+    monkeypatch.setattr(f"{module}.VERTICES_A_SAMPLE", limit * (0.999 if few else 1.001))
+    scene = {"size": [16, 16], "march": {"step": 0.5}}
+    with fhash_codec.open(path) as paper:
+        planned = plan(paper, **scene)
+        assert planned.mode == ("arm" if few else "cache")
+        line = planned.to_dict()["march"]
+        assert ("cost less than decoding the frame" in line) == few
+        assert ("fastest on a CPU" in line) == (not few)
+        smooth = {"effects": {"antialiasing": 2}}
+        lit = {"effects": {"shadows": {}}}
+        assert {plan(paper, **scene, **more).mode for more in (smooth, lit)} == {"cache"}
+        marched = plan(paper, **{**scene, "march": {"step": 0.5, "mode": "cache"}})
+        assert marched.mode == "cache"
+    assert plan(volume, **scene).mode == "cache"
+
+
+@pytest.mark.parametrize(("mode", "words"), [("cache", "has other values"), ("arm", "is linear")])
+def test_a_plan_says_where_network_and_lattice_differ(
+    tmp_path: Path, volume: Volume, mode: str, words: str
+) -> None:
+    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
+    path = tmp_path / "a.fhz"
+    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    with fhash_codec.open(path) as paper:
+        assert words in plan(paper, march={"mode": mode}).to_dict()["march"]
+    assert words not in plan(volume).to_dict()["march"]
+
+
+TOPICS = [
+    "picture",
+    "proportions",
+    "time",
+    "march",
+    "value",
+    "gradient",
+    "secondary rays",
+    "level of detail",
+    "region",
+    "bricks",
+    "rays end",
+    "step",
+]
+
+
+def lines(volume: Volume, **scene: Any) -> dict[str, str]:
+    return plan_picture(volume, Scene.from_dict(scene)).to_dict()
+
+
+def test_every_plan_has_the_same_topics(volume: Volume) -> None:
+    assert list(lines(volume)) == TOPICS
+    more = lines(volume, effects={"buffers": ["depth"], "box": True, "time_label": True})
+    assert list(more) == [*TOPICS, "buffers", "around"]
+    assert more["buffers"] == "depth"
+    assert more["around"].startswith("box, time_label: drawn afterwards; the volume has 512 x ")
+
+
+@pytest.mark.parametrize(
+    ("scene", "topic", "words"),
+    [
+        ({"size": [30, 20], "effects": {"antialiasing": 2}}, "picture", "30 x 20, perspective, 4 "),
+        ({"scale": [1, 2, 3]}, "proportions", "stretched by 1, 2, 3: as the scene says"),
+        ({"step": 0.5}, "time", "step 0.5, between two: both are decoded"),
+        ({}, "march", "decode once, then march what was decoded, since the file has no network"),
+        ({"effects": {"maximum_intensity": True}}, "value", "the largest along each ray"),
+        ({"effects": {"minimum_intensity": True}}, "value", "the smallest along each ray"),
+        ({"effects": {"average_intensity": True}}, "value", "the mean along each ray"),
+        ({"effects": {"average_intensity": True}}, "bricks", "only those that hold values; all"),
+        ({"effects": {"average_intensity": True}}, "rays end", "behind the volume"),
+        (
+            {"effects": {"attenuated_maximum_intensity": True}},
+            "rays end",
+            "where no later value can be larger",
+        ),
+        (
+            {"transfer_function": {"gradient_opacity": [[0, 0], [1, 1]]}},
+            "gradient",
+            "where a sample has opacity, for opacity by gradient",
+        ),
+        (
+            {"effects": {"clip": {"z": [2, 5], "planes": [{"normal": [1, 0, 0], "offset": 2}]}}},
+            "clip",
+            "x 0 to 27, y 0 to 23, z 2 to 5, cut by 1 plane(s): nothing outside is decoded",
+        ),
+        ({"effects": {"clip": {"z": [2, 5]}}}, "region", "(what the clip leaves, in whole tiles)"),
+        ({"effects": {"isosurfaces": [{"value": 5}]}}, "value", "can be seen, and 1 surface(s)"),
+        ({"effects": {"isosurfaces": [{"value": 5}]}}, "gradient", "on surfaces, for shading"),
+        ({"effects": {"shading": True}}, "gradient", "where a sample has opacity, for shading"),
+        ({"effects": {"shadows": True}}, "secondary rays", "shadows on a grid of 2 vertices"),
+        ({"effects": {"ambient_occlusion": True}}, "secondary rays", "within 8 vertices"),
+        ({"effects": {"shadows": True}}, "region", "(all: light comes from everywhere)"),
+        ({"march": {"lod": 1}}, "level of detail", "1: as the scene says"),
+        ({"march": {"skipping": False}}, "bricks", "all are marched: skipping is off"),
+        ({"march": {"threshold": 0}}, "rays end", "behind the volume"),
+    ],
+)
+def test_a_line_says_what_the_scene_asks_for(
+    volume: Volume, scene: dict[str, Any], topic: str, words: str
+) -> None:
+    assert words in lines(volume, **scene)[topic]
+    assert all("\n" not in line for line in lines(volume, **scene).values())
+
+
+def test_a_plan_moved_in_time_says_so(volume: Volume) -> None:
+    plan = plan_picture(volume, Scene())
+    moved = plan_at(plan, volume, Scene(time=1.5))
+    assert (moved.step, moved.time) == (1.5, 1.5)
+    assert moved.task is plan.task
+    changed = {topic for topic in TOPICS if moved.to_dict()[topic] != plan.to_dict()[topic]}
+    assert changed == {"time"}
+
+
+def test_places_and_planes_are_explained(tmp_path: Path) -> None:
+    def explained(values: np.ndarray, z: Coordinate, **scene: Any) -> dict[str, str]:
+        axes = {
+            axis: index_coordinate(axis, n) for axis, n in zip("tzyx", values.shape, strict=True)
+        }
+        series = ArraySeries(values, name="q", units="K", coords={**axes, "z": z})
+        fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(effort=1), force=True)
+        with fhash_codec.open(tmp_path / "a.fhz") as opened:
+            return lines(opened, **scene)
+
+    values = np.random.default_rng(0).random((1, 4, 9, 9)).astype(np.float32)
+    depth = Coordinate(name="depth", values=np.array([0, 1, 2, 6.0]), attributes={"units": "hPa"})
+    assert explained(values, depth)["proportions"] == (
+        "those of the coordinates; z is uneven and resampled to 7 even vertices;"
+        " z ascends downwards"
+    )
+    single = Coordinate(name="z", values=np.zeros(1))
+    lit = explained(values[:, :1], single, effects={"shading": True})
+    assert lit["gradient"] == "none: a plane is drawn in its colours, without light"
+
+
+@pytest.mark.parametrize(
+    ("march", "words"),
+    [
+        ({"mode": "stream"}, "one sample of each ray in a pass"),
+        ({"mode": "arm"}, "as many samples as rays in a pass"),
+        ({"mode": "arm", "samples_per_pass": 5000}, "5,000 samples in a pass"),
+    ],
+)
+def test_a_line_says_how_a_network_is_marched(
+    files: dict[str, Path], march: dict[str, Any], words: str
+) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        plan = Renderer(network).plan(Scene.from_dict({"march": march}))
+    assert words in dict(plan.reasons)["march"]

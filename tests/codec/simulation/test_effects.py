@@ -1,0 +1,487 @@
+"""Effects and their catalogue."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec.simulation.bodies import (
+    MEAN,
+    Blob,
+    Diffusion,
+    Fingers,
+    Front,
+    Shell,
+    round_surface,
+)
+from fhash_codec.simulation.effect import (
+    Effect,
+    Place,
+    Vector,
+    axis_last,
+    direction_of,
+    smooth_step,
+    times,
+)
+from fhash_codec.simulation.flows import Advection, Buoyancy, Rotation, Turbulence, Vortex
+from fhash_codec.simulation.scene import EFFECTS, effect_of
+from fhash_codec.simulation.simulate import simulate
+from fhash_formats.errors import InputError
+
+
+def test_a_step_is_half_the_complementary_error_function() -> None:
+    distance = np.linspace(-3, 3, 601, dtype=np.float32)
+    expected = [math.erfc(each / 0.7) / 2 for each in distance.tolist()]
+    np.testing.assert_allclose(smooth_step(distance, 0.7), expected, atol=3e-4)
+
+
+@pytest.mark.parametrize("width", [1e-6, 1e15])
+def test_a_step_is_finite_for_any_width_and_leaves_its_input(width: float) -> None:
+    distance = np.float32([-1e7, -1e-7, 0.0, 1e-7, 1e7])
+    kept = distance.copy()
+    step = smooth_step(distance, width)
+    np.testing.assert_array_equal(distance, kept)
+    assert np.isfinite(step).all()
+    assert ((step >= 0) & (step <= 1)).all()
+    assert step[2] == 0.5
+
+
+def test_directions_are_of_length_one_or_none() -> None:
+    assert direction_of((0, 3, 4)) == pytest.approx((0, 0.6, 0.8))
+    assert direction_of((0, 0, 0)) is None
+
+
+def test_axes_turn_in_cyclic_order() -> None:
+    turns = {axis: tuple("zyx"[number] for number in axis_last(axis)) for axis in "zyx"}
+    assert turns == {"z": ("x", "y", "z"), "y": ("z", "x", "y"), "x": ("y", "z", "x")}
+
+
+def test_products_leave_out_parts_that_are_zero() -> None:
+    z, y, x = (np.full((1, 1, 1), value, dtype=np.float32) for value in (1, np.nan, 3))
+    assert times((z, y, x), (2, 0, 5)).item() == 17
+    assert times((z, y, x), (0, 0, 0)).item() == 0
+
+
+def test_an_effect_without_a_term_cannot_be_made() -> None:
+    with pytest.raises(TypeError, match="abstract"):
+        Effect()  # type: ignore[abstract]
+
+
+PLACE = (np.float32([[[0.5]]]), np.float32([[[0.25]]]), np.float32([[[0.75]]]))
+
+
+def test_a_parcel_came_from_upwind() -> None:
+    effect = Advection(strength=2.0, direction=(0, 3, 4))
+    flow = effect.term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    z, y, x = flow.carry(PLACE, 1.0, 1.25)
+    assert z is PLACE[0]
+    assert y.item() == pytest.approx(0.25 - 0.5 * 0.6)
+    assert x.item() == pytest.approx(0.75 - 0.5 * 0.8)
+    assert flow.rigid
+    assert flow.exact
+
+
+@pytest.mark.parametrize("settings", [{"strength": 0.0}, {"direction": (0, 0, 0)}])
+def test_no_speed_or_direction_is_idle(settings: dict[str, object]) -> None:
+    assert "0" in Advection(**settings).idle
+    assert not Advection().idle
+
+
+@pytest.mark.parametrize(
+    ("axis", "here", "before"),
+    [
+        ("z", (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),  # y was x
+        ("x", (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),  # z was y
+        ("y", (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),  # x was z
+    ],
+)
+def test_a_quarter_turn_brings_x_to_y_to_z_to_x(
+    axis: str, here: tuple[float, ...], before: tuple[float, ...]
+) -> None:
+    effect = Rotation(strength=math.pi / 2, axis=axis, centre=(0, 0, 0))
+    flow = effect.term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    z, y, x = (np.full((1, 1, 1), part, dtype=np.float32) for part in here)
+    came = [part.item() for part in flow.carry((z, y, x), 2.0, 3.0)]
+    np.testing.assert_allclose(came, before, atol=1e-6)
+
+
+def test_distances_stay() -> None:
+    flow = Rotation(strength=5.0).term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    places = np.random.default_rng(1).uniform(size=(3, 2, 1, 1)).astype(np.float32)
+    came = np.stack(flow.carry((places[0], places[1], places[2]), 0.0, 0.7))
+    before, after = (np.linalg.norm(each[:, 0] - each[:, 1]) for each in (places, came))
+    assert after == pytest.approx(before, rel=1e-5)
+    assert flow.rigid
+
+
+RADIUS = 0.2
+
+
+def speed(distance: float) -> float:
+    """Speed along y of a parcel beside the middle, from where it came a moment ago."""
+    effect = Vortex(strength=3.0, radius=RADIUS, centre=(0, 0, 0))
+    flow = effect.term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    zero = np.zeros((1, 1, 1), dtype=np.float32)
+    _, y, _ = flow.carry((zero, zero, zero + np.float32(distance)), 0.0, 1e-3)
+    return float(-y.item() / 1e-3)
+
+
+def test_the_largest_speed_is_the_strength_at_the_radius() -> None:
+    assert speed(RADIUS) == pytest.approx(3.0, rel=1e-3)
+    assert speed(0.9 * RADIUS) < speed(RADIUS) > speed(1.1 * RADIUS)
+
+
+def test_far_away_the_speed_falls_off_as_the_inverse_of_the_distance() -> None:
+    assert speed(2.0) / speed(4.0) == pytest.approx(2.0, rel=1e-2)
+
+
+def test_near_the_middle_it_turns_as_a_solid() -> None:
+    assert speed(0.02) / speed(0.01) == pytest.approx(2.0, rel=2e-2)
+
+
+def test_the_distance_to_the_axis_stays_and_what_is_even_along_it_is_computed_once() -> None:
+    flow = Vortex(strength=8.0).term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    z, y, x = np.ix_(*(np.linspace(0, 1, 5, dtype=np.float32),) * 3)
+    _, v, u = flow.carry((z, y, x), 0.0, 1.0)
+    assert v.shape == u.shape == (1, 5, 5)
+    before = np.hypot(y - 0.5, x - 0.5)
+    np.testing.assert_allclose(np.hypot(v - 0.5, u - 0.5), before, atol=1e-5)
+    assert not flow.rigid
+
+
+FINE: Vector = (1e-4, 1e-4, 1e-4)
+
+
+def carried(place: np.ndarray, spacing: Vector = FINE, seed: int = 0, **settings: float) -> Place:
+    flow = Turbulence(**settings).term(np.random.default_rng(seed), spacing)
+    z, y, x = (part.astype(np.float32)[:, None, None] for part in place.T)
+    return flow.carry((z, y, x), 0.0, 0.5)
+
+
+def test_volumes_stay() -> None:
+    """A small cube and its image have the same volume, by differences in float32."""
+    edge, corner = 2e-3, np.array([0.3, 0.6, 0.1])
+    corners = corner + np.concatenate([np.zeros((1, 3)), np.eye(3) * edge, -np.eye(3) * edge])
+    came = np.stack(
+        [part[:, 0, 0] for part in carried(corners, strength=0.1, scale=0.5, octaves=2)]
+    )
+    jacobian = (came[:, 1:4] - came[:, 4:7]) / (2 * edge)
+    assert np.linalg.det(jacobian.astype(np.float64)) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_the_way_is_bounded_by_speed_and_time() -> None:
+    places = np.random.default_rng(5).uniform(size=(50, 3))
+    came = np.stack([part[:, 0, 0] for part in carried(places, strength=0.4, octaves=3)], axis=-1)
+    sizes = 0.4 * 0.5 * sum(2 ** (-octave / 3) for octave in range(3))
+    moved = np.abs(came - places)
+    assert 0.01 < moved.max() <= sizes + 1e-5
+
+
+@pytest.mark.parametrize(
+    ("step", "left"),
+    [(0.3 / 8 / 3 / 1.01, 12), (0.3 / 3 * 1.5, 0)],
+)
+def test_waves_of_fewer_than_three_vertices_are_left_out(step: float, left: int) -> None:
+    flow = Turbulence(scale=0.3, octaves=4).term(np.random.default_rng(0), (step, step, step))
+    shown = int(flow.note.split()[0])
+    assert shown == left if left else shown <= 3
+    assert ("left out" in flow.note) == (left < 12)
+
+
+def test_an_axis_of_one_vertex_leaves_nothing_out() -> None:
+    flow = Turbulence(octaves=4).term(np.random.default_rng(0), (0.0, 1e-3, 1e-3))
+    assert "left out" not in flow.note
+
+
+def test_other_random_numbers_are_another_flow() -> None:
+    places = np.array([[0.2, 0.4, 0.6]])
+    first, again, other = (carried(places, seed=seed) for seed in (1, 1, 2))
+    assert first[0].item() == again[0].item() != other[0].item()
+
+
+EFFECT = Buoyancy(strength=2.0, radius=0.25, centre=(0.5, 0.5, 0.5))
+
+
+def carry(places: np.ndarray, stop: float, effect: Buoyancy = EFFECT) -> np.ndarray:
+    flow = effect.term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    z, y, x = (part.astype(np.float32)[:, None, None] for part in places.T)
+    return np.stack([part[:, 0, 0] for part in flow.carry((z, y, x), 0.0, stop)], axis=-1)
+
+
+def test_it_falls_upwards_first_and_then_keeps_its_speed() -> None:
+    assert EFFECT.height(0.0) == 0
+    assert EFFECT.height(0.01) == pytest.approx(2.0 * 0.01**2 / 2, rel=1e-2)
+    assert EFFECT.height(9.0) - EFFECT.height(8.0) == pytest.approx(math.sqrt(2.0 * 0.25), rel=1e-3)
+    assert Buoyancy(strength=-2.0).height(1.0) == -Buoyancy(strength=2.0).height(1.0)
+    assert math.isfinite(Buoyancy(strength=1e3, radius=1e-3).height(1e6))
+
+
+def test_the_middle_came_from_below_and_what_is_far_away_stayed() -> None:
+    came = carry(np.array([[0.9, 0.5, 0.5], [0.5, 0.5, 2.5]]), 0.4)
+    assert came[0, 0] == pytest.approx(0.9 - EFFECT.height(0.4), abs=1e-3)
+    np.testing.assert_allclose(came[1], [0.5, 0.5, 2.5], atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [(0.55, 0.5, 0.7), (0.45, 0.65, 0.6), (0.7, 0.4, 0.45)])
+def test_volumes_stay_buoyancy(place: tuple[float, float, float]) -> None:
+    edge = 2e-3
+    corners = np.array(place) + np.concatenate([np.eye(3) * edge, -np.eye(3) * edge])
+    came = carry(corners, 0.3)
+    jacobian = ((came[:3] - came[3:]) / (2 * edge)).astype(np.float64)
+    assert np.linalg.det(jacobian) == pytest.approx(1.0, abs=5e-3)
+
+
+SPACING = (0.02, 0.02, 0.02)
+
+
+def amount(blob: Blob, widening: float) -> float:
+    """The integral of the value over all space."""
+    radius = np.linspace(0, 3, 20001, dtype=np.float32)[None, None]
+    body = blob.term(np.random.default_rng(0), SPACING)
+    values = body.value(radius - np.float32(blob.radius), widening, 1.0)
+    return float((values * 4 * np.pi * radius.astype(np.float64) ** 2).sum() * 3 / 20000)
+
+
+def test_a_sharp_ball_holds_its_volume() -> None:
+    blob = Blob(strength=2.0, radius=0.5, edge=0.0)
+    assert amount(blob, 0.0) == pytest.approx(2.0 * 4 / 3 * np.pi * 0.5**3, rel=1e-3)
+
+
+@pytest.mark.parametrize("widening", [1e-4, 1e-2, 0.05])
+def test_the_amount_stays_as_it_spreads(widening: float) -> None:
+    blob = Blob(radius=0.5, edge=0.05)
+    assert amount(blob, widening) == pytest.approx(amount(blob, 0.0), rel=5e-3)
+
+
+def test_the_seed_moves_it_by_its_jitter_at_most() -> None:
+    zero = np.zeros((1, 1, 1), dtype=np.float32)
+    distances = [
+        Blob(centre=(0, 0, 0), radius=0.1, jitter=0.2)
+        .term(np.random.default_rng(seed), SPACING)
+        .surface((zero, zero, zero), 0.0)
+        .distance.item()
+        for seed in range(20)
+    ]
+    assert len(set(distances)) == 20
+    assert max(distances) <= 0.2 * 3**0.5 - 0.1 + 1e-6
+
+
+def test_directions_are_unit_vectors_and_finite_in_the_middle() -> None:
+    line = np.linspace(-1, 1, 3, dtype=np.float32)
+    surface = round_surface(np.ix_(line, line, line), (0, 0, 0), 0.5)
+    z, y, x = surface.waves()
+    lengths = np.sqrt(z * z + y * y + x * x)
+    assert lengths[1, 1, 1] == 0
+    np.testing.assert_allclose(np.delete(lengths.ravel(), 13), 1, atol=1e-4)
+    assert surface.distance[1, 1, 1] == np.float32(-0.5)
+
+
+LINE = np.linspace(0, 1, 101, dtype=np.float32)[None, None]
+ZERO = np.zeros((1, 1, 1), dtype=np.float32)
+
+
+def values(front: Front, time: float, widening: float = 0.0) -> np.ndarray:
+    body = front.term(np.random.default_rng(0), (0.01, 0.01, 0.01))
+    surface = body.surface((ZERO, ZERO, LINE), time)
+    return body.value(surface.distance, widening, time).ravel()
+
+
+def test_it_moves_at_its_speed_and_leaves_its_value_behind() -> None:
+    front = Front(strength=-3.0, start=0.2, speed=0.5, width=0.01)
+    early, late = values(front, 0.0), values(front, 1.0)
+    assert early[20] == pytest.approx(-1.5)
+    assert late[70] == pytest.approx(-1.5, abs=1e-4)
+    assert (late[0], late[-1]) == (-3.0, 0.0)
+
+
+def test_a_depth_makes_a_sheet_that_keeps_its_amount_as_it_spreads() -> None:
+    front = Front(start=0.6, speed=0.0, depth=0.2, width=0.01)
+    sharp, wide = values(front, 0.0), values(front, 0.0, 0.005)
+    assert sharp[50] == pytest.approx(1.0, abs=1e-6)
+    assert (sharp[30], sharp[70]) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert wide.sum() == pytest.approx(sharp.sum(), rel=1e-3)
+    assert wide.max() < 0.99
+
+
+def test_what_does_not_depend_on_an_axis_has_length_one_along_it() -> None:
+    body = Front(direction=(0, 2, 0)).term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    column = np.zeros((1, 7, 1), dtype=np.float32)
+    assert body.surface((ZERO, column, LINE), 0.0).distance.shape == (1, 7, 1)
+
+
+def test_no_direction_is_idle() -> None:
+    assert Front(direction=(0, 0, 0)).idle == "its direction is 0"
+    assert Front(strength=0).idle == "its strength is 0"
+
+
+def test_the_radius_grows_as_time_to_the_two_fifths() -> None:
+    shell = Shell(radius=0.4, age=0.1)
+    assert shell.grown(1.0) == pytest.approx(0.4)
+    ratio = (0.5 + 0.1) / (0.2 + 0.1)
+    assert shell.grown(0.5) / shell.grown(0.2) == pytest.approx(ratio**0.4)
+
+
+def test_it_is_densest_at_its_edge_and_weakens() -> None:
+    shell = Shell(strength=2.0, radius=0.4, thickness=0.05, centre=(0, 0, 0))
+    body = shell.term(np.random.default_rng(0), (0.01, 0.01, 0.01))
+    radius = np.linspace(0, 0.6, 601, dtype=np.float32)[None, None]
+    zero = np.zeros((1, 1, 1), dtype=np.float32)
+    profile = body.value(body.surface((zero, zero, radius), 1.0).distance, 0.0, 1.0).ravel()
+    assert profile.argmax() == pytest.approx(385, abs=12)
+    assert profile[350] / profile[300] == pytest.approx(np.exp(1), rel=0.02)
+    assert profile[-1] == 0
+    assert shell.level(0.0) > shell.level(1.0) == 2.0
+    assert Shell(weakening=0, strength=2.0).level(0.0) == 2.0
+
+
+def directions() -> Place:
+    vectors = np.random.default_rng(3).normal(size=(3, 4000, 1, 1))
+    z, y, x = (vectors / np.linalg.norm(vectors, axis=0)).astype(np.float32)
+    return z, y, x
+
+
+def test_they_grow_to_their_strength_and_stay() -> None:
+    effect = Fingers(strength=0.5, growth=0.2, count=20, waves=16)
+    bend = effect.term(np.random.default_rng(0), (0.1, 0.1, 0.1))
+    early, late, later = (bend(directions(), True, time) for time in (0.1, 3.0, 30.0))
+    np.testing.assert_allclose(early, late * math.tanh(0.5), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(late, later, atol=1e-6)
+    assert late.max() == pytest.approx(0.5 * (1 - MEAN), rel=0.1)
+    assert late.min() >= -0.5 * MEAN - 1e-6
+
+
+def test_few_places_have_one_and_the_surface_stays_in_its_mean() -> None:
+    bend = Fingers(strength=1.0, count=20, waves=16).term(np.random.default_rng(0), (0, 0, 0))
+    shift = bend(directions(), True, 100.0)
+    assert 0.05 < (shift > 0.25).mean() < 0.4
+    assert abs(shift.mean()) < 0.12
+
+
+def test_the_count_is_that_of_waves_in_a_metre_of_a_front() -> None:
+    """A single direction along x: the shift repeats after 1 / count m."""
+    bend = Fingers(count=5.0, waves=3).term(np.random.default_rng(0), (0, 0, 0))
+    zero = np.zeros((1, 1, 1), dtype=np.float32)
+    line = np.linspace(0, 1, 400, dtype=np.float32)[None, None]
+    shift = bend((zero, zero, line), False, 9.0).ravel()
+    assert np.abs(np.diff(np.sign(shift - shift.mean()))).sum() / 2 <= 2 * 5
+
+
+DIFFUSIVITY = 4e-3
+
+
+def test_its_term_is_the_diffusivity() -> None:
+    assert Diffusion(strength=0.25).term(np.random.default_rng(0), (0, 0, 0)) == 0.25
+    assert Diffusion(strength=0).idle
+
+
+def test_a_front_becomes_an_error_function_of_width_sqrt_4dt() -> None:
+    scene = {
+        "shape": (1, 1, 512),
+        "effects": [
+            {"effect": "front", "start": 0.5, "speed": 0, "width": 0},
+            {"effect": "diffusion", "strength": DIFFUSIVITY},
+        ],
+    }
+    series = simulate(scene)
+    x, time = series.coords["x"].values, series.coords["t"].values
+    for step in (8, 15):
+        width = math.sqrt(4 * DIFFUSIVITY * time[step])
+        expected = [math.erfc((place - 0.5) / width) / 2 for place in x]
+        np.testing.assert_allclose(series.read(step).ravel(), expected, atol=2e-3)
+
+
+def test_a_medium_that_is_drawn_out_mixes_sooner() -> None:
+    """The share of the contrast that diffusion takes is larger in a vortex than at rest."""
+    sheet = {"effect": "front", "start": 0.55, "speed": 0, "depth": 0.1, "direction": (0, 1, 0)}
+    vortex = {"effect": "vortex", "strength": 1.0}
+    diffusion = {"effect": "diffusion", "strength": 1e-4}
+
+    def contrast(*effects: dict[str, object]) -> float:
+        frame = simulate({"effects": effects}, (2, 1, 128, 128)).read(1)
+        return float(frame[:, 40:88, 40:88].std())
+
+    at_rest = 1 - contrast(sheet, diffusion) / contrast(sheet)
+    wound = 1 - contrast(sheet, vortex, diffusion) / contrast(sheet, vortex)
+    assert wound > 2 * at_rest > 0
+
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scenes.md"
+NAMED = "advection vortex rotation front fingers diffusion turbulence buoyancy shell blob"
+
+
+def test_all_effects_are_there_and_off_by_strength() -> None:
+    assert set(EFFECTS) == set(NAMED.split())
+    for kind, effect in EFFECTS.items():
+        assert effect.role in ("flow", "body", "bend", "spread")
+        assert not effect_of({"effect": kind}, 1).idle
+        assert effect_of({"effect": kind, "strength": 0}, 1).idle == "its strength is 0"
+
+
+def test_settings_have_help_and_limits() -> None:
+    for effect in EFFECTS.values():
+        for setting in dataclasses.fields(effect):
+            assert setting.metadata["help"]
+            assert setting.metadata["choices"] or setting.metadata["high"] is not None
+
+
+def documented() -> dict[str, dict[str, tuple[str, str, str]]]:
+    """Rows of the tables in the document, by effect and setting: default, range, meaning."""
+    tables = {}
+    for section in DOCUMENT.read_text(encoding="utf-8").split("\n### ")[1:]:
+        rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|$", section, re.M)
+        tables[section.split("`")[1]] = {name: (*rest,) for name, *rest in rows}
+    return tables
+
+
+def text_of(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{part:g}" for part in value)
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def test_the_document_has_every_setting_with_its_default_and_range() -> None:
+    expected = {
+        kind: {
+            setting.name: (
+                text_of(setting.default),
+                ", ".join(setting.metadata["choices"])
+                or f"{setting.metadata['low']:g} to {setting.metadata['high']:g}",
+                setting.metadata["help"],
+            )
+            for setting in dataclasses.fields(effect)
+        }
+        for kind, effect in EFFECTS.items()
+    }
+    assert documented() == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"effect": "vortx"}, "effect 3 is 'vortx'; did you mean 'vortex'"),
+        ({"effect": "vortex", "speed": 1}, "effect 3, vortex: unknown setting 'speed'"),
+        ({"effect": "vortex", "strength": "fast"}, "strength is 'fast'; a number from -1000"),
+        ({"effect": "vortex", "strength": 1001}, "strength is 1001; allowed: -1000 to 1000"),
+        ({"effect": "vortex", "axis": "w"}, "axis is 'w'; allowed: z, y, x"),
+        ({"effect": "vortex", "centre": [0, 1]}, "a list of 3"),
+        ({"effect": "blob", "strength": float("nan")}, "strength is nan"),
+        ({"strength": 1}, 'effect 3 has no name; write effect = "NAME"'),
+        (7, "effect 3 is 7; a table of settings is needed"),
+        ({"effect": ["a"]}, "effect 3 has no name"),
+    ],
+)
+def test_a_wrong_table_is_refused_in_one_line(table: Any, message: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)) as error:
+        effect_of(table, 3)
+    assert "\n" not in str(error.value)
+
+
+def test_limits_are_allowed_on_both_sides() -> None:
+    for edge in (-1e3, 1e3):
+        assert effect_of({"effect": "vortex", "strength": edge}, 1) == Vortex(strength=edge)

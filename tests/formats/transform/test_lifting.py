@@ -1,0 +1,464 @@
+"""The bands of a transformed tile: the coefficients they cover and the bands they refer to."""
+
+from __future__ import annotations
+
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from specs import (
+    MIXES as MIXES_LIFTING,
+)
+from specs import (
+    MIXES as MIXES_WEIGHTS,
+)
+from specs import (
+    SHAPES as SHAPES_LIFTING,
+)
+from specs import (
+    TYPES,
+    axis_of,
+    mixes_and_depths,
+    noise,
+    spec_of,
+)
+
+from fhash_formats.errors import InputError
+from fhash_formats.transform.coder import COLUMNS, KINDS, Table
+from fhash_formats.transform.lifting import MAX_LOD, Transform, axis_norms, band_lengths, band_table
+from fhash_formats.transform.spec import KINDS as KINDS_LIFTING
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.values import OFFSET_UNIT, clip_shifted, dequantise
+
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 3, 5, 7),
+    (4, 9, 17, 33),
+    (16, 1, 2, 64),
+    (1, 2, 1, 40),
+    (2, 2, 40, 1),
+    (7, 13, 31, 29),
+    (5, 1, 6, 6),
+]
+MIXES = [
+    ("none", "none", "none", "none"),
+    ("haar", "5/3", "9/7", "9/7"),
+    ("haar", "none", "haar", "haar"),
+    ("9/7", "haar", "5/3", "9/7"),
+    ("none", "9/7", "none", "5/3"),
+    ("haar", "klt", "9/7", "klt"),
+    ("klt", "haar", "5/3", "5/3"),
+    ("klt", "klt", "klt", "klt"),
+]
+
+
+def box(row: Table) -> tuple[slice, ...]:
+    return tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+
+
+CASES = [
+    pytest.param(
+        spec_of(kinds, depth, shape, 8.0),
+        shape,
+        id=f"{'-'.join(kinds)}-{depth}-{'x'.join(map(str, shape))}",
+    )
+    for (kinds, depth), shape in product(mixes_and_depths(MIXES, (1, 2, 10)), SHAPES)
+]
+
+
+@pytest.mark.parametrize(("spec", "shape"), CASES)
+def test_each_coefficient_is_in_one_band(spec: TransformSpec, shape: tuple[int, ...]) -> None:
+    covered = np.zeros(shape, dtype=int)
+    for row in band_table(spec, shape):
+        assert all(
+            0 <= low < high <= n for low, high, n in zip(row[:4], row[4:8], shape, strict=True)
+        )
+        covered[box(row)] += 1
+    kept = tuple(
+        slice(n if axis.basis is None else axis.basis.rank)
+        for axis, n in zip(spec.axes, shape, strict=True)
+    )
+    assert (covered[kept] == 1).all()
+    assert covered.sum() == covered[kept].size
+
+
+@pytest.mark.parametrize(("spec", "shape"), CASES)
+def test_references_point_back_to_bands_that_lie_alike(
+    spec: TransformSpec, shape: tuple[int, ...]
+) -> None:
+    table = band_table(spec, shape)
+    sizes = table[:, 4:8] - table[:, :4]
+    for number, row in enumerate(table):
+        # Axes along which each reference stays in place: the parent and the sibling along t and
+        # z, the band before along t along z, y, x, the band before along z along t, y, x.
+        for reference, same in zip(
+            row[9:].reshape(4, 5), ([0, 1], [1, 2, 3], [0, 2, 3], [0, 1]), strict=True
+        ):
+            to, shifts = int(reference[0]), reference[1:]
+            if to < 0:
+                assert to == -1
+                continue
+            assert to < number
+            assert set(shifts) <= {0, 1}
+            assert (sizes[to] > 0).all()
+            assert (row[same] == table[to, same]).all()
+            assert (row[np.add(same, 4)] == table[to, np.add(same, 4)]).all()
+            for axis in range(4):
+                places = np.minimum(
+                    np.arange(sizes[number, axis]) >> shifts[axis], sizes[to, axis] - 1
+                )
+                assert places.min() >= 0
+                # The other band is as long, or half as long, except for an odd end.
+                if axis in same or shifts[axis]:
+                    assert (sizes[number, axis] - 1) >> shifts[axis] <= sizes[to, axis]
+
+
+def test_every_kind_of_reference_is_made() -> None:
+    spec = spec_of(("haar", "5/3", "9/7", "9/7"), 3, (8, 8, 32, 32))
+    references = band_table(spec, (8, 8, 32, 32))[:, 9:].reshape(-1, 4, 5)
+    assert (references[:, :, 0] >= 0).any(axis=0).all()
+    packets = spec_of(("haar", "5/3", "9/7", "5/3"), 3, (8, 8, 32, 32))
+    seen = band_table(packets, (8, 8, 32, 32))[:, [9, 14, 19, 24]] >= 0
+    assert seen.any(axis=0).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize(("spec", "shape"), CASES)
+def test_kinds_have_a_place_in_the_state(spec: TransformSpec, shape: tuple[int, ...]) -> None:
+    kinds = band_table(spec, shape)[:, 8]
+    assert ((kinds >= 0) & (kinds < KINDS)).all()
+
+
+def test_kinds_tell_levels_and_orientations_apart() -> None:
+    shape = (4, 4, 32, 32)
+    table = band_table(spec_of(("haar", "haar", "9/7", "9/7"), 3, shape), shape)
+    assert len({int(kind) // 4 for kind in table[:, 8]}) == 1 + 3 * 3
+    for row in table:
+        assert row[8] % 4 == 2 * (row[0] > 0) + (row[1] > 0)
+
+
+def test_a_basis_of_rank_0_has_no_band() -> None:
+    shape = (3, 4, 5, 6)
+    spec = spec_of(("none", "klt", "9/7", "9/7"), 1, shape, 1e9)
+    assert spec.axes[1].basis is not None
+    assert spec.axes[1].basis.rank == 0
+    assert band_table(spec, shape).shape == (0, COLUMNS)
+
+
+def test_a_table_is_made_once_and_read_only() -> None:
+    spec = spec_of(("haar", "none", "9/7", "9/7"), 2, (4, 4, 8, 8))
+    table = band_table(spec, (4, 4, 8, 8))
+    assert table is band_table(spec, (4, 4, 8, 8))
+    assert table.dtype == np.int32
+    assert table.flags.c_contiguous
+    with pytest.raises(ValueError, match="read-only"):
+        table[0, 0] = 1
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES_LIFTING, [1, 3, 7]))
+@pytest.mark.parametrize("shape", SHAPES_LIFTING)
+def test_there_and_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any
+) -> None:
+    transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
+    values = noise(shape, dtype)
+    coefficients = transform.forward(values)
+    again = transform.inverse(coefficients)
+    assert coefficients.shape == again.shape == shape
+    assert coefficients.dtype == again.dtype == dtype
+    assert np.abs(again - values).max() < (5e-5 if dtype is np.float32 else 2e-12)
+
+
+@settings(max_examples=60)
+@given(
+    shape=st.tuples(*(st.integers(1, 23),) * 4),
+    kinds=st.tuples(*(st.sampled_from(KINDS_LIFTING),) * 4),
+    depths=st.tuples(*(st.integers(1, 6),) * 4),
+    seed=st.integers(0, 9),
+)
+def test_any_mix_comes_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], seed: int
+) -> None:
+    transform = Transform(spec_of(kinds, depths, shape), shape, np.float64)
+    values = noise(shape, np.float64, seed)
+    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
+
+
+@pytest.mark.parametrize("center", [3.25, 0.0])
+@pytest.mark.parametrize("offsets", [(5, -9, 2, 2, 2, 2), (5, -9, 2, 1, -3, 7)])
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES_LIFTING, [1, 4]))
+@pytest.mark.parametrize("shape", [(3, 4, 9, 37), (1, 1, 16, 64), (4, 1, 1, 5)])
+@pytest.mark.parametrize("empty", ["last", "first", "planes", "but one", "all"])
+def test_one_run_gives_the_bits_of_its_three_steps(
+    shape: tuple[int, ...],
+    kinds: tuple[str, ...],
+    depth: int,
+    dtype: Any,
+    offsets: Any,
+    center: float,
+    empty: str,
+) -> None:
+    transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
+    random = np.random.default_rng(5)
+    integers = (random.integers(-9, 10, shape) * (random.random(shape) < 0.1)).astype(np.int32)
+    kept = {"last": slice(-1), "first": slice(1, None)}.get(empty, slice(0))
+    some = np.zeros(shape, bool)
+    some[kept] = True
+    some[:, 1::2] |= empty == "planes"
+    some[-1, -1] |= empty == "but one"
+    integers[~some] = 0  # steps and planes without anything; some rows have nothing anyway
+    coefficients = dequantise(integers, 0.75, offsets, dtype)
+    expected = clip_shifted(transform.inverse(coefficients), center, -20.0, 20.0)
+    six = (offset / OFFSET_UNIT for offset in offsets)
+    numbers = (0.75, *six, center, -20.0, 20.0)
+    for in_place in (False, True):
+        result = transform.reconstruct(integers, numbers, in_place=in_place)
+        assert result is not None
+        assert result.tobytes() == expected.tobytes()
+
+
+def test_a_centre_of_minus_zero_takes_three_steps() -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    numbers = (1.0, *(0.0,) * 6, -0.0, -1.0, 1.0)
+    assert transform.reconstruct(np.zeros((1, 1, 2, 2), np.int32), numbers) is None
+
+
+def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
+    shape = (1, 1, 16, 16)
+    values = noise(shape, np.float64)
+    shallow, deep = (
+        Transform(
+            spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64
+        )
+        for depth in (1, 2)
+    )
+    first, second = shallow.forward(values), deep.forward(values)
+    assert np.array_equal(first[:, :, 8:, :], second[:, :, 8:, :])
+    assert np.array_equal(first[:, :, :, 8:], second[:, :, :, 8:])
+    packet = Transform(
+        spec_of(("none", "none", "9/7", "9/7"), (0, 0, 2, 1), shape), shape, np.float64
+    ).forward(values)
+    assert not np.allclose(packet[:, :, 4:8, 8:], first[:, :, 4:8, 8:])
+
+
+@pytest.mark.parametrize("kind", ["5/3", "9/7"])
+def test_a_ramp_leaves_the_high_bands_empty(kind: str) -> None:
+    shape = (1, 1, 1, 64)
+    ramp = np.broadcast_to(np.arange(64.0), shape).copy()
+    coefficients = Transform(
+        spec_of(("none", "none", "none", kind), (0, 0, 0, 1), shape), shape, np.float64
+    ).forward(ramp)
+    assert np.abs(coefficients[..., 34:62]).max() < 1e-8
+    assert np.abs(coefficients[..., :32]).min() >= 0
+    assert np.abs(coefficients[..., 16]).max() > 10
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("kinds", [kinds for kinds in MIXES_LIFTING if "klt" not in kinds])
+@pytest.mark.parametrize("shape", SHAPES_LIFTING)
+def test_a_constant_stays_itself_at_every_resolution(
+    shape: tuple[int, ...], kinds: tuple[str, ...], dtype: Any
+) -> None:
+    transform = Transform(spec_of(kinds, (2, 3, 4, 4), shape), shape, dtype)
+    coefficients = transform.forward(np.full(shape, 3.25, dtype))
+    for lod in range(MAX_LOD + 1):
+        reduced = transform.inverse(coefficients, lod)
+        assert reduced.shape == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
+        assert reduced.dtype == dtype
+        assert np.abs(reduced - 3.25).max() < (3e-5 if dtype is np.float32 else 1e-12)
+
+
+@pytest.mark.parametrize("kind", ["none", "5/3", "9/7", "klt"])
+@pytest.mark.parametrize("lod", [1, 2])
+def test_reduced_vertices_stand_at_every_2_to_the_nth(kind: str, lod: int) -> None:
+    shape = (2, 32, 33, 40)
+    t, z, y, x = np.meshgrid(*(np.arange(n) / 40.0 for n in shape), indexing="ij")
+    values = 1.0 + t + z * 2 + y * 3 + np.sin(2 * x)
+    transform = Transform(
+        spec_of(("none", kind, kind, kind), (0, 2, 2, 2), shape), shape, np.float64
+    )
+    step = 1 << lod
+    reduced, expected = (
+        transform.inverse(transform.forward(values), lod),
+        values[:, ::step, ::step, ::step],
+    )
+    inside = (slice(None), *(slice(2, -2),) * 3)
+    assert np.abs(reduced - expected)[inside].max() < 0.01
+
+
+def test_a_haar_low_band_is_the_mean() -> None:
+    shape = (2, 4, 8, 8)
+    values = noise(shape, np.float64)
+    transform = Transform(spec_of(("haar",) * 4, (1, 2, 2, 2), shape), shape, np.float64)
+    means = values.reshape(2, 2, 2, 4, 2, 4, 2).mean(axis=(2, 4, 6))
+    assert np.allclose(transform.inverse(transform.forward(values), 1), means, atol=1e-12)
+
+
+def test_entries_beyond_the_rank_are_zero() -> None:
+    shape = (2, 12, 5, 9)
+    transform = Transform(
+        spec_of(("none", "klt", "none", "klt"), (0,) * 4, shape, step=30.0), shape
+    )
+    z, x = (transform.spec.axes[axis].basis for axis in (1, 3))
+    assert z is not None
+    assert x is not None
+    assert z.rank < 12
+    assert x.rank < 9
+    coefficients = transform.forward(noise(shape, np.float32))
+    assert not coefficients[:, z.rank :].any()
+    assert not coefficients[..., x.rank :].any()
+    assert coefficients[:, : z.rank, :, : x.rank].all()
+    changed = coefficients.copy()
+    changed[:, z.rank :] = np.nan
+    assert transform.inverse(changed).tobytes() == transform.inverse(coefficients).tobytes()
+
+
+def test_a_basis_of_rank_0_gives_zeros() -> None:
+    shape = (2, 3, 4, 5)
+    none = AxisTransform(kind="none")
+    z, x = axis_of("klt", 0, 3, step=1e9), axis_of("klt", 0, 5, step=1e9)
+    transform = Transform(TransformSpec(axes=(none, z, none, x)), shape)
+    assert not transform.forward(noise(shape, np.float32)).any()
+    assert not transform.inverse(noise(shape, np.float32)).any()
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1500), (600, 1, 2, 3), (1, 1, 700, 530)])
+def test_long_axes_come_back(shape: tuple[int, ...]) -> None:
+    transform = Transform(spec_of(("9/7",) * 4, (4,) * 4, shape), shape, np.float64)
+    values = noise(shape, np.float64)
+    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-11
+
+
+def test_the_input_is_unchanged_and_may_have_any_strides() -> None:
+    shape = (3, 4, 6, 8)
+    transform = Transform(spec_of(("haar", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    values = noise(shape, np.float32)
+    kept = values.copy()
+    coefficients = transform.forward(values)
+    strided = np.asfortranarray(values)
+    assert transform.forward(strided).tobytes() == coefficients.tobytes()
+    held = coefficients.copy()
+    transform.inverse(coefficients)
+    assert np.array_equal(values, kept)
+    assert np.array_equal(coefficients, held)
+
+
+def test_threads_share_a_transform() -> None:
+    shape = (4, 8, 16, 16)
+    transform = Transform(spec_of(("9/7", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    tiles = [noise(shape, np.float32, seed) for seed in range(12)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda tile: transform.inverse(transform.forward(tile), 1), tiles))
+    fresh = Transform(transform.spec, shape)
+    assert all(
+        np.array_equal(result, fresh.inverse(fresh.forward(tile), 1))
+        for result, tile in zip(together, tiles, strict=True)
+    )
+
+
+@pytest.mark.filterwarnings("error")
+def test_hostile_coefficients_raise_nothing() -> None:
+    shape = (2, 4, 8, 8)
+    transform = Transform(spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    coefficients = np.full(shape, np.float32(3e38))
+    coefficients[0, 0, 0, :3] = np.nan, np.inf, -np.inf
+    for lod, reduced in ((0, shape), (1, (2, 2, 4, 4)), (3, (2, 1, 1, 1))):
+        assert transform.inverse(coefficients, lod).shape == reduced
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "message"),
+    [
+        ((2, 3, 4), np.float32, "four axes"),
+        ((0, 1, 1, 1), np.float32, "four axes"),
+        ((1, 1, 1, 1), np.float16, "float16"),
+        ((1, 9, 1, 1), np.float32, "along z is for 6"),
+    ],
+)
+def test_bad_tiles_are_refused(shape: tuple[int, ...], dtype: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Transform(spec_of(("none", "klt", "none", "none"), (0,) * 4, (1, 6, 1, 1)), shape, dtype)
+
+
+@pytest.mark.parametrize("lod", [-1, MAX_LOD + 1, 1.0, True, "1"])
+def test_bad_resolutions_are_refused(lod: Any) -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    with pytest.raises(InputError, match="lod is 0 to"):
+        transform.inverse(np.zeros((1, 1, 2, 2), np.float32), lod)
+
+
+def test_other_arrays_are_refused() -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    with pytest.raises(InputError, match="float32 of shape"):
+        transform.forward(np.zeros((1, 1, 2, 2)))
+    with pytest.raises(InputError, match="float32 of shape"):
+        transform.inverse(np.zeros((1, 1, 2, 3), np.float32))
+
+
+def test_the_bits_of_the_transform_are_fixed() -> None:
+    """A file must decode to the same bits for ever: the digests hold for the format version."""
+    shape = (3, 5, 13, 18)
+    integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
+    digests = {}
+    for kinds in (("haar", "5/3", "9/7", "9/7"), ("9/7", "none", "haar", "5/3")):
+        for dtype in TYPES:
+            transform = Transform(spec_of(kinds, (1, 2, 2, 2), shape), shape, dtype)
+            digest = hashlib.sha256(transform.forward(integers.astype(dtype)).tobytes())
+            for lod in (0, 1, 3):
+                digest.update(transform.inverse(integers.astype(dtype), lod).tobytes())
+            digests[kinds[0], np.dtype(dtype).name] = digest.hexdigest()[:16]
+    assert digests == {
+        ("haar", "float32"): "133040732743fa0a",
+        ("haar", "float64"): "8ca439a2a86d2789",
+        ("9/7", "float32"): "ea64a3b5d62271cf",
+        ("9/7", "float64"): "07f0e9ae04a1cccc",
+    }
+
+
+def test_a_low_band_is_half_as_long_rounded_up() -> None:
+    assert band_lengths(13, 5) == [13, 7, 4, 2, 1, 1]
+    assert band_lengths(4, 0) == [4]
+
+
+def test_without_a_transform_all_norms_are_1() -> None:
+    assert axis_norms(AxisTransform(kind="none"), 3).tolist() == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("kinds", MIXES_WEIGHTS)
+@pytest.mark.parametrize("shape", [(2, 3, 5, 7), (3, 8, 16, 12)])
+def test_norms_are_those_of_the_synthesis_vectors(
+    shape: tuple[int, ...], kinds: tuple[str, ...]
+) -> None:
+    transform = Transform(spec_of(kinds, (1, 2, 3, 3), shape), shape, np.float64)
+    places = np.random.default_rng(2).choice(int(np.prod(shape)), 25, replace=False)
+    for place in places:
+        impulse = np.zeros(shape)
+        impulse.flat[place] = 1.0
+        assert np.sqrt(np.sum(transform.inverse(impulse) ** 2)) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("kinds", [("haar",) * 4, ("9/7",) * 4])
+def test_white_noise_in_the_coefficients_is_as_large_in_the_values(kinds: tuple[str, ...]) -> None:
+    shape = (8, 16, 32, 32)
+    transform = Transform(spec_of(kinds, (2, 2, 3, 3), shape), shape, np.float64)
+    assert np.var(transform.inverse(noise(shape, np.float64))) == pytest.approx(1.0, rel=0.05)
+    band = np.zeros(shape)
+    band[4:, :4, 16:, :16] = noise((4, 4, 16, 16), np.float64)
+    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(
+        1.0, rel=0.15
+    )
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1500), (600, 1, 2, 3), (1, 1, 700, 530)])
+def test_long_axes_have_the_norms_of_the_interior(shape: tuple[int, ...]) -> None:
+    transform = Transform(spec_of(("9/7",) * 4, (4,) * 4, shape), shape, np.float64)
+    middle = tuple(n * 3 // 4 if n > 512 else 0 for n in shape)  # inside the finest high band
+    impulse = np.zeros(shape)
+    impulse[middle] = 1.0
+    assert np.sum(transform.inverse(impulse) ** 2) == pytest.approx(1.0, abs=1e-6)
