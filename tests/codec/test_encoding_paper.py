@@ -13,7 +13,6 @@ from readable_paper import FHash
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, InterruptedEncodingError, OutputError
-from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
@@ -80,17 +79,6 @@ def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None
         # Steps 0, 0.5, 1, 2.5 and 3: key indices 0, 0.5, 1, 1.75 and 2 with key frames 0, 1 and 3.
         for number, step in enumerate((0, 0.5, 1, 2.5, 3)):
             assert np.abs(volume.read(step) - expected[number]).max() <= 1e-5 * (high - low)
-
-
-def test_quality_improves_with_training(field, tmp_path) -> None:
-    psnr = [
-        fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(profile="paper", epochs=n))[
-            "psnr"
-        ]
-        for n in (1, 5, 25)
-    ]
-    assert psnr[0] < psnr[1] < psnr[2]
-    assert psnr[2] > 40
 
 
 def test_the_same_input_gives_the_same_bytes_without_timings(field, tmp_path) -> None:
@@ -181,24 +169,6 @@ def test_a_training_that_diverges_at_every_rate_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_deep_network_that_diverges_at_every_other_rate_is_trained_in_the_end(
-    field, tmp_path
-) -> None:
-    config = EncodeConfig(
-        profile="paper",
-        epochs=20,
-        learning_rate=1.0,
-        schedule="constant",
-        hidden_layers=8,
-        width=64,
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FhashWarning)
-        figures = fhash_codec.encode(field(), tmp_path / "a.fhz", config)
-    assert figures["restarts"] > 1
-    assert np.isfinite(figures["rmse"])
-
-
 def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypatch) -> None:
     class Spoilt(SlabEngine):
         def parameters(self):
@@ -212,28 +182,6 @@ def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypa
             field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01, engine="slab")
         )
     assert not list(tmp_path.iterdir())
-
-
-def test_a_failure_after_the_training_leaves_its_checkpoint(field, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("fhash_codec.paper.fit.KEEP_SECONDS", 0.0)
-    config = EncodeConfig(profile="paper", epochs=2, width=16, timings=False)
-    fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
-    trained = []
-
-    def interrupt(stage, done, total, note):
-        trained.append(stage)
-        if stage == "measuring":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=interrupt)
-    trained.clear()
-    fhash_codec.encode(
-        field(), tmp_path / "run.fhz", config, progress=lambda stage, *rest: trained.append(stage)
-    )
-    assert "training" not in trained
-    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
 
 
 def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(
@@ -278,17 +226,3 @@ def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tm
     assert trained["psnr_fringe"] > trained["psnr_fringe_linear"] - 5
     assert trained["psnr_key_frames"] > untrained["psnr_key_frames"] - 3
     assert figures["trained"]["psnr_linear"] == figures["untrained"]["psnr_linear"]
-
-
-@pytest.mark.parametrize("engine", ["auto", "native", "slab"])
-def test_the_header_says_which_engine_trained(field, tmp_path, engine) -> None:
-    paths = machine_paths()
-    if engine == "native" and not paths:
-        pytest.skip("the native library was not built here")
-    fhash_codec.encode(field(), tmp_path / "a.fhz", replace(QUICK, engine=engine))
-    with Container.open(tmp_path / "a.fhz") as container:
-        training = container.header["training"]
-    name = ("native" if paths else "slab") if engine == "auto" else engine
-    assert training["engine"] == name
-    assert training["threads"] >= 1
-    assert training.get("path") == (paths[0] if name == "native" else None)

@@ -61,16 +61,6 @@ def test_xarray_shows_the_variable(tmp_path: Path, tile: str, effort: int) -> No
         assert volume.verify()
 
 
-def test_positions_that_have_an_array_are_shown(tmp_path: Path) -> None:
-    """Those that follow a rule, and those of up to 1024 steps, are in the header alone."""
-    path, times = tmp_path / "run.fhz", np.sort(np.random.default_rng(0).uniform(0, 9, 1100))
-    data = np.repeat(values()[:1], 1100, axis=0)
-    fhash_codec.encode(series(data, times=times), path, EncodeConfig(effort=1, max_error=0.01))
-    dataset = shown(path)
-    assert list(dataset.coords) == ["time"]
-    np.testing.assert_array_equal(dataset["time"], times)
-
-
 def test_of_features_it_shows_the_box_and_nan_outside(tmp_path: Path) -> None:
     path = tmp_path / "run.fhz"
     config = EncodeConfig(effort=2, max_error=0.01, features=("interval:1.2:9",), dilation=0)
@@ -84,38 +74,3 @@ def test_of_features_it_shows_the_box_and_nan_outside(tmp_path: Path) -> None:
     assert found.dims[0] == "time"
     for name, own, whole in zip(found.dims[1:], found.shape[1:], SHAPE[1:], strict=True):
         assert str(name).endswith("_box") == (own != whole)
-
-
-def test_numbers_that_are_not_the_values_are_not_shown(tmp_path: Path) -> None:
-    """Integers without a value have a number that looks like one."""
-    path = tmp_path / "run.fhz"
-    counts = series((values() * 100).astype(np.int16))
-    config = EncodeConfig(effort=1, max_error=1, features=("interval:120:900",), dilation=0)
-    fhash_codec.encode(counts, path, config)
-    assert "rain_rate" not in shown(path)
-    with fhash_codec.open(path) as volume:
-        assert "array" not in volume.info
-        assert volume.verify()
-
-
-@pytest.mark.parametrize("name", ["time", "tables", "a/b", "", "zarr.json"])
-def test_any_name_makes_a_sound_file(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "run.fhz"
-    fhash_codec.encode(series(name=name), path, EncodeConfig(effort=1, max_error=0.01))
-    with fhash_codec.open(path) as volume:
-        assert volume.name == (name or "values")
-        assert np.abs(volume[...] - values()).max() <= 0.01
-        assert volume.coords["z"].values.tolist() == [1, 2, 4, 8]
-
-
-def test_plain_files_have_their_tables_among_the_parts(tmp_path: Path) -> None:
-    fhash_codec.encode(series(), tmp_path / "run.fhz", EncodeConfig(effort=1, max_error=0.01))
-    fhash_codec.export_plain(tmp_path / "run.fhz", tmp_path / "plain.fhz")
-    with (
-        fhash_codec.open(tmp_path / "run.fhz") as volume,
-        fhash_codec.open(tmp_path / "plain.fhz") as plain,
-    ):
-        assert "array" not in plain.info
-        assert plain.container.arrays["tables/level_1"].name == "parts/0.tables.level_1"
-        assert plain.container.arrays["coords/z"].name == "height"
-        np.testing.assert_allclose(plain[...], volume[...], rtol=0, atol=1e-6)

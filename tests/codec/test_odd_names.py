@@ -66,32 +66,3 @@ def test_a_dimension_of_any_name_comes_back(
         np.testing.assert_allclose(dataset["u"], VALUES, atol=0.01)
         if make is labelled:
             assert dataset[plain].values.tolist() == [3, 5, 7]
-
-
-def test_names_that_become_the_same_stay_apart(tmp_path: Path) -> None:
-    path = tmp_path / "a.fhz"
-    with pytest.warns(FhashWarning, match=r"'a/b' to 'a_b_2', 'a\\\\b' to 'a_b_3'"):
-        fhash_codec.encode(zarr_2(tmp_path, ["time", "a_b", "a/b", "a\\b"]), path, CONFIG)
-    with xr.open_dataset(path, engine="fhash") as dataset:
-        assert dataset["u"].dims == ("time", "a_b", "a_b_2", "a_b_3")
-
-
-def test_text_in_latin_1_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "a.nc"
-    source = xr.Dataset(
-        {"uq": (["t", "zq", "y", "x"], VALUES, {"units": "zzC", "good": "\u00b5m"})},
-        {"zq": np.arange(3.0)},
-        {"title": "Zqqrich"},
-    )
-    source.to_netcdf(path, engine="scipy")
-    data = path.read_bytes().replace(b"zzC", b"\xb0C ").replace(b"Zqqrich", b"Z\xfcrich ")
-    data = data.replace(b"zq", "\u00e9".encode()).replace(b"uq", "\u03be".encode())
-    path.write_bytes(data)
-    fhash_codec.encode(path, tmp_path / "a.fhz", CONFIG)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert (volume.name, volume.units.strip()) == ("\u03be", "\u00b0C")
-    with xr.open_dataset(tmp_path / "a.fhz", engine="fhash") as dataset:
-        assert dataset.attrs["title"].strip() == "Z\u00fcrich"
-        assert dataset["\u03be"].attrs["good"] == "\u00b5m"
-        assert dataset["\u03be"].dims == ("t", "\u00e9", "y", "x")
-        assert dataset["\u00e9"].values.tolist() == [0, 1, 2]

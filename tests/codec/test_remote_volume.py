@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, MissingInputError
+from fhash_codec import EncodeConfig, InputError
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +62,6 @@ def test_levels_of_detail_ask_for_all_tiles_at_once(path, url, range_server) -> 
         assert_array_equal(volume.tables[1][0, :8, :8, :8, 0], here.tables[1][0, :8, :8, :8, 0])
 
 
-def test_opening_loads_no_more_than_the_end(url, range_server) -> None:
-    fhash_codec.open(url).close()
-    ranges = [entry[1] for entry in range_server.log]
-    assert len(ranges) <= 3
-    assert sum(entry[3] for entry in range_server.log) < 20_000
-
-
 @pytest.mark.parametrize("profile", ["paper", "compact"])
 def test_both_profiles_equal_the_file_at_hand(encoded, path, range_server, profile) -> None:
     path = encoded[1] if profile == "paper" else path
@@ -80,17 +73,6 @@ def test_both_profiles_equal_the_file_at_hand(encoded, path, range_server, profi
         assert_array_equal(volume.sample(**points), here.sample(**points))
         assert {**volume.info, "path": ""} == {**here.info, "path": ""}
         assert volume.describe()
-
-
-def test_failures_that_pass_do_not_show(path, url, range_server, monkeypatch) -> None:
-    from fhash_formats.container.remote import FsspecFile
-
-    paused: list[float] = []
-    monkeypatch.setattr(FsspecFile.__init__, "__kwdefaults__", {"pause": paused.append})
-    with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
-        range_server.failures = [503, "drop", 500]
-        assert_array_equal(volume[0], here[0])
-    assert paused
 
 
 def test_a_file_that_changes_is_noticed(path, url, range_server) -> None:
@@ -136,26 +118,3 @@ def test_open_files(path) -> None:
             with pytest.raises(InputError, match="open it by its path or URL"):
                 pickle.dumps(volume)
         assert not file.closed
-
-
-def test_no_such_url(url) -> None:
-    with pytest.raises(MissingInputError, match=r"none\.fhz: no such file"):
-        fhash_codec.open(url.replace("noise", "none"))
-
-
-def test_pictures_name_no_secrets(path, range_server, tmp_path) -> None:
-    url = range_server.put("noise.fhz", path.read_bytes())
-    with fhash_codec.open(f"{url}?signature=secret") as volume:
-        scene = fhash_codec.Scene(size=(16, 16))
-        image = fhash_codec.render(volume, scene)
-    assert image.source == "noise.fhz"
-
-
-def test_a_process_that_draws_opens_the_url_itself(url) -> None:
-    from fhash_codec.rendering import film as workers
-
-    scene = fhash_codec.Scene(size=(8, 8))
-    with fhash_codec.open(url) as volume:
-        job = workers._job(volume, [scene], threads=1)
-        (drawn,) = workers._images(pickle.loads(pickle.dumps(job)))
-        assert_array_equal(drawn.rgba, fhash_codec.render(volume, scene).rgba)

@@ -20,10 +20,10 @@ from xarray.core import indexing
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.features.selection import labelled_series
-from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide, shown_names
+from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
+from fhash_formats.series import ArraySeries, Coordinate
 
 DIMENSIONS = {"lon": "x", "one": "", "time": "t", "lat": "y"}
 
@@ -79,14 +79,6 @@ def test_chunks_are_the_tiles_of_the_dimensions(run) -> None:
         assert coarse.chunks(volume)["lon"] == x // 2
 
 
-def test_a_released_array_reads_on(run) -> None:
-    path, whole = run
-    lazy = array(path)
-    lazy.release()
-    lazy.release()
-    np.testing.assert_array_equal(lazy[indexing.BasicIndexer((0, 0, 0, 0))], whole[0, 0, 0, 0])
-
-
 CONFIG = EncodeConfig(max_error=0.01, effort=1, timings=False)
 SHAPE = (3, 1, 5, 6)
 
@@ -127,30 +119,6 @@ def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
         assert dataset.sizes["x_3"] == 7
 
 
-def with_latitudes(number: int) -> ArraySeries:
-    series = ArraySeries(values(number), name=f"u{number}")
-    latitudes = np.full((5, 6), 10.0 * number)
-    series.metadata = SourceMetadata(
-        dimensions={"time": "t", "y": "y", "x": "x"},
-        variable_attributes={"coordinates": "lat"},
-        variables=(
-            SourceVariable(name="lat", dimensions=("y", "x"), values=latitudes, is_coordinate=True),
-        ),
-    )
-    return series
-
-
-def test_arrays_beside_of_one_name_do_not_take_the_place_of_others(tmp_path: Path) -> None:
-    sources = {"u0": with_latitudes(0), "u1": with_latitudes(1)}
-    with opened(sources, tmp_path / "a.fhz") as dataset:
-        assert set(dataset.coords) == {"lat", "lat_2"}
-        assert (dataset["lat"] == 0).all()
-        assert (dataset["lat_2"] == 10).all()
-    with xr.open_dataset(tmp_path / "a.fhz", engine="fhash", decode_coords=False) as raw:
-        assert raw["u0"].attrs["coordinates"] == "lat"
-        assert raw["u1"].attrs["coordinates"] == "lat_2"
-
-
 def test_a_coordinate_has_not_the_name_of_a_variable() -> None:
     joined = SideBySide({"u": "x", "x": "x"})
     assert joined.add("u", along(x=3), {"x": along(x=3)}) == {"x": "x_2"}
@@ -176,17 +144,6 @@ def test_a_dimension_without_positions_is_shared() -> None:
     joined.add("w", along(x=3), {"x": along(x=3) + 1})
     assert joined.variables["v"].dims == ("x",)
     assert joined.variables["w"].dims == ("x_2",)
-
-
-def test_a_variable_alone_keeps_the_names_of_its_source() -> None:
-    joined = SideBySide({"x": "x"})
-    joined.add("x", along(x=3), {})
-    assert joined.variables["x"].dims == ("x",)
-
-
-def test_names_are_those_of_the_sources_where_these_differ() -> None:
-    assert shown_names({"a/u": "u", "b/v": "v"}) == {"a/u": "u", "b/v": "v"}
-    assert shown_names({"a": "u", "b": "u", "c": "b"}) == {"a": "a", "b": "b", "c": "c"}
 
 
 def vector_file(path: Path, kind: str) -> dict[str, np.ndarray]:
@@ -304,17 +261,6 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
             )
 
 
-def test_the_file_says_where_it_comes_from(made) -> None:
-    container = made[2]
-    with opened_xarray_backend(container) as stored:
-        *before, line = stored.attrs["history"].split("\n")
-        assert "fhash encode source.nc --psnr 45 --effort 1 --without ssim" in line
-        assert line.startswith("fhash ")  # no date without timings
-        assert before in ([], ["made by hand"])
-        assert stored.attrs["fhash_source"] == "source.nc"
-        assert len(stored.attrs["fhash_source_digest"]) == 64
-
-
 def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
     read = []
     original = fhash_codec.Volume.values_of_steps
@@ -349,14 +295,6 @@ def test_indices_are_those_of_numpy(plain, key: tuple[Any, ...]) -> None:
         np.testing.assert_array_equal(stored["values"][key].values, whole[key].values)
 
 
-def test_points_are_picked_one_by_one(plain) -> None:
-    places = xr.DataArray([0, 3, 3], dims="point")
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
-        found = stored["values"].isel(time=places, x=places + 5).values
-        whole = volume[...]
-    np.testing.assert_array_equal(found, np.stack([whole[n, :, :, n + 5] for n in (0, 3, 3)]))
-
-
 def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
     with fhash_codec.open(plain) as volume:
         whole = volume[...]
@@ -370,14 +308,6 @@ def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
             assert found.tobytes() == whole.tobytes(), scheduler
 
 
-def test_a_dataset_is_pickled_by_its_path(plain) -> None:
-    with opened_xarray_backend(plain) as stored:
-        data = pickle.dumps(stored)
-        assert len(data) < 20_000
-        other = pickle.loads(data)
-        np.testing.assert_array_equal(other["values"][1], stored["values"][1])
-
-
 def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
     path = tmp_path / "run.fhz"
     path.write_bytes(plain.read_bytes())
@@ -389,13 +319,6 @@ def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
         pickle.loads(data)["values"].values  # noqa: B018 - reads them
 
 
-def test_a_closed_dataset_opens_its_file_again(plain) -> None:
-    stored = opened_xarray_backend(plain)
-    before = stored["values"][0].values
-    stored.close()
-    np.testing.assert_array_equal(stored["values"][0].values, before)
-
-
 def test_levels_of_detail_have_every_other_vertex(plain) -> None:
     with fhash_codec.open(plain) as volume, opened_xarray_backend(plain, lod=1) as stored:
         z, y, x = volume.lod_vertices(1)
@@ -405,17 +328,6 @@ def test_levels_of_detail_have_every_other_vertex(plain) -> None:
         assert "fhash_max_error" not in stored["values"].attrs
         part = stored["values"][3, 1:4, ::-2, 5].values
         np.testing.assert_array_equal(part, volume.read_lod(3, 1)[1:4, ::-2, 5])
-
-
-def test_the_background_stands_outside(plain) -> None:
-    with (
-        fhash_codec.open(plain) as volume,
-        opened_xarray_backend(plain, outside="background") as stored,
-    ):
-        assert np.isnan(volume[0]).any()
-        np.testing.assert_array_equal(
-            stored["values"][0].values, volume.read(0, outside="background")
-        )
 
 
 @pytest.mark.parametrize(
@@ -547,12 +459,3 @@ def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: s
             fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)
         same = (tmp_path / f"{name}.fhz").read_bytes() == (tmp_path / "path.fhz").read_bytes()
         assert same, name
-
-
-def test_data_in_memory_or_computed_name_no_file(tmp_path) -> None:
-    source = KINDS["packed"]().write(tmp_path / "source.nc")
-    with xr.open_dataset(source, chunks={}) as lazy:
-        assert labelled_series(lazy).metadata.file == "source.nc"
-        for data in (xr.load_dataset(source), lazy.assign(sst=lazy["sst"] * 2)):
-            metadata = labelled_series(data, "sst").metadata
-            assert (metadata.file, metadata.digest) == (None, None)

@@ -13,7 +13,7 @@ from fhash_codec import DamagedFileError, EncodeConfig, InputError, UnsupportedF
 from fhash_codec.appending import series_plan
 from fhash_codec.appending.series_plan import SeriesPlan, bounded, plan_parts
 from fhash_formats.container import record as strict_json
-from fhash_formats.errors import FhashError, MissingInputError, OutputExistsError
+from fhash_formats.errors import FhashError, MissingInputError
 from fhash_formats.series import ArraySeries, Coordinate
 
 SHAPE = (6, 4, 6, 8)
@@ -46,43 +46,11 @@ def test_a_plan_comes_back_from_its_file(plan) -> None:
     read.require(series())
 
 
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        ({"name": "v"}, "they differ in name: u, not v"),
-        ({"units": "km"}, "they differ in units: m, not km"),
-        ({"values": np.zeros((6, 4, 6, 9), np.float32)}, "they differ in shape"),
-        ({"values": np.zeros(SHAPE)}, "they differ in dtype: float32, not float64"),
-        ({"coords": times([0, 1, 2, 3, 4, 5])}, "they differ in coordinates; give the same data"),
-    ],
-)
-def test_a_plan_of_other_data_is_refused(plan, labels, message) -> None:
-    with pytest.raises(InputError, match=message):
-        SeriesPlan.read(plan).require(series(**labels))
-
-
-def test_other_settings_are_refused(plan) -> None:
-    known = SeriesPlan.read(plan)
-    known.require_settings({"max_error": 0.02, "effort": 2, "timings": True})
-    with pytest.raises(InputError, match=r"effort is 3, and 2 in the plan; leave it out"):
-        known.require_settings({"effort": 3})
-
-
 @pytest.mark.parametrize("promise", [{"psnr": 40}, {"ratio": 9}, {}, {"profile": "paper"}])
 def test_only_a_bound_is_planned(tmp_path, promise) -> None:
     with pytest.raises(InputError, match="give max_error or max_error_rel"):
         plan_parts(series(), tmp_path / "a.plan", EncodeConfig(**promise))
     assert not list(tmp_path.iterdir())
-
-
-def test_an_older_plan_is_kept_without_force(tmp_path) -> None:
-    path = tmp_path / "a.plan"
-    path.write_text("older")
-    with pytest.raises(OutputExistsError):
-        plan_parts(series(), path, CONFIG)
-    assert path.read_text() == "older"
-    plan_parts(series(), path, CONFIG, force=True)
-    assert SeriesPlan.read(path).layers == 3
 
 
 def test_what_is_no_plan_is_refused(tmp_path) -> None:

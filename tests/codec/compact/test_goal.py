@@ -12,9 +12,7 @@ from fhash_codec.compact.goal import (
     DECIDED,
     DEFAULT_PSNR,
     FAR_BELOW,
-    SLOPE,
     Bracket,
-    Goal,
     PsnrSearch,
     arithmetic_mean,
     cheapest,
@@ -26,16 +24,11 @@ from fhash_codec.compact.goal import (
     promise,
     remarks,
     secant,
-    step_after_gain,
 )
-from fhash_codec.compact.tiles import Coding, Outcome
+from fhash_codec.compact.tiles import Outcome
 from fhash_codec.measure.errors import MIN_SHARE
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
-
-
-def test_a_single_point_takes_the_usual_slope() -> None:
-    assert secant([(1.0, 40.0)], 42.0, 5.0) == pytest.approx(1.0 - 2.0 / 5.0)
 
 
 def test_two_points_take_their_own_slope_within_reason() -> None:
@@ -56,14 +49,6 @@ def test_a_psnr_of_uniform_rounding_is_found_in_a_few_steps() -> None:
     assert search.step_for(60.0) == pytest.approx(1e-9)
 
 
-def test_a_gain_moves_the_step_by_the_usual_slope() -> None:
-    assert step_after_gain(0.5, 0.0) == 0.5
-    assert step_after_gain(0.5, SLOPE) == pytest.approx(0.5 * math.e)
-    assert secant([(math.log(0.5), 40.0)], 40.0 - 2.0, SLOPE) == pytest.approx(
-        math.log(step_after_gain(0.5, 2.0))
-    )
-
-
 @pytest.mark.parametrize("mean", [arithmetic_mean, geometric_mean])
 @pytest.mark.parametrize("target", [1.5, 40.0, 99.0])
 def test_bisection_in_a_bracket_converges(
@@ -75,14 +60,6 @@ def test_bisection_in_a_bracket_converges(
         bracket = bracket.narrowed(number, too_low=number < target)
     assert bracket.low == pytest.approx(target, rel=1e-9)
     assert bracket.high == pytest.approx(target, rel=1e-9)
-
-
-def test_a_prediction_inside_a_bracket_is_taken() -> None:
-    bracket = Bracket(1.0, math.inf, middle=geometric_mean)
-    assert bracket.inside(7.0) == 7.0
-    assert bracket.narrowed(4.0, too_low=False).inside(7.0) == 2.0
-    # A trial outside the bracket does not widen it.
-    assert bracket.narrowed(0.5, too_low=True).low == 1.0
 
 
 def test_an_exchange_rate_is_that_of_the_last_points_some_way_apart() -> None:
@@ -105,13 +82,6 @@ def test_the_cheapest_is_found_from_everywhere(start: int, lowest: int) -> None:
     assert cheapest(run, start, 12, strides=(2, 1)) == f"at {lowest}"
     assert len(asked) == len(set(asked))
     assert all(0 <= number <= 12 for number in asked)
-
-
-def test_numbers_that_cannot_be_run_are_avoided() -> None:
-    def run(numbers: Sequence[int]) -> list[tuple[float, int] | None]:
-        return [(float(number), number) if number > 2 else None for number in numbers]
-
-    assert cheapest(run, 7, 12, strides=(2, 1)) == 3
 
 
 @pytest.mark.parametrize(
@@ -177,23 +147,6 @@ def test_both_promises_are_kept_where_the_psnr_of_an_outcome_is(
     assert goal.psnr == 50.0
     assert (outcome.psnr(100.0) >= 50.0) == (rmse < 0.316 and bulk_rmse < 0.1)
     assert goal.expected_error == pytest.approx(0.1)
-
-
-def test_a_bulk_alone_stands_for_all() -> None:
-    goal = goal_of(EncodeConfig(psnr_bulk=40.0), RANGE, 1000, 0, ValueRange(20.0, 30.0))
-    assert goal.psnr == goal.even_psnr == pytest.approx(60.0)
-    assert goal.bulk is not None
-    assert goal.bulk.alone
-
-
-def test_only_a_bound_changes_the_coding() -> None:
-    coding = Coding(rounds=2)
-    assert Goal(psnr=50.0, data_range=1.0).bounded(coding) is coding
-    assert Goal(error=0.5, data_range=1.0).bounded(coding) == Coding(rounds=2, error=0.5)
-
-
-def test_the_expected_error_of_a_psnr_is_that_of_its_definition() -> None:
-    assert Goal(psnr=40.0, data_range=5.0).expected_error == pytest.approx(0.05)
 
 
 def figures(**others):

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,22 +18,14 @@ from fhash_codec import EncodeConfig
 from fhash_codec.compact.goal import step_after_gain
 from fhash_codec.compact.head import (
     EFFORTS,
-    GAIN_BY_WIDTHS,
-    MIN_BYTES,
     PERCEPTRON,
     Budget,
     Effort,
     Shape,
     _coarsened,
     _side_by_side,
-    best_widths,
-    choose_head,
-    expected_gain,
     likely_heads,
-    most_saved,
 )
-from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.compact.transform import usual_transform
 from fhash_codec.progress import Parts
 from fhash_formats.transform.encoding import OFFSETS
@@ -110,36 +101,6 @@ def test_an_interruption_ends_the_trainings_of_other_threads() -> None:
     assert not any(thread.is_alive() for thread in threads)
 
 
-class AskedFor(Exception):
-    """Raised by a sample that is asked for tiles to learn from."""
-
-
-class NoSample:
-    """A sample that trains nothing."""
-
-    def decoded(self, settings: TileSettings, coding: Coding) -> None:
-        raise AskedFor
-
-
-@pytest.mark.parametrize("size", [0, MIN_BYTES - 1, MIN_BYTES])
-def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
-    outcome = Outcome(size=size, squares=1.0, count=1, max_error=1.0)
-    transform = usual_transform((1, 1, 8, 8))
-    settings = TileSettings(transform=transform, step=1.0, center=0.0, low=0.0, high=1.0)
-
-    def choose() -> Any:
-        return choose_head(
-            cast(Sample, NoSample()), settings, outcome, Coding(),
-            cast(Any, None), cast(Any, None), [], aim=50.0, data_range=1.0, effort=5, seed=0,
-        )  # fmt: skip
-
-    if size < MIN_BYTES:
-        assert choose() == (settings, outcome, [])
-    else:
-        with pytest.raises(AskedFor):
-            choose()
-
-
 @pytest.mark.parametrize(("lost", "share"), [(2.2, 1), (4, 0.5), (24, 1 / 12), (0.8, 2), (0, 2)])
 def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> None:
     """Their loss in dB at the usual step decides, within a power of 2."""
@@ -159,27 +120,6 @@ def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> 
     )
 
 
-def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
-    def widths(size: float, gain: float = 0.5, effort: int = 9) -> tuple[int, int] | None:
-        return best_widths(size, gain, 4.5, effort)
-
-    assert widths(1_000) is None
-    chosen = [widths(size) for size in (1e4, 2e4, 3e4, 1e5, 3e5, 1e6)]
-    ranks = [list(GAIN_BY_WIDTHS).index(each) for each in chosen if each is not None]
-    assert ranks == sorted(ranks)
-    assert len(set(ranks)) > 2
-    # Weights cost decoding time, whatever the size of the file: a small gain pays for few of them.
-    assert widths(1e9, gain=3.0) == (14, 24)
-    assert widths(1e9, gain=3.0, effort=5) == (12, 12)
-    assert widths(1e6, gain=0.01) is None
-
-
-def test_a_perceptron_that_cannot_pay_is_told_from_its_size_and_the_gain_of_the_trial() -> None:
-    assert most_saved(20_000, 0.03, 4.5) < 0
-    assert most_saved(20_000, 0.5, 4.5) > 0
-    assert most_saved(500_000, 0.03, 4.5) > 0
-
-
 def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:
     def shapes(size: float, gain: float) -> list[Shape]:
         return likely_heads(size, gain, 4.5, effort=5)
@@ -189,10 +129,6 @@ def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:
     assert shapes(120_000, 0.14) == [PERCEPTRON]
     assert [shape.cross for shape in shapes(1e6, 3.0)] == [True]
     assert [shape.cross for shape in shapes(60_000, 0.5)] == [True, False]
-
-
-def test_a_full_training_is_expected_to_gain_more_than_the_trial() -> None:
-    assert [expected_gain(gain) > gain for gain in (0.0, 0.1, 1.0)] == [True] * 3
 
 
 def test_weights_and_products_of_a_head() -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from reference.head import Head, clip, inputs_of, moved
 
-from fhash_codec import native
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     BLOCK_VOXELS,
@@ -24,7 +22,7 @@ from fhash_codec.compact.head_training import (
     draw,
     train_head,
 )
-from fhash_formats.transform.head import CROSS, INPUTS, NeighbourHead
+from fhash_formats.transform.head import CROSS, INPUTS
 
 
 def voxels(
@@ -123,12 +121,6 @@ def test_a_step_is_adams() -> None:
         np.testing.assert_allclose(trained.parameters, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_long_gradient_is_shortened() -> None:
-    trained = network(1)
-    trained.learn(voxels(1, 1, 1, largest=True), 1, *factors(1), as_in_file=False)
-    assert np.linalg.norm(trained.means) == pytest.approx(0.1)
-
-
 @pytest.mark.parametrize("as_in_file", [False, True])
 def test_the_bits_of_training_are_fixed(as_in_file: bool) -> None:
     """So that the same series gives the same bytes on every machine."""
@@ -141,34 +133,6 @@ def test_the_bits_of_training_are_fixed(as_in_file: bool) -> None:
 
 
 DIGESTS = {False: "75241812da0c4ada", True: "6ff35e4c66d28414"}
-
-
-def test_the_layers_are_those_of_the_last_measurement() -> None:
-    trained = network(9, (8, 8))
-    for (weights, biases), layer in zip(
-        layer_arrays(trained.parameters, (8, 8), 9), trained.layers(), strict=True
-    ):
-        assert np.abs(layer.weights).max() <= 31
-        assert np.abs(layer.biases).max(initial=0) <= 127
-        rounded = layer.weights * layer.weight_scale
-        assert np.abs(rounded - weights).max() <= 0.51 * layer.weight_scale
-        rounded = layer.biases * layer.bias_scale
-        assert np.abs(rounded - biases).max() <= 0.51 * layer.bias_scale + 1e-6
-
-
-def test_the_native_functions_refuse_sizes_that_they_cannot_take() -> None:
-    library = native.library()
-    # A block of another length, more blocks and voxels than sums stay exact for, wide layers.
-    for sizes in (
-        (0, 1, 64, 1, 4, 4),
-        (1, 65, 64, 1, 4, 4),
-        (1, 1, 32, 1, 4, 4),
-        (1, 1, 64, 10, 4, 4),
-        (1, 1, 64, 1, 65, 4),
-        (1, 1, 64, 1, 4, 0),
-    ):
-        array = np.array(sizes, dtype=np.int64)
-        assert library.fhash_head_errors(*(None,) * 4, array.ctypes.data, None, 0, None) == -1
 
 
 def tiles() -> list[Pair]:
@@ -279,20 +243,6 @@ def test_a_cross_sees_farther(far: tuple[Floats, Floats]) -> None:
     assert cross.head.cross
 
 
-def test_noise_gains_nothing_much() -> None:
-    random = np.random.default_rng(0)
-    original = random.normal(size=(2, 16, 16, 32)).astype(np.float32)
-    decoded = (original + 0.1 * random.normal(size=original.shape)).astype(np.float32)
-    trained = train_head(
-        [Pair(decoded, original, None)],
-        low=-6.0,
-        high=6.0,
-        updates=150,
-        samples=100_000,
-    )
-    assert abs(trained.gain_db) < 0.5
-
-
 @pytest.mark.parametrize("cross", [False, True])
 def test_the_same_seed_gives_the_same_head(front: tuple[Floats, Floats], cross: bool) -> None:
     settings = {
@@ -328,68 +278,6 @@ def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) ->
     assert heads[0].to_bytes() == heads[1].to_bytes()
 
 
-def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(
-    front: tuple[Floats, Floats],
-) -> None:
-    decoded, original = front
-    pairs = [
-        Pair(decoded, original, None),
-        Pair(decoded[:1, :5, :, :7], original[:1, :5, :, :7], None),
-        Pair(decoded, original * np.float32(np.nan), np.zeros(original.shape, dtype=bool)),
-    ]
-    trained = train_head(
-        pairs,
-        low=-1.0,
-        high=2.0,
-        hidden=(6, 4),
-        cross=True,
-        samples=100_000,
-        updates=200,
-    )
-    assert trained.head.hidden == (6, 4)
-    assert trained.gain_db > 3
-
-
-def test_progress_rises_to_one_in_small_parts(front: tuple[Floats, Floats]) -> None:
-    parts: list[float] = []
-    trained = train_head(
-        [Pair(*front, None)],
-        low=-1.0,
-        high=2.0,
-        updates=150,
-        samples=40_000,
-        progress=parts.append,
-    )
-    assert trained is not None
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0
-    assert np.diff([0.0, *parts]).max() <= 20 / 150
-    assert [update for _, update, _ in trained.history] == list(range(15, 151, 15))
-
-
-def test_what_the_progress_raises_ends_the_training(front: tuple[Floats, Floats]) -> None:
-    def interrupt(share: float) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_head(
-            [Pair(*front, None)],
-            low=-1.0,
-            high=2.0,
-            updates=5000,
-            samples=4096,
-            progress=interrupt,
-        )
-
-
-@pytest.mark.parametrize("updates", [1, 2, 3, 7, 11])
-def test_a_very_short_training_gives_a_head(front: tuple[Floats, Floats], updates: int) -> None:
-    trained = train_head([Pair(*front, None)], low=-1.0, high=2.0, updates=updates, samples=4096)
-    assert trained is not None
-    assert trained.history[-1][1:] == (updates, trained.gain_db)
-    assert NeighbourHead.from_bytes(trained.head.to_bytes()).hidden == (12, 8)
-
-
 @pytest.mark.parametrize(
     "pair",
     [
@@ -406,25 +294,3 @@ def test_a_very_short_training_gives_a_head(front: tuple[Floats, Floats], update
 )
 def test_where_nothing_can_be_learned_there_is_no_head(pair: Pair) -> None:
     assert train_head([pair], low=-3e38, high=3e38, updates=5, samples=4096) is None
-
-
-def test_an_error_that_a_head_removes_gives_a_finite_gain() -> None:
-    decoded = np.tile(np.float32([0.25, 0.75]), (2, 8, 8, 16))
-    trained = train_head(
-        [Pair(decoded, np.rint(decoded), None)], low=0.0, high=1.0, updates=80, samples=8192
-    )
-    assert trained is not None
-    assert all(np.isfinite(gain) for _, _, gain in trained.history)
-
-
-def test_two_trainings_at_once_give_what_each_gives_alone(front: tuple[Floats, Floats]) -> None:
-    def trained(seed: int) -> bytes:
-        result = train_head(
-            [Pair(*front, None)], low=-1.0, high=2.0, updates=40, samples=40_000, seed=seed
-        )
-        assert result is not None
-        return result.head.to_bytes()
-
-    with ThreadPoolExecutor(2) as workers:
-        together = list(workers.map(trained, (1, 2)))
-    assert together == [trained(1), trained(2)]

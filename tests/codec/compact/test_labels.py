@@ -12,12 +12,10 @@ from planned import plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact import plan as planning
 from fhash_codec.compact.attempt import Attempt
 from fhash_codec.compact.labels import (
     ends_trials,
     holds_beside,
-    is_hopeless,
     look_at_labels,
     rank_share,
 )
@@ -130,52 +128,6 @@ def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:
         assert holds_beside(task, plateau, attempt(None, labels=False))
 
 
-def test_values_that_a_transform_codes_in_fewer_bytes_are_no_labels(tmp_path) -> None:
-    smooth = np.indices((4, 10, 24, 24)).sum(0).astype("f4") ** 2 / 16
-    assert "labels" not in encoded(tmp_path, smooth.astype("u1"), psnr=30.0)[1]
-    noise = np.random.default_rng(0).integers(0, 200, (2, 4, 20, 20)).astype("u1")
-    assert "labels" not in encoded(tmp_path, noise, psnr=30.0, effort=1)[1]
-    assert "labels" not in encoded(tmp_path, noise, max_error=20.0)[1]
-    many = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
-    assert "labels" not in encoded(tmp_path, many, effort=1)[1]
-
-
-def grains(count: int) -> np.ndarray:
-    """Columns (3, 4, 40, 60) of `count` numbers in a random order, some of which change."""
-    chance = np.random.default_rng(1)
-    numbers = chance.permutation(count)[np.arange(600).reshape(20, 30) % count]
-    values = np.broadcast_to(numbers.repeat(2, 0).repeat(2, 1), (3, 4, 40, 60)).copy()
-    values[1:, :, 10:20, 10:30] = values[1:, :, 11:21, 10:30]
-    return values.astype("u2") * 7
-
-
-@pytest.mark.parametrize("count", [256, 257, 600])
-def test_few_and_many_labels_take_few_bytes(tmp_path, count) -> None:
-    values = grains(count)
-    size, features, decoded = encoded(tmp_path, values)
-    assert "labels" in features
-    np.testing.assert_array_equal(decoded, values)
-    assert 20 * size < values.nbytes
-
-
-@pytest.mark.parametrize(
-    ("other", "entropy", "rank", "hopeless"),
-    [
-        (125, 200, 1.0, True),  # a first guess much above labels, though these found a structure
-        (124, 200, 1.0, False),
-        (250, 200, 0.5, True),  # the same after a basis of half of the vectors
-        (249, 200, 0.5, False),
-        (100, 103, 0.9, True),  # noise, which no way takes for anything else
-        (99, 103, 1.0, False),
-        (100, 104, 1.0, False),  # labels found a little structure
-    ],
-)
-def test_trials_end_where_they_cannot_gain(
-    other: float, entropy: float, rank: float, hopeless: bool
-) -> None:
-    assert is_hopeless(100, other, entropy, rank) is hopeless
-
-
 def pieces(lengths: list[int]) -> np.ndarray:
     """Random numbers (2, 6, 24, x) that are the same along each of some pieces of x."""
     noise = np.random.default_rng(0).integers(0, 12, (2, 6, 24, len(lengths)))
@@ -188,47 +140,3 @@ def test_the_rank_is_that_of_the_axis_with_the_fewest_vectors() -> None:
     assert rank_share([pieces([5, 9, 14])]) == 3 / 28
     assert rank_share([pieces([5, 9, 14]), pieces([9, 5, 14])]) == 4 / 28
     assert rank_share([np.zeros((1, 2, 3, 4), "i4")]) == 1.0
-
-
-@pytest.mark.parametrize("kind", ["i8", "u8", "f4", "f8"])
-def test_the_rank_of_extreme_values(kind: str) -> None:
-    limits = np.finfo(kind) if kind[0] == "f" else np.iinfo(kind)
-    values = np.array([limits.min, limits.max], kind)[pieces([9, 5]) % 2]
-    assert rank_share([values]) == 2 / 14
-    if kind[0] == "f":
-        values[0, 0, 0] = [np.nan, np.inf, -np.inf, *values[0, 0, 0, 3:]]
-        assert 0 < rank_share([values]) <= 1
-
-
-def test_an_axis_that_is_too_long_for_a_basis_does_not_count() -> None:
-    lines = np.repeat(np.arange(4, dtype="u1").reshape(1, 1, 4, 1), 700, axis=3)
-    assert rank_share([lines[..., :512]]) == 1 / 512
-    assert rank_share([lines]) == 1 / 4
-
-
-def test_pieces_at_fixed_places_are_tried_further(tmp_path, monkeypatch) -> None:
-    """Their first guess is three times as long as labels; with their own basis it is shorter."""
-
-    def tried(*_: object) -> None:
-        raise LookupError
-
-    monkeypatch.setattr(planning, "_improved", tried)
-    with pytest.raises(LookupError):
-        encoded(tmp_path, np.tile(pieces([14, 14]), 2))
-
-
-def test_noise_is_planned_without_further_trials(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(planning, "_improved", lambda *_: pytest.fail("a trial of noise"))
-    noise = np.random.default_rng(0).integers(0, 6, (2, 8, 24, 24)).astype("u1")
-    size, features, decoded = encoded(tmp_path, noise)
-    assert "labels" in features
-    np.testing.assert_array_equal(decoded, noise)
-    assert size < noise.size * np.log2(6) / 8 + 2000
-
-
-def test_smooth_values_are_tried_further(tmp_path) -> None:
-    t, z, y, x = np.indices((2, 8, 24, 24))
-    smooth = np.rint(120 + 100 * np.sin(x / 9 + t / 3) * np.cos(y / 7 + z / 5)).astype("u1")
-    size, _, decoded = encoded(tmp_path, smooth)
-    np.testing.assert_array_equal(decoded, smooth)
-    assert 3 * size < smooth.size

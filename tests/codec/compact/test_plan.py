@@ -48,17 +48,6 @@ def test_effort_1_codes_no_sample_for_a_psnr(field: Field) -> None:
     assert done == [0, 7]
 
 
-@pytest.mark.parametrize("promise", [{"max_error": 1.0}, {"ratio": 4.0}], ids=str)
-def test_effort_1_codes_a_sample_for_other_promises(
-    field: Field, promise: dict[str, float]
-) -> None:
-    made, done = plan_of(field(), EncodeConfig(effort=1, **promise))
-    assert made.sample is not None
-    assert [gain["what"] for gain in made.gains] == ["start"]
-    assert made.coding.error == promise.get("max_error")
-    assert done == [0, 1, 2, 3, 4, 5, 6, 7]
-
-
 @pytest.mark.parametrize("factor", [1e200, 1e-200])
 def test_values_whose_squares_overflow_are_stored_without_loss(field: Field, factor: float) -> None:
     exact, done = plan_of(field(dtype=np.float64) * factor, EncodeConfig(effort=2))

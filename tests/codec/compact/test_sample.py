@@ -13,7 +13,7 @@ import pytest
 from untrained_heads import some_head
 
 from fhash_codec.compact import sample as sample_module
-from fhash_codec.compact.sample import Sample, fill, spread_order, strata
+from fhash_codec.compact.sample import Sample, fill, strata
 from fhash_codec.compact.tiles import Coding, Index, Tile
 from fhash_codec.compact.transform import usual_transform
 from fhash_formats.transform.encoding import OFFSETS
@@ -82,17 +82,6 @@ SETTINGS_SAMPLE = TileSettings(
 )
 
 
-def test_a_wider_sample_has_more_tiles_of_the_same_series() -> None:
-    with ThreadPoolExecutor(1) as workers:
-        narrow = Sample(Row(16), 4_000, workers)
-        wide = narrow.wider(8_000)
-        assert (len(narrow.tiles), narrow.weights) == (4, [4] * 4)
-        assert (len(wide.tiles), wide.weights) == (8, [2] * 8)
-        complete = Sample(Row(8), 8_000, workers)
-        assert complete.complete
-        assert complete.wider(16_000) is complete
-
-
 def test_an_expensive_tile_stands_for_itself_and_a_cheap_one_for_many() -> None:
     """The sample must have the one tile in which everything happens, and count it once."""
     costs = [1.0] * 16
@@ -118,19 +107,6 @@ def test_strata_cover_all_tiles(max_tiles: int) -> None:
     assert [weight for _, weight in strata([0.0] * 40, 4)] == [10] * 4
 
 
-def test_a_single_tile_of_many_is_the_one_nearest_to_the_mean() -> None:
-    """Most tiles around a small feature are nearly empty, the middle one by cost as well."""
-    assert strata([1.0, 0.0, 50.0, 0.0, 400.0, 0.0, 2.0], 1) == [(2, 7)]
-
-
-def test_each_beginning_of_the_order_is_spread_evenly() -> None:
-    order = spread_order(100)
-    assert sorted(order) == list(range(100))
-    for count in (5, 20, 50):
-        gaps = np.diff([-1, *sorted(order[:count]), 100])
-        assert gaps.max() <= 3 * 100 / count
-
-
 @pytest.mark.parametrize("in_memory", [True, False])
 def test_all_tiles_of_the_series_come_in_order(in_memory: bool) -> None:
     row = Row(40)
@@ -139,36 +115,6 @@ def test_all_tiles_of_the_series_come_in_order(in_memory: bool) -> None:
         sample = Sample(row, 4_000, workers)
         firsts = list(sample.map_all(lambda tile: int(tile.values.flat[0])))
     assert firsts == list(range(40))
-
-
-class HalfCounts(Row):
-    """Tiles of noise of which the first half along x counts."""
-
-    complete = False
-
-    def read(self, index: Index) -> Tile:
-        values = np.random.default_rng(index[2]).random(self.tile).astype(np.float32)
-        return Tile(values, np.indices(self.tile)[3] < 50)
-
-
-FILL_SETTINGS = replace(SETTINGS_SAMPLE, step=0.05, center=0.5, high=1.0, offsets=OFFSETS)
-
-
-def test_all_trials_at_once_are_what_each_gives_alone() -> None:
-    with ThreadPoolExecutor(3) as workers:
-        sample = Sample(HalfCounts(4), 10**7, workers)
-        trials = [(replace(FILL_SETTINGS, step=step), Coding(filled=True)) for step in (0.02, 0.1)]
-        assert sample.run_all(trials) == [sample.run(*trial) for trial in trials]
-        assert sample.run_all([]) == []
-
-
-def test_every_filling_begins_with_the_source() -> None:
-    with ThreadPoolExecutor(2) as workers:
-        sample = Sample(HalfCounts(4), 10**7, workers)
-        once = sample.filled(FILL_SETTINGS, 2)
-        twice = sample.filled(FILL_SETTINGS, 1).filled(FILL_SETTINGS, 2)
-    for first, second in zip(once.tiles, twice.tiles, strict=True):
-        np.testing.assert_array_equal(first.values, second.values)
 
 
 def test_what_was_coded_before_is_not_coded_again(monkeypatch: pytest.MonkeyPatch) -> None:

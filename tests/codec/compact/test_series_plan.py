@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +14,8 @@ from fhash_codec.compact.transform import usual_transform
 from fhash_codec.features.features import Extent
 from fhash_codec.progress import silent
 from fhash_formats.container.record import Record
-from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import ArraySeries
 from fhash_formats.support.threads import thread_pool
-from fhash_formats.transform.spec import AxisTransform, TransformSpec, fit_basis
 from fhash_formats.transform.tile_format import TileSettings
 
 TILE = (2, 4, 4, 4)
@@ -29,44 +26,6 @@ FILLED = replace(RECIPE, filling=Filling(settings=replace(SETTINGS, step=0.2), d
 
 def read(values) -> Recipe:
     return Recipe.from_dict(Record(values, "recipe."))
-
-
-@pytest.mark.parametrize("recipe", [RECIPE, FILLED])
-def test_a_recipe_comes_back_from_json(recipe) -> None:
-    assert read(json.loads(json.dumps(recipe.to_dict()))) == recipe
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("tile", [2, 4, 4]),
-        ("tile", [2, 4, 4, 0]),
-        ("settings", []),
-        ("settings", {"step": 1}),
-        ("coding", {}),
-        ("coding", {**vars(Coding()), "filled": 1}),
-        ("coding", {**vars(Coding()), "rounds": -1}),
-        ("coding", {**vars(Coding()), "density": 3}),
-        ("coding", {**vars(Coding()), "density": 0}),
-        ("coding", {**vars(Coding()), "error": "a"}),
-        ("coding", {**vars(Coding()), "error": -1.0}),
-        ("filling", {"settings": {}, "density": 1}),
-        ("filling", 3),
-    ],
-)
-def test_other_values_are_refused(key, value) -> None:
-    with pytest.raises((DamagedFileError, InputError)):
-        read({**FILLED.to_dict(), key: value})
-
-
-def test_a_basis_of_another_length_is_refused() -> None:
-    basis = fit_basis(np.eye(4) + 0.1, 0.1)
-    t, z, _, x = SETTINGS.transform.axes
-    axes = (t, z, AxisTransform(kind="klt", basis=basis), x)
-    own = replace(RECIPE, settings=replace(SETTINGS, transform=TransformSpec(axes=axes)))
-    assert read(own.to_dict()).to_dict() == own.to_dict()
-    with pytest.raises(InputError, match="the basis along y is for 4 vertices, the tile has 5"):
-        read({**own.to_dict(), "tile": [2, 4, 5, 4]})
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, FILLED])

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,70 +21,18 @@ from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.head import EFFORTS, Budget, Effort
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
-    PLATEAU,
-    choose_filling,
-    choose_step,
     choose_tiles,
     coarser_bases,
-    fill_tiles,
     first_guess,
     first_settings,
     mask_levels,
-    mean_center,
-    plateau_center,
-    try_head,
-    try_predictor,
 )
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Coding, Index, Tile
-from fhash_codec.compact.transform import Bases, basis_bytes, refit, usual_transform
+from fhash_codec.compact.transform import Bases, basis_bytes, usual_transform
 from fhash_codec.features.features import dilate, parse_feature
-from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.transform.encoding import OFFSETS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
-
-RANGE = ValueRange(low=0.0, high=8.0)
-
-
-def sample_of(*tiles: tuple[Any, Any, int]) -> Any:
-    """A sample of tiles: values, which count, and the number of tiles that each stands for."""
-    return SimpleNamespace(
-        tiles=[Tile(np.asarray(values, np.float32), counted) for values, counted, _ in tiles],
-        weights=[weight for _, _, weight in tiles],
-    )
-
-
-def with_plateau(share: float) -> np.ndarray:
-    """Values that are spread over the range, but a share of them, which is 1.5."""
-    values = np.linspace(0, 8, 10_000, dtype=np.float32)
-    values[: round(share * values.size)] = 1.5
-    return values.reshape(1, 1, 100, 100)
-
-
-def test_a_plateau_is_the_centre_from_its_share_on() -> None:
-    assert plateau_center(sample_of((with_plateau(PLATEAU + 0.01), None, 1)), RANGE) == 1.5
-    assert plateau_center(sample_of((with_plateau(PLATEAU - 0.01), None, 1)), RANGE) is None
-
-
-def test_tiles_count_by_what_they_stand_for_and_by_their_vertices() -> None:
-    none, half = with_plateau(0.0), with_plateau(0.5)
-    assert plateau_center(sample_of((none, None, 99), (half, None, 1)), RANGE) is None
-    assert plateau_center(sample_of((none, None, 1), (half, None, 1)), RANGE) == 1.5
-    assert plateau_center(sample_of((half, half != 1.5, 1)), RANGE) is None
-    assert mean_center(sample_of((half, half == 1.5, 1)), RANGE) == 1.5
-
-
-@pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
-def test_missing_values_and_constants_have_no_plateau() -> None:
-    missing = np.full((1, 1, 2, 2), np.nan)
-    assert plateau_center(sample_of((missing, None, 1)), RANGE) is None
-    assert mean_center(sample_of((missing, None, 1)), RANGE) == 4.0
-    same = ValueRange(low=3.0, high=3.0)
-    assert plateau_center(sample_of((np.full((1, 1, 2, 2), 3.0), None, 1)), same) is None
-    with_gap = with_plateau(0.5)
-    with_gap[..., -1] = np.nan
-    assert plateau_center(sample_of((with_gap, None, 1)), RANGE) == 1.5
 
 
 @pytest.mark.parametrize("effort", [1, 2])
@@ -157,93 +104,7 @@ def test_bases_that_are_too_fine_become_coarser(workers: ThreadPoolExecutor) -> 
     assert new.psnr(GOAL.data_range) == pytest.approx(40.0, abs=0.2)
 
 
-def test_bases_that_do_not_pay_are_left_alone(workers: ThreadPoolExecutor) -> None:
-    sample = Sample(Patterns(), 1 << 20, workers)
-    settings = begun(sample, 1.0)
-    coarse = refit(sample, settings, 40.0)
-    coarse, outcome = find_step(sample, coarse, Coding(), GOAL, tries=6)
-    found = coarser_bases(sample, coarse, outcome, Coding(), GOAL)
-    if found is None:
-        return
-    chosen, new = found
-    total = new.size + basis_bytes(chosen.transform)
-    # They are coarser already than any that is tried. Finer ones of more bytes come out only where
-    # with these no step keeps the promise.
-    missed = outcome.psnr(GOAL.data_range) < 39.8
-    assert missed or total <= 1.02 * (outcome.size + basis_bytes(coarse.transform))
-    assert new.psnr(GOAL.data_range) >= min(outcome.psnr(GOAL.data_range), 39.8)
-
-
-def test_without_bases_nothing_is_tried(workers: ThreadPoolExecutor) -> None:
-    sample = Sample(Patterns(), 1 << 20, workers)
-    settings = TileSettings(
-        transform=usual_transform(Patterns.tile), step=0.3, center=0.0, low=-4.0, high=4.0
-    )
-    settings, outcome = find_step(sample, settings, Coding(), GOAL, tries=3)
-    assert coarser_bases(sample, settings, outcome, Coding(), GOAL) is None
-
-
-def test_a_file_with_coarser_bases_keeps_its_promise(tmp_path: Path) -> None:
-    values = Patterns().read((0, 0, 0, 0)).values
-    report = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=40.0, effort=2))
-    assert report["psnr"] >= 40.0
-    whats = [gain["what"] for gain in report["gains"]]
-    assert {"coarser bases", "coarser bases (left out)"} & {*whats} or "klt" not in str(
-        fhash_codec.open(tmp_path / "a.fhz").container.arrays["tables/level_1"].settings
-    )
-
-
-SHAPE = (3, 12, 16, 20)
-SETTINGS = TileSettings(
-    transform=usual_transform(SHAPE), step=0.05, center=0.5, low=0.0, high=1.0, offsets=OFFSETS
-)
-
-
-class Grid:
-    """Two tiles of noise in which a smooth half along z counts."""
-
-    complete, in_memory, shape, tile = False, True, (3, 12, 32, 20), SHAPE
-    dtype = np.dtype(np.float32)
-
-    def indices(self) -> Iterator[Index]:
-        return iter([(0, 0, number, 0) for number in range(2)])
-
-    def weight(self, index: Index) -> int:
-        return 1
-
-    def read(self, index: Index) -> Tile:
-        t, z, y, x = np.indices(SHAPE)
-        noise = np.random.default_rng(index[2]).normal(size=SHAPE)
-        smooth = 0.5 + 0.3 * np.sin(0.3 * x + 0.2 * t) * np.cos(0.2 * y)
-        values = (smooth + 0.15 * noise * (z > 6)).clip(0, 1).astype(np.float32)
-        return Tile(values, z <= 6)
-
-
-def test_a_filling_takes_fewer_bytes_than_noise() -> None:
-    with ThreadPoolExecutor(2) as workers:
-        sample = Sample(Grid(), 10**7, workers)
-        coding = Coding(filled=True, weight=0.09)
-        plain = sample.run(SETTINGS, coding)
-        filled = sample.filled(SETTINGS, 2).run(SETTINGS, coding)
-        assert filled.size < 0.8 * plain.size
-        assert filled.count == plain.count
-
-
-def test_the_chosen_filling_is_no_larger_than_the_existing_values() -> None:
-    with ThreadPoolExecutor(2) as workers:
-        sample = Sample(Grid(), 10**7, workers)
-        goal, coding = Goal(psnr=35.0, data_range=1.0), Coding(filled=True)
-        chosen = choose_filling(sample, SETTINGS, coding, goal, 4)
-        settings = replace(SETTINGS, step=0.06)
-        assert chosen.run(settings, coding).size <= sample.run(settings, coding).size
-
-
 Field = Callable[..., npt.NDArray[Any]]
-
-
-def decoded(path: Path) -> npt.NDArray[Any]:
-    with fhash_codec.open(path) as volume:
-        return volume[...]
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8"])
@@ -269,46 +130,6 @@ def test_the_occupancy_is_exact_at_every_step(
     np.testing.assert_array_equal(np.isfinite(values), requested)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"dilation": 0}, {"features": ("interval:150:400", "isosurface:0")}],
-    ids=str,
-)
-def test_features_that_do_not_follow_from_values_are_exact_as_well(
-    tmp_path: Path, field: Field, options: dict[str, Any]
-) -> None:
-    source = field()
-    mask = np.random.default_rng(5).random(source.shape) < 0.02
-    config = EncodeConfig(effort=1, **options)
-    fhash_codec.encode(source, tmp_path / "a.fhz", config, mask=mask)
-    selected = mask.copy()
-    for text in options.get("features", ()):
-        selected |= np.stack(
-            [parse_feature(text).select(frame, step) for step, frame in enumerate(source)]
-        )
-    requested = np.stack([dilate(frame, config.dilation) for frame in selected])
-    np.testing.assert_array_equal(np.isfinite(decoded(tmp_path / "a.fhz")), requested)
-
-
-def test_huge_values_have_an_exact_occupancy_too(tmp_path: Path, field: Field) -> None:
-    source = field(dtype=np.float64) * 1e200
-    config = EncodeConfig(effort=1, features=("interval:1e202:1e300",), dilation=0)
-    fhash_codec.encode(source, tmp_path / "a.fhz", config)
-    back = decoded(tmp_path / "a.fhz")
-    np.testing.assert_array_equal(np.isfinite(back), source >= 1e202)
-    np.testing.assert_array_equal(back[source >= 1e202], source[source >= 1e202])
-
-
-def test_scores_of_an_interval_rise_inside_it() -> None:
-    levels = mask_levels([parse_feature("interval:0:10")], 1, 0.5, [])
-    edges, scores = np.array(levels.edges), np.array(levels.scores)
-    assert len(scores) == len(edges) + 1
-    inside = scores[np.searchsorted(edges, 5.0, side="right")]
-    at_border = scores[np.searchsorted(edges, 0.01, side="right")]
-    outside = scores[np.searchsorted(edges, -5.0, side="right")]
-    assert outside < at_border < inside
-
-
 def test_scores_of_a_mask_are_learned_from_tiles() -> None:
     values = np.linspace(0, 1, 4000, dtype=np.float32).reshape(1, 10, 20, 20)
     levels = mask_levels([], 1, 0.01, [Tile(values, values > 0.5), Tile(values, None)])
@@ -316,25 +137,6 @@ def test_scores_of_a_mask_are_learned_from_tiles() -> None:
     assert levels.scores[0] < levels.scores[-1]
     nothing = Tile(np.full((1, 1, 1, 1), np.nan), None)
     assert mask_levels([], 1, 0.01, [nothing]).edges == ()
-
-
-def test_the_stages_follow_each_other_and_leave_out_what_does_not_apply(field: Field) -> None:
-    with ThreadPoolExecutor(2) as workers:
-        task = plan_task(field((4, 8, 12, 16)), workers, fixed_tile=(4, 8, 6, 8), psnr=45.0)
-        tiled = task.blocks.retile((4, 8, 6, 8))
-        guess = first_guess(task, tiled, first_settings(task, tiled))
-        attempt = choose_tiles(task, guess)
-        assert attempt.sample.blocks.tile == (4, 8, 6, 8)
-        filled = fill_tiles(task, attempt)
-        assert filled.sample is attempt.sample  # all vertices count
-        attempt = choose_step(task, filled)
-        assert attempt.outcome.psnr(task.goal.data_range) == pytest.approx(45.0, abs=0.3)
-        assert attempt.outcome in attempt.tried
-        # Effort 2 trains no head, and a PSNR has no predictor.
-        assert try_head(task, attempt) is attempt
-        assert try_predictor(task, attempt) is attempt
-    assert [entry["what"] for entry in task.gains.entries] == ["start", "transform by trial"]
-    assert task.gains.entries[1]["bytes"] == attempt.outcome.size + 100
 
 
 def test_transforms_of_a_large_tile_are_tried_at_a_step_of_its_own(
@@ -365,17 +167,6 @@ def test_transforms_of_a_large_tile_are_tried_at_a_step_of_its_own(
     assert steps[0] == pytest.approx(steps[1], rel=0.3)
 
 
-def test_under_a_bound_a_predictor_is_tried(tmp_path: Path, field: Field) -> None:
-    figures = fhash_codec.encode(
-        field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2, max_error_rel=1e-3)
-    )
-    whats = [gain["what"] for gain in figures["gains"]]
-    noted = [what for what in whats if not what.startswith("coarser bases")]
-    assert noted[:2] == ["start", "transform by trial"]
-    assert noted[2] in ("prediction", "prediction (left out)")
-    assert noted[3:] == ["all tiles"]
-
-
 def test_more_effort_is_no_larger_and_keeps_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
 ) -> None:
@@ -393,16 +184,6 @@ def test_more_effort_is_no_larger_and_keeps_the_promise(
     assert sizes[2] < 1.15 * sizes[1]
     assert [gain["what"] for gain in reports[0]["gains"]] == ["all tiles"]
     assert any(gain["what"].startswith("head") for gain in reports[2]["gains"])
-
-
-def test_a_coreset_of_integers_is_filled_anew_for_all_tiles(tmp_path: Path, field: Field) -> None:
-    """Rounded fill values would cost more than those that they were rounded from."""
-    source = np.rint(field((3, 6, 10, 12))).astype(np.int16)
-    config = EncodeConfig(effort=2, psnr=45.0, features=("interval:0:400",))
-    fhash_codec.encode(source, tmp_path / "a.fhz", config)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume[...].dtype.kind == "f"  # NaN outside the coreset
-        assert volume.verify() == len(volume.info["arrays"])
 
 
 def _stages(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -429,14 +210,3 @@ def test_a_stage_that_is_switched_off_is_never_entered(field: Field, tmp_path: P
     assert {with_all[name]["times"] for name in ("transform", "filling", "predictor", "ssim")} == {
         1
     }
-
-
-def test_the_seconds_of_the_stages_are_those_of_the_whole(field: Field, tmp_path: Path) -> None:
-    report = fhash_codec.encode(field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2))
-    assert sum(entry["seconds"] for entry in report["stages"]) == pytest.approx(
-        report["seconds"], rel=0.05, abs=0.02
-    )
-    stages = _stages(report)
-    assert {"scan", "features", "bulk", "first guess", "transform", "step", "coding"} <= set(stages)
-    assert stages["head"]["why"] == "effort 2 trains none; from 5 on"
-    assert stages["measuring"]["times"] == stages["ssim"]["times"] == 1

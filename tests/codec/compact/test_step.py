@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fhash_codec.compact.goal import EXCHANGE, Goal
+from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.step import (
-    allows_trellis,
     is_smaller,
-    octave_gain,
     off_trellis,
     on_trellis,
     plain_step,
-    step_after,
     with_step,
 )
 from fhash_codec.compact.tiles import Coding, Outcome
@@ -29,16 +25,6 @@ from fhash_formats.transform.tile_format import TileSettings
 
 def outcome(size: int, psnr: float) -> Outcome:
     return Outcome(size=size, squares=10 ** (-psnr / 10) * 100, count=100, max_error=1.0)
-
-
-def test_the_last_two_outcomes_tell_what_an_octave_buys() -> None:
-    tried = [outcome(100, 30.0), outcome(1000, 40.0), outcome(2000, 46.0)]
-    assert octave_gain(tried, 1.0) == pytest.approx(6.0)
-
-
-def test_one_outcome_and_empty_ones_tell_nothing() -> None:
-    assert octave_gain([outcome(1000, 40.0)], 1.0) == EXCHANGE
-    assert octave_gain([outcome(0, 40.0), outcome(1000, 46.0)], 1.0) == EXCHANGE
 
 
 NONE = AxisTransform(kind="none")
@@ -61,21 +47,6 @@ def test_the_way_to_the_trellis_and_back() -> None:
     back, plain = off_trellis(settings, coding)
     assert replace(back, step=0.1) == SETTINGS
     assert plain == Coding()
-
-
-def test_exact_values_and_the_finest_steps_stay_plain() -> None:
-    assert allows_trellis(SETTINGS, GOAL, 2)
-    assert not allows_trellis(SETTINGS, GOAL, 1)
-    assert not allows_trellis(replace(SETTINGS, double=True), GOAL, 9)
-    assert not allows_trellis(SETTINGS, Goal(error=0.0, data_range=1.0), 9)
-
-
-def test_a_psnr_above_the_promise_makes_the_step_larger() -> None:
-    assert step_after(SETTINGS, outcome(1000, 41.0), GOAL) > SETTINGS.step
-    assert step_after(SETTINGS, outcome(1000, 40.0), GOAL) == pytest.approx(SETTINGS.step)
-    exact = outcome(1000, math.inf)
-    assert step_after(SETTINGS, exact, GOAL) == SETTINGS.step
-    assert step_after(SETTINGS, outcome(9, 9.0), Goal(error=0.1, data_range=1.0)) == 0.1
 
 
 def test_bytes_are_compared_at_the_same_quality() -> None:

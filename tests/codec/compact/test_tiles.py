@@ -20,7 +20,6 @@ from fhash_codec.compact.tiles import (
     Tile,
     TileRun,
     code,
-    total,
 )
 from fhash_codec.compact.transform import usual_transform
 from fhash_codec.config import EncodeConfig
@@ -60,20 +59,6 @@ def test_tiles_make_up_the_box_and_repeat_its_border(
         else:
             np.testing.assert_array_equal(tile.counted, inside[span])
         assert tile.counted_vertices == np.count_nonzero(inside[span])
-
-
-def test_vertices_outside_the_coreset_do_not_count() -> None:
-    blocks = blocks_of(SHAPE, ("interval:0:10",))
-    tile = blocks.read((0, 0, 0, 0))
-    assert not blocks.complete
-    np.testing.assert_array_equal(tile.counted, tile.values >= 0)
-    other = blocks.retile((1, 6, 7, 8))
-    np.testing.assert_array_equal(other.read((3, 0, 0, 0)).counted, tile.counted[3:4])
-
-
-def test_a_tile_is_empty_where_no_vertex_counts() -> None:
-    assert Tile(VALUES, np.zeros(SHAPE, bool)).is_empty
-    assert not Tile(VALUES, None).is_empty
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
@@ -128,25 +113,6 @@ def test_a_window_is_the_part_where_values_vary_most(
     np.testing.assert_array_equal(half.read((0, 0, 0, 1)).values, VALUES[1:4, :, :, 6:])
 
 
-def test_by_layers_only_the_layer_that_is_asked_for_is_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    blocks = blocks_of((2, 4, 7, 5))
-    read: list[int] = []
-    usual = StepsSeries.read
-    monkeypatch.setattr(
-        StepsSeries, "read", lambda self, step: read.append(step) or usual(self, step)
-    )
-    layers = blocks.by_layers()
-    assert not layers.in_memory
-    for index in [(1, 0, 0, 0), (1, 1, 0, 1)]:
-        tile = layers.read(index)
-        assert read == [2, 3]
-        assert blocks.in_memory
-        first = VALUES[2:4, 4 * index[1], 0, 5 * index[3]]
-        np.testing.assert_array_equal(tile.values[:, 0, 0, 0], first)
-
-
 @pytest.mark.parametrize("features", [("all",), ("interval:0:1",)])
 def test_an_array_in_memory_is_neither_copied_nor_written(features: tuple[str, ...]) -> None:
     array = VALUES.copy()
@@ -188,35 +154,6 @@ def test_the_outcome_is_that_of_the_decoded_values() -> None:
     assert outcome.max_error == pytest.approx(np.abs(errors).max())
     expected = 10 * math.log10(9.0 / (errors**2).mean())
     assert outcome.psnr(3.0) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("high", [1e-200, 1e-310])
-def test_a_range_whose_scale_has_no_square_is_measured(high: float) -> None:
-    """Settings of a file that grows may be of any range."""
-    settings = replace(SETTINGS, low=0.0, high=high)
-    coded, outcome = code(Tile(VALUES_CODING, None), settings, Coding())
-    assert coded.decoded.max() == pytest.approx(high, abs=1e-38)
-    assert outcome.max_error == pytest.approx(np.abs(VALUES_CODING).max())
-    assert outcome.squares > 1
-
-
-def test_an_exact_tile_has_no_error() -> None:
-    coded, outcome = code(
-        Tile(VALUES_CODING, None), replace(SETTINGS, double=True), Coding(exact=True)
-    )
-    np.testing.assert_array_equal(coded.decoded, VALUES_CODING)
-    assert (outcome.squares, outcome.max_error, outcome.count) == (0.0, 0.0, VALUES_CODING.size)
-    assert outcome.psnr(1.0) == math.inf
-
-
-def test_outcomes_add_up_by_their_weights() -> None:
-    first = Outcome(size=3, squares=1.0, count=10, max_error=0.5, nonzero=2)
-    second = Outcome(size=5, squares=2.0, count=20, max_error=0.1, nonzero=1)
-    assert total([first, second], [2, 3]) == Outcome(
-        size=21, squares=8.0, count=80, max_error=0.5, nonzero=7
-    )
-    assert total([first]) == first
-    assert total([]).size == 0
 
 
 def lattice_values(kind: str) -> np.ndarray:
@@ -271,15 +208,6 @@ OUTCOME = Outcome(size=3, squares=1.0, count=10, max_error=0.5)
 
 def run(settings: TileSettings, coding: Coding, stream: bytes = b"abc") -> Run:
     return Run(settings, coding, [TileRun(stream, OUTCOME)])
-
-
-def test_equal_settings_are_known_and_others_are_not() -> None:
-    runs = Known()
-    first = run(SETTINGS_KNOWN, Coding())
-    runs.keep(first)
-    assert runs.run(replace(SETTINGS_KNOWN), Coding()) is first
-    assert runs.run(replace(SETTINGS_KNOWN, step=1.5), Coding()) is None
-    assert runs.run(SETTINGS_KNOWN, Coding(passes=2)) is None
 
 
 def test_a_head_changes_no_stream_but_under_a_bound() -> None:

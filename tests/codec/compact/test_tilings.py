@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from fhash_codec.compact import tilings
 from fhash_codec.compact import tilings as tiling_trials
 from fhash_codec.compact.attempt import PRICES, PlanTask, Tiling, region_vertices
 from fhash_codec.compact.stages import first_guess, first_settings
-from fhash_codec.compact.tilings import FAR, Trials, choose_tiling, largest_tile
+from fhash_codec.compact.tilings import Trials, choose_tiling, largest_tile
 from fhash_codec.config import ACCESSES
 
 Values = npt.NDArray[Any]
@@ -46,16 +45,6 @@ def trials_on(
     return Trials(task, blocks, guess.settings, guess.coding)
 
 
-def test_a_tiling_is_coded_once(
-    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trials = trials_on(waves((4, 8, 16, 16)), workers)
-    size = trials.size((4, 8, 8, 8))
-    monkeypatch.setattr(Trials, "_picked", lambda *_: pytest.fail("coded again"))
-    assert trials.size((4, 8, 8, 8)) == size
-    assert trials.sizes == {(4, 8, 8, 8): size}
-
-
 def test_more_cuts_take_more_bytes(workers: ThreadPoolExecutor) -> None:
     trials = trials_on(waves((8, 16, 32, 32)), workers)
     trials.settle((8, 16, 16, 16))
@@ -69,38 +58,6 @@ def test_all_boxes_of_a_series_take_the_bytes_of_the_series(workers: ThreadPoolE
     values = waves((8, 8, 24, 24))
     tile = (2, 8, 12, 12)
     assert trials_on(values, workers, boxes=2).size(tile) == trials_on(values, workers).size(tile)
-
-
-def test_a_box_counts_as_often_as_its_weight(workers: ThreadPoolExecutor) -> None:
-    values = waves((4, 8, 24, 24))
-    trials = trials_on(values, workers)
-    once = trials.size((4, 8, 24, 24))
-    trials._blocks = trials._blocks.boxes(trials.shape, [(0, 0, 0, 0)], [5])
-    trials.sizes.clear()
-    bases = 0.1 * once  # which the file has once
-    assert trials.size((4, 8, 24, 24)) == pytest.approx(5 * once, abs=5 * bases)
-
-
-def test_a_tiling_far_from_the_quality_of_the_first_is_coded_with_another_step(
-    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values = np.random.default_rng(2).normal(size=(4, 8, 24, 24)).astype(np.float32)
-    trials = trials_on(values, workers)
-    settled = trials.settle(None)
-    first = trials.sizes.pop((4, 8, 24, 24))
-    steps = []
-    noted = Trials._note
-
-    def note(self: Trials, sample: Any, outcome: Any, settings: Any) -> None:
-        steps.append(settings.step)
-        assert self._missing(outcome) < 2.0 - FAR
-        noted(self, sample, outcome, settings)
-
-    monkeypatch.setattr(Trials, "_note", note)
-    assert trials._psnr is not None
-    trials._psnr += 2.0  # as if the first one had been that much better
-    assert trials.size((4, 8, 24, 24)) > first
-    assert steps[0] < 0.8 * settled.step
 
 
 def test_under_a_bound_one_tile_keeps_it_with_bases_that_were_fitted_again(
@@ -124,13 +81,6 @@ def test_under_a_bound_one_tile_keeps_it_with_bases_that_were_fitted_again(
     assert max(errors) <= 0.5
 
 
-@pytest.mark.parametrize("promise", [{"max_error_rel": 0.02}, {"ratio": 20.0}])
-def test_other_promises_have_sizes(promise: dict[str, float], workers: ThreadPoolExecutor) -> None:
-    trials = trials_on(waves((4, 8, 16, 16)), workers, **promise)
-    trials.settle(None)
-    assert 0 < trials.size((4, 8, 16, 16)) < trials.size((1, 4, 8, 8))
-
-
 def shell() -> Values:
     """A plateau with a thin shell that grows unevenly; constant at the first step."""
     z, y, x = np.mgrid[:24, :24, :24].astype(np.float32)
@@ -142,10 +92,6 @@ def shell() -> Values:
 
 def noise() -> Values:
     return np.random.default_rng(3).normal(size=(4, 24, 32, 32)).astype(np.float32)
-
-
-def labels() -> Values:
-    return (waves((6, 24, 32, 32)) * 3).astype(np.uint8)
 
 
 KINDS: dict[str, Callable[[], Values]] = {
@@ -207,11 +153,6 @@ def test_a_wish_is_kept_and_faster_ones_have_faster_regions(
     assert works == sorted(works)
 
 
-def test_a_series_that_is_read_in_a_moment_is_one_tile(workers: ThreadPoolExecutor) -> None:
-    tiling, task = chosen(waves((4, 8, 12, 16)), "fast", workers)
-    assert (tiling.tile, tiling.price, tiling.trials) == (task.blocks.shape, 1.0, [])
-
-
 def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make a series of a million vertices a large one."""
     for module in (tilings, access):
@@ -243,37 +184,6 @@ def test_a_large_series_is_tried_on_parts_of_few_steps_and_of_many(
     assert prices[base] > 1.5 * prices[tiling.tile]
 
 
-def test_many_steps_of_a_large_series_are_for_nothing_in_noise(
-    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small_limits(monkeypatch)
-    values = np.random.default_rng(3).normal(size=(64, 32, 32, 32)).astype(np.float32)
-    tiling, task = chosen(values, "balanced", workers, psnr=25.0)
-    assert tiling.tile[0] <= largest_tile(task.blocks.shape)[0]
-    assert all(prod(trial.tile) <= 1 << 18 for trial in tiling.trials)
-
-
-def test_a_large_series_of_few_steps_has_one_part(
-    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small_limits(monkeypatch)
-    tiling, task = chosen(waves((2, 64, 80, 80)), "balanced", workers)
-    assert tiling.parts == [largest_tile(task.blocks.shape)]
-    assert tiling.parts[0] in [trial.tile for trial in tiling.trials]
-
-
-def test_no_layer_of_tiles_is_longer_than_the_cache_of_a_reader(
-    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A reader that goes from step to step would decode such tiles again for each step."""
-    small_limits(monkeypatch)
-    values = slow_drift()
-    steps = 24
-    monkeypatch.setattr(tilings, "CACHE_BYTES", steps * values[0].nbytes)
-    tiling, _ = chosen(values, "small", workers, psnr=25.0)
-    assert all(trial.tile[0] <= steps for trial in tiling.trials)
-
-
 def test_a_series_larger_than_memory_is_tried_on_windows(
     workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,48 +192,3 @@ def test_a_series_larger_than_memory_is_tried_on_windows(
     tiling, _ = chosen(slow_drift(), "balanced", workers, psnr=25.0)
     assert tiling.price is not None
     assert tiling.tile[0] > 8
-
-
-@pytest.mark.parametrize("promise", [{"max_error_rel": 0.01}, {"max_error": 0.0}, {"ratio": 20.0}])
-def test_every_promise_has_a_price(
-    promise: dict[str, float], workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
-    tiling, _ = chosen(shell(), "balanced", workers, **promise)
-    assert tiling.price is not None
-    assert 1 <= tiling.price <= PRICES["balanced"]
-
-
-def test_steep_cuts_are_told_from_flat_ones() -> None:
-    """Four steps as good as twelve say little of one: further trials do."""
-    shape = (12, 8, 64, 64)
-    in_time, in_space = (4, 8, 64, 64), (12, 8, 32, 32)
-    cuts = [
-        tilings._Cuts(shape, in_time, (0,), 0.03),
-        tilings._Cuts(shape, in_space, (1, 2, 3), 0.1),
-    ]
-    found = {shape: 1.0, in_time: 1.03, in_space: 1.1, (1, 8, 64, 64): 1.4}
-    assert cuts[0].extra((1, 8, 64, 64)) < 0.15
-    tilings._fit(cuts, found)
-    assert cuts[0].extra((1, 8, 64, 64)) > 0.3
-    assert cuts[0].extra(in_time) < 0.06
-    assert cuts[1].extra(in_space) == pytest.approx(0.1, abs=0.03)
-
-
-def test_labels_are_tried_as_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 12)
-    values = labels()
-    for effort, tried in ((1, False), (2, True)):
-        config = EncodeConfig(effort=effort, max_error=0.0)
-        fhash_codec.encode(values, tmp_path / "a.fhz", config, force=True)
-        with fhash_codec.open(tmp_path / "a.fhz") as volume:
-            np.testing.assert_array_equal(volume[...], values)
-            assert (volume.info["model"]["tiling"]["tried"] > 0) == tried
-
-
-def test_some_vertices_may_be_outside_the_coreset(tmp_path: Path) -> None:
-    values = waves((4, 24, 32, 32))
-    config = EncodeConfig(effort=2, psnr=40.0, features=("interval:0:9",))
-    fhash_codec.encode(values, tmp_path / "a.fhz", config)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume.info["model"]["tiling"]["price"] <= PRICES["balanced"]

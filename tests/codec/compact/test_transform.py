@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,15 +13,12 @@ import pytest
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile
 from fhash_codec.compact.transform import (
-    MAX_BASIS_LENGTH,
     Bases,
-    CountedBases,
     Gram,
     choose_transform,
     estimated_step,
     gram_of,
     likely_transform,
-    magnitudes,
     refit,
     usual_transform,
 )
@@ -74,35 +70,6 @@ def test_a_basis_holds_the_lines_of_its_axis(axis: int, lines: int | None) -> No
     vector, line = basis.synthesis.reshape(-1), sample.lines[axis]
     overlap = abs(vector @ line) / np.linalg.norm(vector) / np.linalg.norm(line)
     assert overlap == pytest.approx(1.0, abs=1e-3)
-
-
-def test_long_axes_and_single_vertices_have_none() -> None:
-    bases = Bases(OneTile(), SETTINGS)
-    assert bases.possible(2, MAX_BASIS_LENGTH)
-    assert not bases.possible(1, 5)
-    assert not bases.possible(5, MAX_BASIS_LENGTH + 1)
-    assert not CountedBases(in_memory=False).possible(5)
-    counted = CountedBases(in_memory=True)
-    counted.along(2)
-    assert counted.fitted == {2}
-
-
-def test_the_error_is_that_of_a_dead_zone_and_uniform_rounding() -> None:
-    coefficients = np.random.default_rng(0).laplace(size=200_000).astype(np.float32)
-    histogram = magnitudes(coefficients)
-    for step in (0.01, 0.5, 4.0):
-        dead = np.abs(coefficients) < 0.8 * step
-        expected = np.square(
-            coefficients[dead], dtype=np.float64
-        ).sum() + 0.1 * step**2 * np.count_nonzero(~dead)
-        assert histogram.error(step) == pytest.approx(expected, rel=0.02)
-        assert histogram.step(histogram.error(step), 1e-6) == pytest.approx(step, rel=1e-3)
-
-
-def test_zeros_have_no_error() -> None:
-    histogram = magnitudes(np.zeros(100, np.float32))
-    assert histogram.error(1.0) == 0.0
-    assert math.isfinite(histogram.step(1.0, 1e-3))
 
 
 @pytest.mark.parametrize("tile", [(6, 10, 20, 20), (6, 20, 40, 40)], ids=str)
@@ -159,14 +126,6 @@ def test_lines_are_added_one_after_the_other(
     # Sums of n products in another order differ by n roundings of the largest sum at most.
     bound = lines.shape[1] * np.finfo(np.float64).eps * np.max(np.sum(lines * lines, axis=1))
     np.testing.assert_allclose(gram, lines @ lines.T, rtol=0, atol=bound)
-
-
-def test_values_beyond_the_type_leave_a_matrix_that_is_symmetric() -> None:
-    values = np.full((1, 3, 2), 1e200)
-    values[0, 1] = -1e200
-    gram = gram_of(values, 0.0)
-    np.testing.assert_array_equal(gram, gram.T)
-    assert np.isinf(gram[0, 0])
 
 
 class Hats:
@@ -241,31 +200,3 @@ def test_a_likely_transform_is_found_by_four_trials() -> None:
         )
         # A series that is not in memory has no bases, and keeps the usual transform.
         assert likely_transform(sample, settings, Coding()) == settings
-
-
-class MovingSpikes:
-    """Spikes that jump in time and in space: no transform of time or z does any good."""
-
-    shape = tile = (6, 12, 24, 24)
-    in_memory = False
-
-    def indices(self) -> Iterator[Index]:
-        return iter([(0, 0, 0, 0)])
-
-    def weight(self, index: Index) -> int:
-        return 1
-
-    def read(self, index: Index) -> Tile:
-        values = np.random.default_rng(4).normal(size=self.tile)
-        return Tile(np.where(np.abs(values) > 2.5, values, 0).astype(np.float32), None)
-
-
-def test_time_is_looked_at_again_after_z() -> None:
-    settings = TileSettings(
-        transform=usual_transform(MovingSpikes.tile), step=0.5, center=0.0, low=-5.0, high=5.0
-    )
-    with ThreadPoolExecutor(1) as workers:
-        sample = Sample(MovingSpikes(), 1 << 20, workers)
-        chosen, _ = choose_transform(sample, settings, Coding())
-    t, z, _, _ = chosen.transform.axes
-    assert (t.kind, z.kind) == ("none", "none")

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from fhash_codec.features.occupancy import (
-    between,
-    bit_order,
     morton_index,
     pack,
     packed_bytes,
@@ -63,25 +61,3 @@ def test_unpack_inverts_pack_and_the_index_is_injective(shape) -> None:
     np.testing.assert_array_equal(unpack(bits, shape), mask)
     assert np.unique(morton_index(*np.indices(shape), shape)).size == mask.size
     assert np.unpackbits(bits).sum() == mask.sum()
-
-
-def test_pack_takes_views() -> None:
-    mask = random_mask((6, 9, 12))
-    view = mask[1:6, 2:9:2, ::-1]
-    np.testing.assert_array_equal(pack(view), pack(np.ascontiguousarray(view)))
-
-
-def test_thin_boxes_do_not_pay_for_the_thick_ones() -> None:
-    assert packed_bytes((25, 125, 125)) == 65_536
-    assert packed_bytes((1, 1, 1)) == 1
-    assert packed_bytes((1, 1024, 1024)) == 131_072
-
-
-def test_bit_order_goes_x_y_z_and_passes_over_an_axis_that_has_run_out() -> None:
-    assert bit_order((2, 4, 16)) == [(2, 0), (1, 0), (0, 0), (2, 1), (1, 1), (2, 2), (2, 3)]
-
-
-def test_between_key_frames_either_occupies() -> None:
-    a, b = random_mask((5, 6, 7), 1), random_mask((5, 6, 7), 2)
-    np.testing.assert_array_equal(unpack(between(pack(a), pack(b)), (5, 6, 7)), a | b)
-    np.testing.assert_array_equal(between(pack(a), pack(a)), pack(a))

@@ -72,23 +72,6 @@ def test_vertices_that_a_key_frame_lacks_have_no_interpolated_source() -> None:
     assert quality.psnr_linear is not None
 
 
-def test_two_key_frames_are_read_once_for_all_steps_between_them() -> None:
-    read = []
-
-    def frame(step: int) -> np.ndarray:
-        read.append(step)
-        return SOURCE[step]
-
-    near = neighbours(read=frame)
-    for step in range(7):
-        assert (near(step) is None) == (step in KEY_FRAMES)
-    assert read == [1, 3, 4]
-
-
-def test_without_steps_between_key_frames_there_are_no_figures() -> None:
-    assert measure_quality(SOURCE.__getitem__, decoded, 7, 1.0, 0.0).between is None
-
-
 def test_huge_values_are_interpolated_without_overflow() -> None:
     huge = np.full((7, 1, 1, 1), np.finfo(np.float64).max)
     near = neighbours_of(KEY_FRAMES, key_index, huge.__getitem__, lambda step: huge[0] > 0)
@@ -173,38 +156,6 @@ def test_the_bulk_is_measured_within_its_range_and_the_coreset() -> None:
         "rmse": quality.bulk.rmse,
         "range": [0.25, 0.75],
     }
-
-
-def test_a_bulk_without_error_or_without_vertices_has_no_psnr() -> None:
-    original, _ = frames(2)
-    read = original.__getitem__
-    exact = measure_quality(read, read, 2, 1.0, 0.5, bulk=ValueRange(0.25, 0.75)).bulk
-    assert (exact.psnr, exact.rmse) == (None, 0.0)
-    empty = measure_quality(read, read, 2, 1.0, 0.5, bulk=ValueRange(5.0, 6.0)).bulk
-    assert (empty.psnr, empty.rmse) == (None, None)
-    assert measure_quality(read, read, 2, 1.0, 0.5).bulk is None
-
-
-@pytest.mark.parametrize(("data_range", "value"), [(0.0, 3.0), (math.inf, 1e308)])
-def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, value) -> None:
-    frame = np.full((3, 3, 3), value)
-    quality = measure_quality(lambda _: frame, lambda _: frame, 2, data_range, 0.0)
-    assert (quality.psnr, quality.rmse, quality.ssim) == (None, 0.0, None)
-    json.dumps(quality.to_dict(), allow_nan=False)
-
-
-def test_quality_of_nothing_kept() -> None:
-    original, _ = frames(2)
-    quality = measure_quality(
-        original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5
-    )
-    assert (quality.psnr, quality.rmse, quality.max_abs_error, quality.ssim) == (
-        None,
-        None,
-        None,
-        None,
-    )
-    assert quality.rmse_domain == pytest.approx(math.sqrt(np.mean((original - 0.5) ** 2)))
 
 
 @pytest.mark.parametrize("held", [1, 8])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, QualityError
+from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
 from fhash_codec.paper.encode import select, sparse_tables
 from fhash_codec.progress import silent
@@ -42,31 +42,6 @@ def test_tables_get_the_promise_only_if_every_step_is_a_key_frame(
 
 
 @pytest.mark.parametrize(
-    ("key_frames", "advice"), [("all", "More --epochs may help"), ("0,2", "key frames are trained")]
-)
-def test_a_missed_promise_says_what_may_help(tmp_path, key_frames, advice) -> None:
-    config = EncodeConfig(profile="paper", epochs=1, width=8, psnr=150.0, key_frames=key_frames)
-    field = np.random.default_rng(0).random((3, 4, 5, 6), dtype=np.float32)
-    with pytest.raises(QualityError, match=advice):
-        fhash_codec.encode(field, tmp_path / "a.fhz", config)
-
-
-def test_the_history_is_about_the_coreset_alone(tmp_path) -> None:
-    """Its last point is the PSNR of the file, which has no fringe to measure."""
-    field = np.random.default_rng(0).random((6, 8, 9, 10), dtype=np.float32)
-    config = EncodeConfig(
-        profile="paper",
-        epochs=3,
-        width=8,
-        tables="float32",
-        features=("interval:0.9:1",),
-        dilation=0,
-    )
-    figures = fhash_codec.encode(field, tmp_path / "a.fhz", config)
-    assert figures["curve"][-1]["psnr"] == pytest.approx(figures["psnr"], abs=0.02)
-
-
-@pytest.mark.parametrize(
     ("tables", "share", "expected"),
     [
         ("float16", 0.49, True),
@@ -85,27 +60,6 @@ def test_tables_are_sparse_below_half_of_the_box(tables, share, expected) -> Non
     coreset = Mock(box=box, key_frames=(0, 3), values=np.zeros(round(1000 * share)))
     config = EncodeConfig(profile="paper", tables=tables)
     assert sparse_tables(coreset, config) == expected
-
-
-@pytest.mark.parametrize(("low", "expected"), [(0.4, False), (0.8, True)])
-def test_a_file_says_which_tables_it_has(tmp_path, low, expected) -> None:
-    field = np.random.default_rng(0).random((3, 8, 9, 10), dtype=np.float32)
-    config = EncodeConfig(
-        profile="paper",
-        epochs=1,
-        width=8,
-        features=(f"interval:{low}:1",),
-        dilation=0,
-        fringe="untrained",
-    )
-    figures = fhash_codec.encode(field, tmp_path / "a.fhz", config)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        model = volume.info["model"]
-        assert ("sparse" in model) == expected
-        assert model["tables"] == "float16"
-        dense = 2 * sum(np.prod(level) for level in model["levels"]) + volume.mlp.parameters
-        assert (model["parameters"] < dense) == expected
-        assert figures["psnr"] == pytest.approx(volume.info["quality"]["psnr"], abs=1e-3)
 
 
 def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
@@ -127,13 +81,3 @@ def test_the_architecture_is_that_of_the_box_and_the_key_frames() -> None:
     assert architecture.sizes == (len(selection.coreset.key_frames), 5, 5, 11)
     assert len(architecture.levels) == 3  # ceil(log3 11)
     assert (architecture.embedding_size, architecture.width) == (3, 8)
-
-
-def test_a_mask_is_a_feature() -> None:
-    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
-    mask = np.zeros((4, 5, 6), bool)
-    mask[1, 2:4, 3] = True
-    config = EncodeConfig(profile="paper", dilation=0)
-    selection = select(ArraySeries(field), config, silent, mask)
-    assert selection.coreset.box == ((1, 2), (2, 4), (3, 4))
-    assert len(selection.coreset.values) == 4

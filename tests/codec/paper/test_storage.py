@@ -17,7 +17,6 @@ from fhash_codec.paper.network import Architecture
 from fhash_codec.paper.storage import (
     StoredTable,
     fringe_step,
-    mix_components,
     round_fringe,
     table_chunk,
     write_tables,
@@ -118,12 +117,6 @@ def test_numbers_that_are_not_finite_are_refused(coreset_storage, kind, value) -
         written(coreset_storage, kind, [0.5, value])
 
 
-@pytest.mark.parametrize("value", [65505.0, -65536.0, 1e9])
-def test_what_half_precision_does_not_hold_is_refused(coreset_storage, value) -> None:
-    with pytest.raises(InputError, match=r"more than float16 holds; use --tables float32"):
-        written(coreset_storage, "float16", [value])
-
-
 def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset_storage) -> None:
     with pytest.raises(InputError, match=r"more than uint8 holds; use --tables float32"):
         written(coreset_storage, "uint8", [-3e38, 3e38])
@@ -160,11 +153,6 @@ def test_chunks_are_one_time_node_of_bounded_size(shape) -> None:
     assert all(1 <= n <= length for n, length in zip(chunk, shape, strict=True))
 
 
-def decoded(path) -> np.ndarray:
-    with fhash_codec.open(path) as volume:
-        return volume[...]
-
-
 def rewritten(path, target, mixing) -> None:
     """Write the same arrays, not coded, with other attributes of a component of level 1."""
     with Container.open(path) as container, ContainerWriter(target) as writer:
@@ -185,13 +173,6 @@ def small(tmp_path_factory):
     return path
 
 
-def test_coded_or_not_the_components_mean_the_same(tmp_path, small) -> None:
-    with Container.open(small) as container:
-        mixing = dict(container.arrays["tables/level_1/component_2"].attributes)
-    rewritten(small, tmp_path / "a.fhz", mixing)
-    np.testing.assert_array_equal(decoded(tmp_path / "a.fhz"), decoded(small))
-
-
 @pytest.mark.parametrize(
     "mixing",
     [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}],
@@ -209,17 +190,3 @@ def test_a_mixing_beyond_float32_is_damage(tmp_path, small) -> None:
         pytest.raises(DamagedFileError, match="not finite"),
     ):
         volume.read(0)
-
-
-def test_mixing_adds_the_components_from_the_first_on() -> None:
-    random = np.random.default_rng(0)
-    components, mixing = (
-        [random.random((3, 4), dtype=np.float32) for _ in range(3)],
-        random.random((3, 3), dtype=np.float32),
-    )
-    expected = np.stack(
-        [(components[0] * m[0] + components[1] * m[1]) + components[2] * m[2] for m in mixing.T],
-        axis=-1,
-    )
-    np.testing.assert_array_equal(mix_components(components, mixing), expected)
-    assert mix_components(components, mixing).dtype == np.float32

@@ -56,16 +56,6 @@ def test_a_made_up_axis_is_left_out_and_the_codec_says_so(tmp_path: Path) -> Non
         assert table.codec.axes == ("t", "y", "x")
 
 
-def test_a_file_without_a_source_has_all_four_axes(tmp_path: Path) -> None:
-    values = dataset().u.values
-    run = tmp_path / "run.fhz"
-    fhash_codec.encode(ArraySeries(values), run, fhash_codec.EncodeConfig(max_error=0.1, effort=1))
-    with fhash_codec.open(run) as volume:
-        table = ChunkTable(volume)
-        assert tuple(table.outline.dimensions.values()) == ("t", "z", "y", "x")
-        assert table.outline.file_attributes["history"].endswith("--max-error 0.1 --effort 1")
-
-
 def test_a_feature_is_refused(tmp_path: Path) -> None:
     run, values = tmp_path / "run.fhz", dataset().u.values
     mask = np.zeros(values.shape, bool)

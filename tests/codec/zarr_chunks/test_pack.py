@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -52,29 +51,9 @@ def test_a_store_of_dask_becomes_a_container(tmp_path: Path, encoding: dict[str,
     check(write(tmp_path, dataset(), dask=chunks, **encoding))
 
 
-@pytest.mark.parametrize(
-    "dimensions",
-    [
-        ("time", "lat", "lon"),
-        ("lon", "time", "level", "lat"),
-        ("level", "lat", "lon"),
-        ("lat", "lon", "time"),
-    ],
-)
-def test_any_order_of_dimensions_is_taken(tmp_path: Path, dimensions: tuple[str, ...]) -> None:
-    chunks = {name: CHUNKS[name] for name in dimensions}
-    check(write(tmp_path, dataset(dimensions), dask=chunks))
-
-
 @pytest.mark.parametrize("dtype", ["f8", "f2", "i1", "u2", "i4", "i8", "u8"])
 def test_all_number_types_are_taken(tmp_path: Path, dtype: str) -> None:
     check(write(tmp_path, dataset(dtype=dtype), max_error=1 if dtype[0] != "f" else 0.1))
-
-
-def test_lossless_labels_are_taken(tmp_path: Path) -> None:
-    data = dataset(dtype="i4")
-    data["u"] = (data.u // 30) * 30
-    check(write(tmp_path, data, dask={}, max_error=0))
 
 
 def test_missing_values_are_missing(tmp_path: Path) -> None:
@@ -129,15 +108,6 @@ def test_an_index_is_selected_along_an_ensemble(tmp_path: Path) -> None:
     np.testing.assert_array_equal(shown(run).u.values, shown(store).u.values[2])
 
 
-def test_a_zip_and_a_path_within_a_group_are_taken(tmp_path: Path) -> None:
-    store = write(tmp_path, dataset())
-    packed = shutil.make_archive(str(tmp_path / "packed"), "zip", store)
-    for number, source in enumerate((packed, store / "u")):
-        run = tmp_path / f"{number}.fhz"
-        fhash_codec.pack(source, run)
-        np.testing.assert_array_equal(shown(run).u.values, shown(store).u.values)
-
-
 def test_figures_that_nobody_measured_are_not_in_the_file(tmp_path: Path) -> None:
     run = tmp_path / "run.fhz"
     report = fhash_codec.pack(write(tmp_path, dataset(), max_error=0.5), run)
@@ -154,13 +124,6 @@ def test_figures_that_nobody_measured_are_not_in_the_file(tmp_path: Path) -> Non
     assert 0 < measured["max_abs_error"] <= 0.5
     with fhash_codec.open(run) as volume:
         fhash_codec.render(volume)
-
-
-def test_the_same_store_gives_the_same_bytes_without_times(tmp_path: Path) -> None:
-    store = write(tmp_path, dataset())
-    for name in ("a.fhz", "b.fhz"):
-        fhash_codec.pack(store, tmp_path / name, timings=False)
-    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
 
 
 def test_chunks_that_are_missing_are_told_or_refused(tmp_path: Path) -> None:

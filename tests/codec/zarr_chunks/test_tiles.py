@@ -69,11 +69,6 @@ def test_missing_vertices_are_kept_step_by_step(
         assert np.array_equal(np.unpackbits(bits, count=540).reshape(SHAPE[1:]), gaps[step])
 
 
-def test_one_chunk_needs_no_shard(tmp_path: Path) -> None:
-    with open_coded(write(tmp_path, dataset(), dask={}), Request()) as (series, array):
-        assert Tiles(array, series.source).shard is None
-
-
 def test_a_tile_in_a_wrong_place_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

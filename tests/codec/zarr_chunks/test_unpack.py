@@ -11,7 +11,7 @@ import zarr
 from coded_stores import dataset, shown, without_provenance, write
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, OutputExistsError
+from fhash_codec import EncodeConfig, InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Zarr format 3 specification")
 
@@ -132,21 +132,3 @@ def test_plain_files_and_integers_with_gaps_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=what):
             fhash_codec.unpack(golden / f"{name}.fhz", tmp_path / "out.zarr")
-
-
-def test_an_existing_store_is_replaced_on_request_alone(tmp_path: Path) -> None:
-    run = encoded(tmp_path, dataset())
-    store = tmp_path / "out.zarr"
-    fhash_codec.unpack(run, store)
-    with pytest.raises(OutputExistsError):
-        fhash_codec.unpack(run, store)
-    fhash_codec.unpack(run, store, force=True)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(fhash_codec.OutputError, match="no Zarr store"):
-        fhash_codec.unpack(run, tmp_path / "folder", force=True)
-    assert sorted(each.name for each in tmp_path.iterdir()) == [
-        "folder",
-        "out.zarr",
-        "run.fhz",
-        "run.nc",
-    ]

@@ -19,7 +19,6 @@ from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.network import Architecture
 from fhash_codec.progress import silent
-from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries
 
 LAUNCHES = {1: 130, 2: 136}
@@ -132,40 +131,3 @@ def test_captured_steps_are_the_steps_kernel_by_kernel(
         plain = steps(coreset, batches)
     for name, array in plain.items():
         np.testing.assert_array_equal(captured[name], array, err_msg=name)
-
-
-def test_replays_are_one_launch(
-    noise_coreset: Callable[..., Coreset], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    coreset = noise_coreset((3, 9, 20, 35), 0.0)
-    architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
-    replays = []
-    with pretended_cuda():
-        graph = torch.cuda.CUDAGraph
-        monkeypatch.setattr(
-            graph, "replay", lambda self, replay=graph.replay: replays.append(replay(self))
-        )
-        engine = make_engine(
-            "slab", architecture, coreset, np.full(9, 0.01), seed=3, device=torch.device("cuda")
-        )
-        for _ in range(8):
-            engine.train(np.arange(4))
-    assert len(replays) == 6
-
-
-def test_training_goes_on_where_no_graph_can_be_captured(
-    noise_coreset: Callable[..., Coreset], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
-        raise RuntimeError("CUDA error: operation not permitted\nFor debugging ...")
-
-    coreset = noise_coreset((3, 9, 20, 35), 0.0)
-    batches = [np.arange(4)] * 6
-    with pretended_cuda():
-        captured = steps(coreset, batches)
-        monkeypatch.setattr(torch.cuda, "graph", refuse)
-        with pytest.warns(FhashWarning, match=r"no CUDA graph .*\(CUDA error: .*\)") as told:
-            plain = steps(coreset, batches)
-    assert len(told) == 1
-    for name, array in captured.items():
-        np.testing.assert_array_equal(plain[name], array, err_msg=name)

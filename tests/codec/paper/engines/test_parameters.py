@@ -42,21 +42,6 @@ def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
     )
 
 
-def test_parameters_are_within_their_bounds_and_split_by_level_and_layer(noise_coreset) -> None:
-    coreset = noise_coreset((2, 5, 6, 7))
-    architecture = Architecture.for_box(coreset.box.shape, 2)
-    parameters = initial_parameters(architecture, coreset, 0)
-    tables, layers = parameters.dense(architecture)
-    assert [tuple(table.shape) for table in tables] == [
-        (prod(level), 2) for level in architecture.levels[1:]
-    ]
-    for table in (parameters.fine, *tables):
-        assert 0.5 * SPREAD < float(table.abs().max()) <= SPREAD
-    for (weight, bias), (outputs, inputs) in zip(layers, architecture.layer_shapes, strict=True):
-        assert (weight.shape, bias.shape) == ((outputs, inputs), (outputs,))
-        assert max(float(weight.abs().max()), float(bias.abs().max())) <= inputs**-0.5
-
-
 def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
     noise_coreset, in_coreset, monkeypatch
 ) -> None:

@@ -45,29 +45,6 @@ def test_a_rank_is_the_number_of_ones_before(size: int, share: float) -> None:
     assert bits.count == mask.sum()
 
 
-def test_positions_of_any_shape_and_order() -> None:
-    mask = mask_of(0.4)
-    bits = bits_of(mask)
-    places = np.where(mask.reshape(-1), np.cumsum(mask) - 1, mask.sum())
-    positions = np.random.default_rng(1).integers(0, mask.size, (4, 5, 6))
-    np.testing.assert_array_equal(bits.lookup(positions), places[positions])
-
-
-@pytest.mark.parametrize("size", [64, 256, 320, 4096])
-def test_ones_before_a_position(size: int) -> None:
-    mask = mask_of(0.4, (size,))
-    bits = bits_of(mask)
-    for position in {0, 1, 63, 64, 65, 255, 256, size - 1, size}:
-        if position <= size:
-            assert bits.before(position) == mask[:position].sum()
-
-
-def test_the_counts_take_a_quarter_of_the_bitmap() -> None:
-    bits = bits_of(mask_of(0.5, (64, 64, 64)))
-    assert bits.words.nbytes == 64**3 // 8
-    assert bits.nbytes <= 1.26 * bits.words.nbytes
-
-
 def test_more_ones_than_a_count_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ranked, "MAX_COUNT", 99)
     with pytest.raises(InputError, match="needs 100 vertices at one time; at most 99"):
@@ -87,12 +64,6 @@ def test_a_sparse_frame_reads_as_a_dense_one(share: float, dtype: str) -> None:
         read = frame.read(region)
         assert read.dtype == dense.dtype
         np.testing.assert_array_equal(read, dense[region])
-
-
-def test_embeddings_of_vertices() -> None:
-    frame, dense = frame_of(0.3)
-    z, y, x = (np.random.default_rng(2).integers(0, n, (4, 25)) for n in SHAPE)
-    np.testing.assert_array_equal(frame.take(z, y, x), dense[z, y, x])
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])

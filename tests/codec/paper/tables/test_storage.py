@@ -18,11 +18,9 @@ from fhash_codec.paper.model import (
     PointTables,
     SparsePatch,
     decode_region,
-    sample_points,
 )
-from fhash_codec.paper.network import ArrayTable, Network, SparseSource, level_resolutions
+from fhash_codec.paper.network import Network, level_resolutions
 from fhash_codec.paper.storage import Needed, SparseTable, corners, needed_by, spread
-from fhash_codec.paper.tables import trained_tables
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import DamagedFileError, InputError
 
@@ -72,21 +70,6 @@ def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
         assert needed.counts(number) == expected.sum(axis=(1, 2, 3)).tolist()
 
 
-def test_the_coreset_of_a_selection_needs_what_its_bricks_hold(random_model) -> None:
-    coreset, architecture = random_model.selection.coreset, random_model.selection.architecture
-    assert coreset.fringe is not None
-    needed = needed_by(architecture, coreset)
-    table = trained_tables(
-        architecture, coreset, random_model.bricks, random_model.fine, random_model.tables
-    )[0]
-    region = tuple(slice(0, n) for n in table.shape[:4])
-    nodes = range(architecture.key_frames)
-    np.testing.assert_array_equal(
-        np.stack([needed.mask(0, node) for node in nodes]), table.needed(region)
-    )
-    assert sum(needed.counts(0)) == len(coreset.values)
-
-
 FEATURE = EncodeConfig(
     profile="paper",
     epochs=2,
@@ -116,14 +99,6 @@ def sparse(network: Network, model: Any) -> Network:
             )
         )
     return replace(network, tables=tables)
-
-
-def test_only_sparse_tables_have_frames(random_model) -> None:
-    dense = random_model.network(fill=0.0)
-    for level, table in enumerate(sparse(dense, random_model).tables):
-        assert isinstance(table, SparseSource)
-        assert not isinstance(dense.tables[level], SparseSource)
-        assert dense.sparse_frame(level, 0) is None
 
 
 def test_regions_of_a_table_are_those_of_a_dense_one(random_model) -> None:
@@ -158,19 +133,6 @@ def test_a_decoded_region_has_the_bits_of_a_dense_one(
     )
 
 
-def test_points_have_the_bits_of_a_dense_one(random_model) -> None:
-    dense = random_model.network(fill=0.0)
-    network = sparse(dense, random_model)
-    chance = np.random.default_rng(2)
-    points = [chance.random(200) * (n - 1) for n in (dense.key_frames, *dense.box_size)]
-    for ours, theirs in zip(
-        sample_points(network, *points, gradient=True),
-        sample_points(dense, *points, gradient=True),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(ours, theirs)
-
-
 @pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
 def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
     """Pictures through the network do so."""
@@ -196,36 +158,6 @@ def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
     with pytest.raises(AssertionError, match="at several times"):
         PointSampler(tables)
     PointSampler(tables, 1.3)
-
-
-@pytest.mark.parametrize("box", [(1, 6, 9), (5, 1, 9), (5, 6, 1), (1, 1, 1)])
-def test_an_axis_of_one_vertex(box) -> None:
-    chance = np.random.default_rng(4)
-    mask = chance.random(box) < 0.5
-    held = chance.normal(size=(int(mask.sum()), 3)).astype(np.float32)
-    dense = np.zeros((1, *box, 3), np.float32)
-    dense[0][mask] = held
-    layer = (np.array([[1.0, -2.0, 0.5]], np.float32), np.zeros(1, np.float32))
-
-    def network(table: Any) -> Network:
-        return Network(
-            levels=((1, *box),),
-            embedding_size=3,
-            tables=[table],
-            layers=(layer,),
-            box_size=box,
-            key_frames=1,
-        )
-
-    table = SparseTable(
-        dense.shape, [len(held)], lambda first, end: held[first:end], lambda node: mask, "level 1"
-    )
-    places = [np.zeros(1), *(chance.random(50) * (n - 1) for n in box)]
-    values = np.empty((2, 50), np.float32)
-    for number, source in enumerate((table, ArrayTable(dense))):
-        tables = PointTables.of_box(network(source), 0.0)
-        PointSampler(tables, 0.0).sample(places, values[number], None, 1)
-    np.testing.assert_array_equal(values[0], values[1])
 
 
 def test_numbers_that_are_not_finite_are_damage(random_model) -> None:
@@ -258,61 +190,6 @@ def test_both_files_decode_to_the_same_bits(files) -> None:
         points = np.random.default_rng(0).random((2000, 4)) * [4, 8, 11, 19]
         np.testing.assert_array_equal(dense.model(points), other.model(points))
         assert np.isfinite(other.model(points)).sum() > 20
-
-
-def test_tables_differ_only_where_nothing_needs_them(files) -> None:
-    with fhash_codec.open(files[0]) as dense, fhash_codec.open(files[1]) as other:
-        stored = 0
-        for ours, theirs in zip(dense.tables, other.tables, strict=True):
-            assert ours.shape == theirs.shape
-            assert ours.dtype == theirs.dtype
-            values, dense_values = np.asarray(theirs), np.asarray(ours)
-            array = other.container.arrays[f"tables/level_{theirs.level}"]
-            stored += array.shape[0] * array.shape[1]
-            held = (values != 0).any(axis=-1)
-            np.testing.assert_array_equal(values[held], dense_values[held])
-            assert np.count_nonzero(held) <= array.shape[0]
-        assert other.info["model"]["parameters"] == stored + other.mlp.parameters
-
-
-def test_the_finest_level_has_the_samples_alone(files) -> None:
-    with fhash_codec.open(files[1]) as volume:
-        box = volume.info["model"]["levels"][0][1:]
-        (bits,) = volume.container.arrays["occupancy/bits"].read()
-        masks = np.stack([occupancy.unpack(row, tuple(box)) for row in bits])
-        samples = masks.copy()
-        samples[1:] |= masks[:-1]
-        samples[:-1] |= masks[1:]
-        assert volume.container.arrays["tables/level_1"].shape[0] == np.count_nonzero(samples)
-
-
-def test_an_untrained_fringe_is_not_stored(tmp_path, waves) -> None:
-    config = replace(FEATURE, tables="sparse", fringe="untrained")
-    fhash_codec.encode(waves(), tmp_path / "sparse.fhz", config)
-    fhash_codec.encode(waves(), tmp_path / "dense.fhz", replace(config, tables="dense"))
-    with (
-        fhash_codec.open(tmp_path / "dense.fhz") as dense,
-        fhash_codec.open(tmp_path / "sparse.fhz") as other,
-    ):
-        assert other.info["model"]["sparse"] == "coreset"
-        occupied = sum(int(other.occupancy(t).sum()) for t in (0, 2, 4))
-        assert other.container.arrays["tables/level_1"].shape[0] == occupied
-        for t in (0, 1, 2.5, 4):
-            np.testing.assert_array_equal(dense.read(t), other.read(t))
-
-
-def test_the_plain_export_is_dense_and_decodes_to_the_same_bits(files, tmp_path) -> None:
-    fhash_codec.export_plain(files[1], tmp_path / "plain.fhz")
-    with fhash_codec.open(files[1]) as volume, fhash_codec.open(tmp_path / "plain.fhz") as plain:
-        assert plain.info["required_features"] == []
-        assert "sparse" not in plain.info["model"]
-        # The 0 of other vertices is no number of the range that 8 bits have.
-        kind = "float16" if volume.info["model"]["tables"] == "float16" else "float32"
-        assert plain.info["model"]["tables"] == plain.tables[0].dtype.name == kind
-        numbers = sum(np.asarray(table).size for table in plain.tables)
-        assert plain.info["model"]["parameters"] == numbers + plain.mlp.parameters
-        for t in (0, 1, 2.5):
-            np.testing.assert_array_equal(plain.read(t), volume.read(t))
 
 
 def rewritten(source: Path, target: Path, changes: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,18 +18,9 @@ from fhash_codec.paper.table_step import (
     StepSearch,
     Window,
     choose_codings,
-    squared_weights,
 )
 from fhash_codec.paper.tables import CoarseTable, components_of, tile_region
 from fhash_formats.container import Container
-
-
-@pytest.mark.parametrize(("length", "resolution"), [(1, 1), (5, 3), (5, 5), (9, 2), (20, 7)])
-def test_squared_weights_are_those_of_the_interpolation(length, resolution) -> None:
-    position = np.arange(length) * (resolution - 1) / max(length - 1, 1)
-    # Vertex r of the level weighs 1 - |position - r| where that is positive.
-    weights = np.maximum(1 - np.abs(position[:, None] - np.arange(resolution)), 0)
-    assert squared_weights(length, resolution) == pytest.approx((weights**2).sum(axis=1).mean())
 
 
 def test_components_keep_the_embeddings_and_lie_in_their_range(random_model) -> None:
@@ -90,11 +80,6 @@ def rough_waves(waves) -> np.ndarray:
     return waves() + noise.astype(np.float32)
 
 
-def decoded(path) -> np.ndarray:
-    with fhash_codec.open(path) as volume:
-        return volume[...]
-
-
 def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
     (exact, _), (coded, path) = pair["exact"], pair["coded"]
     loss = exact["psnr"] - coded["psnr"]
@@ -147,23 +132,6 @@ def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) ->
     assert missed.value.figures["bytes"] <= free["bytes"] + 40  # the texts of the settings
 
 
-def test_by_default_coded_tables_have_few_levels_and_take_fewer_bytes(
-    rough_waves, coded_config, tmp_path
-) -> None:
-    source = rough_waves
-    config = replace(coded_config, epochs=30, psnr=38.0)
-    published = fhash_codec.encode(source, tmp_path / "a.fhz", config)
-    config = replace(config, fold=0, embedding_size=0)
-    figures = fhash_codec.encode(source, tmp_path / "b.fhz", config)
-    assert 38.0 <= figures["psnr"] < 38.1
-    assert figures["bytes"] < 0.75 * published["bytes"]
-    with fhash_codec.open(tmp_path / "b.fhz") as volume:
-        model = volume.info["model"]
-        assert (model["fold"], model["embedding_size"]) == (8, 1)
-        assert model["levels"] == [[5, 9, 12, 20], [2, 2, 2, 3]]
-        assert volume.info["config"]["fold"] == 0
-
-
 def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> None:
     config = replace(coded_config, epochs=10)
     free = fhash_codec.encode(rough_waves, tmp_path / "a.fhz", config)
@@ -173,32 +141,6 @@ def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> 
     assert wanted <= figures["psnr"] < wanted + 0.1
     with fhash_codec.open(tmp_path / "b.fhz") as volume:
         assert volume.info["training"]["epochs"] > 10
-
-
-@pytest.mark.parametrize(
-    "shape", [(1, 1, 1, 1), (3, 1, 1, 1), (1, 1, 1, 7), (2, 2, 2, 2), (7, 3, 5, 11)]
-)
-def test_every_shape_comes_back(coded_config, tmp_path, shape) -> None:
-    source = np.random.default_rng(0).random(shape, dtype=np.float32)
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", coded_config)
-    back = decoded(tmp_path / "a.fhz")
-    assert back.shape == shape
-    assert np.isfinite(back).all()
-    assert figures["max_abs_error"] == pytest.approx(np.abs(back - source).max(), rel=1e-5)
-
-
-def test_a_constant_series_comes_back_exactly(coded_config, tmp_path) -> None:
-    figures = fhash_codec.encode(np.full((3, 4, 5, 6), 7.25), tmp_path / "a.fhz", coded_config)
-    assert (decoded(tmp_path / "a.fhz") == 7.25).all()
-    assert figures["rmse"] == 0
-
-
-def test_the_same_input_gives_the_same_bytes(waves, coded_config, tmp_path) -> None:
-    for name in ("a.fhz", "b.fhz"):
-        fhash_codec.encode(
-            waves((3, 6, 7, 8)), tmp_path / name, replace(coded_config, epochs=2, timings=False)
-        )
-    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
 
 
 def test_other_readers_see_what_is_needed(pair) -> None:
@@ -240,19 +182,6 @@ def test_the_search_ends_in_the_window(start, power, room) -> None:
     assert trials <= TRIALS
 
 
-def test_a_course_that_is_no_power_takes_a_few_more_trials() -> None:
-    window = Window.of(1e-6, 3e-5, 0.05)
-    # The error bends twice, as that of tables does in which whole levels become zero.
-    search, _ = searched(
-        window,
-        lambda step: 1e-6 + 2e-5 * math.tanh(step) ** 2 + 1e-5 * max(step - 2, 0.0) ** 3,
-        1e-3,
-    )
-    assert search.done
-    assert search.best is not None
-    assert search.best > 2
-
-
 def test_a_jump_over_the_window_keeps_the_allowed_side() -> None:
     window = Window.of(1e-6, 1e-5, 0.05)
     search, _ = searched(window, lambda step: 1e-6 + (1e-6 if step < 3 else 1e-3), 1.0)
@@ -267,11 +196,3 @@ def test_nothing_below_the_smallest_step_is_tried() -> None:
     assert search.done
     assert search.step == 0.5
     assert trials < TRIALS
-
-
-@pytest.mark.parametrize(("exact", "width"), [(0.0, 0.05), (9.99e-6, 0.00217), (1e-6, 0.05)])
-def test_a_window_leaves_room_for_what_coding_adds(exact, width) -> None:
-    window = Window.of(exact, 1e-5, 0.05)
-    assert exact < window.least < window.allowed == 1e-5
-    assert 10 * math.log10(window.allowed / window.least) == pytest.approx(width, rel=0.01)
-    assert 0 < window.aim < window.allowed - exact

@@ -14,11 +14,8 @@ from fhash_codec.paper import tables as small_parts
 from fhash_codec.paper.encode import select
 from fhash_codec.paper.model import decode_region
 from fhash_codec.paper.storage import finest_frame
-from fhash_codec.paper.table_step import MAX_LOSS
 from fhash_codec.paper.tables import (
-    FEW_TILES,
     MIN_WEIGHTS,
-    TILE_VERTICES,
     WEIGHT_STEPS,
     Samples,
     quantised_layers,
@@ -76,25 +73,6 @@ def test_errors_are_those_of_the_clipped_values_at_all_samples(random_model, sam
     assert squares == pytest.approx(direct)
 
 
-def test_chosen_tiles_hold_about_the_samples_asked_for(samples) -> None:
-    count = sum(samples.counts.values())
-    for asked in (0, count // 3, count):
-        tiles = samples.choose(asked)
-        assert tiles == sorted(tiles)
-        held = sum(samples.counts[index] for index in tiles)
-        assert 0 < held <= max(asked, max(samples.counts.values()))
-    assert tiles == list(samples.counts)
-
-
-def test_slopes_are_taken_at_samples_of_the_tiles(random_model, samples) -> None:
-    tiles = list(samples.counts)
-    slopes = samples.slopes(random_model.network(), tiles)
-    assert slopes.shape[0] == random_model.selection.architecture.inputs
-    assert 0 < slopes.shape[1] <= sum(samples.counts.values())
-    assert np.isfinite(slopes).all()
-    assert slopes.any()
-
-
 def layers(rows: int, columns: int):
     random = np.random.default_rng(0)
     return [
@@ -128,36 +106,11 @@ def test_the_largest_step_that_is_allowed_is_taken(allowed) -> None:
     assert first.step > 0.8 * np.sqrt(12 * allowed) / 2 or first.step >= WEIGHT_STEPS[0] / 2
 
 
-@pytest.mark.parametrize(("rows", "is_coded"), [(32, True), (31, False)])
-def test_small_matrices_stay_as_they_are(rows, is_coded) -> None:
-    _, (first, _) = quantised_layers(layers(rows, MIN_WEIGHTS // 32), lambda _: 0.0, 1.0)
-    assert (first is not None) == is_coded
-
-
 def test_layers_that_no_step_keeps_stay_as_they_are() -> None:
     original = layers(32, 32)
     quantised, settings = quantised_layers(original, lambda _: 1.0, 0.5)
     assert settings == [None, None]
     assert quantised[0][0] is original[0][0]
-
-
-def test_a_matrix_of_zeros_is_no_error() -> None:
-    zeros = [(np.zeros((32, 32), np.float32), np.zeros(32, np.float32))]
-    assert quantised_layers(zeros, lambda _: 0.0, 0.0)[1] == [None]
-
-
-def test_a_file_has_the_layers_that_were_measured(tmp_path, waves, coded_config) -> None:
-    config = replace(coded_config, epochs=1, width=64, hidden_layers=2)
-    path = tmp_path / "a.fhz"
-    figures = fhash_codec.encode(waves((3, 6, 7, 8)), path, config)
-    with Container.open(path) as container:
-        weight = container.arrays["mlp/weight_2"].read((slice(0, 64), slice(0, 64)))
-    # Whole multiples of a step came back, and the loss counts what they cost.
-    values = np.unique(weight)[1:-1]  # the range clips its ends
-    multiples = values / np.diff(values).min()
-    assert values.size < 600
-    assert np.abs(multiples - np.rint(multiples)).max() < 0.01
-    assert figures["tables_loss_db"] <= MAX_LOSS + 1e-4
 
 
 @pytest.mark.parametrize("vertices", [1, 5000, 1 << 22])
@@ -210,26 +163,6 @@ def test_points_and_times_between_are_as_smooth_as_before(waves, pair) -> None:
         assert np.isfinite(slopes[finite]).all()
         span = float(np.ptp(waves()))
         assert np.sqrt(np.mean((values - expected)[finite] ** 2)) < 0.05 * span
-
-
-@pytest.mark.parametrize(
-    "resolution",
-    [(1, 1, 1, 1), (9, 20, 30, 40), (81, 40, 40, 63), (17, 200, 200, 200), (3, 1, 1, 5000)],
-    ids=str,
-)
-def test_tiles_cut_a_level_evenly(resolution) -> None:
-    tile = tile_shape(resolution)
-    covered = [-(-n // length) * length for n, length in zip(resolution, tile, strict=True)]
-    assert np.prod(covered) < 1.2 * np.prod(resolution)
-    assert np.prod(tile) < 1.5 * TILE_VERTICES
-    assert all(1 <= length <= n for length, n in zip(tile, resolution, strict=True))
-
-
-@pytest.mark.parametrize(("steps", "most"), [(14, 32 * 1.5), (16, 8 * 1.5)])
-def test_tiles_of_a_long_series_have_few_time_nodes(steps, most) -> None:
-    tile = tile_shape((steps * 16, 64, 64, 32))  # as many times TILE_VERTICES as `steps`
-    assert tile[0] <= most
-    assert (tile[0] > 8 * 1.5) == (steps < FEW_TILES)
 
 
 def test_the_coreset_does_not_depend_on_what_is_not_needed(random_model) -> None:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from math import prod
-
 import numpy as np
 import pytest
-import torch
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.fit import (
     MAX_DOUBLINGS,
     MIN_STEPS,
@@ -38,19 +33,6 @@ def architecture(coreset) -> Architecture:
     return Architecture.for_box(coreset.box.shape, 3, width=8)
 
 
-def test_a_model_is_numbers_of_every_level_and_layer(coreset, architecture, tmp_path) -> None:
-    trained = train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
-    assert trained.fine.shape == (2, len(coreset.values))
-    assert [table.shape for table in trained.tables] == [
-        (prod(level), 2) for level in architecture.levels[1:]
-    ]
-    assert [weight.shape for weight, _ in trained.layers] == architecture.layer_shapes
-    assert [point["epoch"] for point in trained.history] == [1]
-    assert (trained.epochs, trained.restarts, trained.device) == (1, 0, "cpu")
-    assert trained.learning_rate == CONFIG.learning_rate
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_training_that_diverges_at_every_rate_is_an_error(
     coreset, architecture, tmp_path, monkeypatch
 ) -> None:
@@ -71,25 +53,7 @@ def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_pat
         train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
 
 
-def test_a_checkpoint_of_whole_bricks_is_refused(coreset, architecture, tmp_path) -> None:
-    """The finest embeddings were once stored for all vertices of the bricks."""
-    device = torch.device("cpu")
-    engine = make_engine("auto", architecture, coreset, np.zeros(2), seed=0, device=device)
-    whole = np.zeros((len(coreset.bricks), 2, prod(coreset.brick_shape)), np.float32)
-    state = engine.state() | dict.fromkeys(("fine", "fine_mean", "fine_square"), whole)
-    path = checkpoint_path(tmp_path / "a.fhz", coreset, CONFIG)
-    save_checkpoint(path, state, TrainingProgress(epoch=0, batch=1))
-    with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
-        train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
-
-
 GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
-
-
-@pytest.mark.parametrize("psnr", [45.5, 60.0, math.inf])
-def test_a_model_that_is_good_enough_is_not_trained_on(psnr) -> None:
-    decision = decide(GOAL, psnr, 20, MIN_STEPS, 10.0, [])
-    assert (decision.round, decision.message) == (None, "")
 
 
 def test_a_round_doubles_the_epochs_and_says_so() -> None:
@@ -106,15 +70,6 @@ def test_a_round_fits_into_the_time_that_is_left(seconds, epochs) -> None:
     before = [Round(epochs=20, psnr=40.0, seconds=0.0)]
     decision = decide(GOAL, 44.0, 40, MIN_STEPS, seconds, before)
     assert decision.round == Round(epochs=epochs, psnr=44.0, seconds=seconds)
-
-
-@pytest.mark.parametrize("seconds", [0.0, 1.0])
-def test_the_limit_in_time_is_said_plainly(seconds) -> None:
-    goal = Goal(psnr=45.5, promised=45.0, seconds=seconds)
-    decision = decide(goal, 44.0, 20, MIN_STEPS, 100.0, [])
-    assert decision.round is None
-    assert f"ends at its limit of {seconds:g} more seconds" in decision.message
-    assert "--train-on-seconds" in decision.message
 
 
 @pytest.mark.parametrize(("gain", "goes_on"), [(2.01, True), (1.99, False), (-1.0, False)])

@@ -20,7 +20,6 @@ from fhash_codec.paper.train import (
     Diverged,
     Probe,
     TrainingProgress,
-    batch_ends,
     checkpoint_path,
     load_checkpoint,
     plan_training,
@@ -83,26 +82,6 @@ def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(InputError, match=r"run\.checkpoint cannot be read"):
             load_checkpoint(path)
-
-
-def test_tables_that_change_the_sizes_of_the_model_have_a_checkpoint_of_their_own(
-    coreset, tmp_path
-) -> None:
-    def path(**settings):
-        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", **settings))
-
-    published = {"fold": 2, "embedding_size": 2, "width": 64}
-    assert path() == path(tables="uint8") == path(**published)
-    assert path() == path(tables="transform", **published)
-    for setting in published:
-        assert path() != path(tables="transform", **(published | {setting: 0}))
-
-
-def test_engines_that_go_on_from_each_other_share_a_checkpoint(coreset, tmp_path) -> None:
-    def path(engine):
-        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", engine=engine))
-
-    assert path("auto") == path("native") == path("slab")
 
 
 SHAPE = (3, 9, 10, 21)
@@ -172,28 +151,6 @@ def test_a_value_that_is_not_finite_ends_the_training(field, value) -> None:
         Probe(coreset).psnr(Engine(coreset, broken))
 
 
-def test_a_choice_of_bricks_has_some_of_the_coreset_in_each(field) -> None:
-    # Only the last key frame holds the feature: the bricks of the first have neither.
-    late = field * np.float32(0.5)
-    late[2] = field[2]
-    coreset = built(late, Interval(0.9, 1.0), fringe=True)
-    assert set(coreset.bricks[:, 0]) == {1, 2}
-    for limit in (None, 3, 1):
-        probe = Probe(coreset, limit, seed=4)
-        assert set(coreset.bricks[probe.bricks, 0]) == {2}
-        assert len(probe.bricks) == (limit or np.count_nonzero(coreset.bricks[:, 0] == 2))
-    assert Probe(coreset).samples == np.count_nonzero(late >= np.float32(0.9))
-
-
-def test_the_error_of_a_constant_is_that_of_the_mean_of_all_samples(field) -> None:
-    coreset = built(field, Interval(0.8, 1.0), fringe=True)
-    values = field[field >= np.float32(0.8)].astype(np.float64)
-    mean = coreset.values.mean(dtype=np.float64)
-    assert Probe(coreset).error_of_constant() == pytest.approx(np.square(values - mean).mean())
-    plain = built(field, Interval(0.8, 1.0), fringe=False)
-    assert Probe(plain).error_of_constant() == pytest.approx(values.var())
-
-
 def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, coreset) -> None:
     plan, _ = setup(coreset)
     orders = [np.concatenate(plan.order(epoch)) for epoch in range(4)]
@@ -201,18 +158,6 @@ def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, cores
         assert sorted(order) == list(range(plan.bricks))
     assert not np.array_equal(orders[0], orders[1])
     np.testing.assert_array_equal(orders[2], np.concatenate(setup(coreset)[0].order(2)))
-
-
-@pytest.mark.parametrize(
-    ("batch", "batches"),
-    [(0, 20), (2**21, 1), (1008, 26), (5000, 5), (1, 54)],
-)
-def test_batches_of_an_epoch(setup, coreset, batch, batches) -> None:
-    assert len(coreset.bricks) == 54  # 3 key frames of 2 x 3 x 3 bricks of 6 x 7 x 12 vertices
-    assert len(coreset.values) == 25_920  # fewer than 54 whole bricks: the last ones are cut
-    plan, _ = setup(coreset, batch=batch)
-    assert plan.batches == min(batches, plan.bricks)
-    assert len(plan.rates) == 4 * plan.batches + 1
 
 
 @pytest.mark.parametrize("batch", [500, 1700, 4000])
@@ -230,50 +175,9 @@ def test_a_batch_has_as_many_samples_as_asked_however_full_the_bricks(coreset, b
         assert abs(counts[chosen].sum() - counts.sum() / plan.batches) <= 504
 
 
-@pytest.mark.parametrize(
-    "counts", [[1] * 7, [100, 1, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 1, 100], [0, 0, 3, 0, 0, 9, 0]]
-)
-def test_no_batch_is_empty(counts) -> None:
-    for batches in range(1, 8):
-        cuts = batch_ends(np.array(counts), batches)
-        parts = np.split(np.arange(7), cuts)
-        assert len(parts) == batches
-        assert all(len(part) for part in parts)
-
-
 @pytest.mark.parametrize(("batch", "epochs"), [(0, 50), (1, 20), (2**20, 1000)])
 def test_epochs_that_suit_the_data(setup, coreset, batch, epochs) -> None:
     assert setup(coreset, epochs=0, batch=batch)[0].epochs == epochs
-
-
-def test_rates_fall_to_zero_or_stay(setup, coreset) -> None:
-    cosine, constant = setup(coreset)[0].rates, setup(coreset, schedule="constant")[0].rates
-    assert cosine[0] == 0.01
-    assert cosine[-1] == pytest.approx(0, abs=1e-12)
-    assert (np.diff(cosine) < 0).all()
-    assert (constant == 0.01).all()
-
-
-def test_history_tells_seconds_epoch_and_psnr_that_rises(setup, coreset) -> None:
-    plan, engine = setup(coreset, epochs=12)
-    reached = TrainingProgress()
-    seen = []
-    assert train(engine, plan, coreset, reached, progress=lambda *step: seen.append(step))
-    assert [point["epoch"] for point in reached.history] == list(range(1, 13))
-    assert all(
-        a["seconds"] < b["seconds"]
-        for a, b in zip(reached.history, reached.history[1:], strict=False)
-    )
-    assert reached.history[-1]["psnr"] > reached.history[0]["psnr"] + 5
-    assert reached.history[-1]["psnr"] > 30
-    assert [done for _, done, _, _ in seen] == list(range(1, 12 * plan.batches + 1))
-
-
-def test_checkpoints_come_by_the_clock_too(setup, coreset) -> None:
-    plan, engine = setup(coreset, epochs=2)
-    saved = []
-    assert train(engine, plan, coreset, TrainingProgress(), save=saved.append, save_seconds=0.0)
-    assert saved
 
 
 def test_training_that_diverges_is_an_error(setup, coreset) -> None:
@@ -308,10 +212,3 @@ def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says
             train(engine, plan, coreset, TrainingProgress())
     else:  # A lower rate than the usual one would not help, nor does it with a model still moving.
         assert train(engine, plan, coreset, TrainingProgress())
-
-
-def test_a_budget_ends_the_training(setup, coreset) -> None:
-    plan, engine = setup(coreset)
-    reached = TrainingProgress()
-    assert not train(engine, plan, coreset, reached, budget_seconds=0.0)
-    assert (reached.epoch, reached.batch, engine.step) == (0, 1, 1)
