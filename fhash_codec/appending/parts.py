@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.series_plan import CodedLayers, SeriesPlan, bounded, code_layers
+from fhash_codec.appending.series_plan import SeriesPlan, bounded, code_layers
 from fhash_codec.compact.encode import all_tiles
-from fhash_codec.compact.tiles import Blocks
+from fhash_codec.compact.tiles import Blocks, CodedTiles
 from fhash_codec.comparison import measure, report, ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
@@ -245,7 +245,7 @@ class _Job:
         self,
         writer: ContainerWriter,
         blocks: Blocks,
-        coded: CodedLayers,
+        coded: CodedTiles,
         missing: Mapping[int, npt.NDArray[np.uint8]],
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""

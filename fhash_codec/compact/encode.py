@@ -43,12 +43,12 @@ from fhash_codec.compact.tiles import (
     Outcome,
     Tile,
     TileRun,
-    Values,
+    Worked,
     code,
+    code_tiles,
     fits_memory,
     measured,
     recoded,
-    total,
 )
 from fhash_codec.compact.transform import refit, usual_transform
 from fhash_codec.config import EncodeConfig
@@ -61,7 +61,7 @@ from fhash_codec.progress import Progress, stage
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
-from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
+from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.values import at_origin
 
@@ -497,15 +497,16 @@ def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bo
         return True
     plain = replace(settings, head=None)
 
-    def measure(job: tuple[bytes, Index | Tile]) -> Outcome:
+    def measure(job: tuple[bytes, Index | Tile]) -> Worked:
         stream, source = job
         tile = _tile_of(blocks, source)
-        return measured(tile, recoded(tile, stream, plain), plain, table.plan.coding)
+        coded = recoded(tile, stream, plain)
+        return stream, measured(tile, coded, plain, table.plan.coding), None
 
     sources = (_readable(blocks, index) for index in blocks.indices())
     jobs = zip(table.streams, sources, strict=True)
     with stage("coding", "gain of the head in all tiles"):
-        without = total(list(map_ahead(workers, measure, jobs, 2 * usable_threads())))
+        without = code_tiles(jobs, measure, workers).outcome
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
     size = table.outcome.size
     own = len(settings.head.to_bytes()) + HEAD_BYTES
@@ -536,31 +537,28 @@ def _code_all(
     """
     blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
-    def work(source: Index | Tile | TileRun) -> tuple[bytes, Outcome, Values | None]:
+    def work(source: Index | Tile | TileRun) -> Worked:
         if isinstance(source, TileRun):
             return source.stream, source.outcome, None
         tile = _tile_of(blocks, source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome, coded.decoded if keeps_decoded else None
 
-    streams: list[bytes] = []
-    decoded_tiles: list[Values | None] = []
-    outcomes: list[Outcome] = []
     indices = list(blocks.indices())
-    sources = _sources(coding_plan, indices)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
-        for data, outcome, values in map_ahead(workers, work, sources, 2 * usable_threads()):
-            streams.append(data)
-            outcomes.append(outcome)
-            decoded_tiles.append(values)
-            progress("coding", len(streams), len(indices), note)
-    kept = zip(indices, decoded_tiles, strict=True)
+        coded = code_tiles(
+            _sources(coding_plan, indices),
+            work,
+            workers,
+            lambda count: progress("coding", count, len(indices), note),
+        )
+    kept = zip(indices, coded.decoded, strict=True)
     return CodedTable(
         plan=coding_plan,
-        streams=streams,
-        outcome=total(outcomes),
+        streams=coded.streams,
+        outcome=coded.outcome,
         decoded={index: values for index, values in kept if values is not None},
     )
 

@@ -1,9 +1,11 @@
-"""A lazy array has the dimensions of the source in their order, whatever is asked for."""
+"""Containers as xarray shows them: the values, names and attributes of their source."""
 
 from __future__ import annotations
 
 import pickle
 import tomllib
+import warnings
+from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from itertools import product
@@ -13,17 +15,133 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import xarray
 import xarray as xr
+import zarr
 from cf_files import KINDS, Kind, smooth
 from xarray.core import indexing
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.config import EncodeConfig as EncodeConfig_odd_names
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import ArraySeries, Coordinate
+
+SHAPE = (5, 4, 12, 10)
+
+
+def values() -> np.ndarray[Any, Any]:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE), indexing="ij")
+    return (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
+
+
+def series(
+    data: np.ndarray[Any, Any] | None = None,
+    name: str = "rain rate",
+    times: Sequence[float] = (0, 1, 2.5, 4, 9),
+) -> ArraySeries:
+    coords = {
+        "t": Coordinate(name="time", values=np.array(times)),
+        "z": Coordinate(name="height", values=np.array([1.0, 2.0, 4.0, 8.0])),
+        "x": Coordinate(name="lon", values=np.linspace(0, 90, SHAPE[3])),
+    }
+    return ArraySeries(values() if data is None else data, name=name, units="mm h-1", coords=coords)
+
+
+def shown(path: Path) -> xarray.Dataset:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        store = zarr.storage.ZipStore(path, mode="r")
+        return xarray.open_zarr(store, consolidated=False, chunks=None).load()
+
+
+@pytest.mark.parametrize("tile", ["whole", "2x4x6x10"])
+@pytest.mark.parametrize("effort", [1, 3])
+def test_xarray_shows_the_variable(tmp_path: Path, tile: str, effort: int) -> None:
+    path = tmp_path / "run.fhz"
+    config = EncodeConfig(effort=effort, max_error=0.01, tile=tile, timings=False)
+    fhash_codec.encode(series(), path, config)
+    dataset = shown(path)
+    assert list(dataset.data_vars) == ["rain_rate"]
+    assert dataset["rain_rate"].dims == ("time", "height", "y", "lon")
+    assert dataset["rain_rate"].attrs == {"units": "mm h-1"}
+    with fhash_codec.open(path) as volume:
+        assert volume.name == "rain rate"
+        assert volume.info["arrays"]["rain_rate"]["shape"] == list(SHAPE)
+        np.testing.assert_array_equal(dataset["rain_rate"], volume[...])
+        assert volume.verify()
+
+
+def test_of_features_it_shows_the_box_and_nan_outside(tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    config = EncodeConfig(effort=2, max_error=0.01, features=("interval:1.2:9",), dilation=0)
+    fhash_codec.encode(series(), path, config)
+    with fhash_codec.open(path) as volume:
+        box = tuple(slice(low, high) for low, high in volume.box)
+        expected = volume[(slice(None), *box)]
+    found = shown(path)["rain_rate"]
+    np.testing.assert_array_equal(found, expected)
+    assert np.isnan(expected).any()
+    assert found.dims[0] == "time"
+    for name, own, whole in zip(found.dims[1:], found.shape[1:], SHAPE[1:], strict=True):
+        assert str(name).endswith("_box") == (own != whole)
+
+
+VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1
+NAMES = {
+    "zeta ": "zeta",
+    " ": "unnamed",
+    "": "unnamed",
+    "/": "unnamed",
+    "a/b": "a_b",
+    "..": "unnamed",
+    "a\nb": "a_b",
+    "a\0b": "a_b",
+    "__x": "_x",
+    "zarr.json": "zarr_json",
+    ".zarray": "_zarray",
+    "y" * 300: "y" * 240,
+    "\u03be": "\u03be",
+    "tables": "tables",
+    "a b": "a b",
+    "\ud800": "?",
+}
+CONFIG = EncodeConfig_odd_names(max_error=0.01, effort=1)
+
+
+def zarr_2(folder: Path, names: list[str]) -> Path:
+    group = zarr.open_group(folder / "a.zarr", mode="w", zarr_format=2)
+    made = group.create_array("u", shape=VALUES.shape, dtype="f4", chunks=VALUES.shape)
+    made[...] = VALUES
+    made.attrs["_ARRAY_DIMENSIONS"] = names
+    return folder / "a.zarr"
+
+
+def labelled(folder: Path, names: list[str]) -> xr.Dataset:
+    return xr.Dataset({"u": (names, VALUES)}, {names[1]: [3.0, 5.0, 7.0]})
+
+
+@pytest.mark.parametrize(("name", "plain"), NAMES.items(), ids=map(ascii, NAMES))
+@pytest.mark.parametrize("make", [zarr_2, labelled])
+def test_a_dimension_of_any_name_comes_back(
+    tmp_path: Path, make: Any, name: str, plain: str
+) -> None:
+    names = ["time", name, "lat", "lon"]
+    path = tmp_path / "a.fhz"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fhash_codec.encode(make(tmp_path, names), path, CONFIG)
+    told = [str(each.message) for each in caught if each.category is FhashWarning]
+    assert any("were changed" in text for text in told) == (plain != name)
+    with xr.open_dataset(path, engine="fhash") as dataset:
+        assert dataset["u"].dims == ("time", plain, "lat", "lon")
+        np.testing.assert_allclose(dataset["u"], VALUES, atol=0.01)
+        if make is labelled:
+            assert dataset[plain].values.tolist() == [3, 5, 7]
+
 
 DIMENSIONS = {"lon": "x", "one": "", "time": "t", "lat": "y"}
 
@@ -79,16 +197,16 @@ def test_chunks_are_the_tiles_of_the_dimensions(run) -> None:
         assert coarse.chunks(volume)["lon"] == x // 2
 
 
-CONFIG = EncodeConfig(max_error=0.01, effort=1, timings=False)
-SHAPE = (3, 1, 5, 6)
+BOUND = EncodeConfig(max_error=0.01, effort=1, timings=False)
+FLAT = (3, 1, 5, 6)
 
 
-def values(seed: int, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+def noise(seed: int, shape: tuple[int, ...] = FLAT) -> np.ndarray:
     return np.random.default_rng(seed).random(shape, dtype=np.float32)
 
 
 def opened(sources: dict[str, Any], path: Path) -> xr.Dataset:
-    fhash_codec.encode_dataset(sources, path, CONFIG)
+    fhash_codec.encode_dataset(sources, path, BOUND)
     return xr.open_dataset(path, engine="fhash")
 
 
@@ -97,19 +215,19 @@ def along(**sizes: int) -> xr.Variable:
 
 
 def test_variables_of_one_name_in_their_sources_are_all_there(tmp_path: Path) -> None:
-    sources = {f"{group}/u": ArraySeries(values(n), name="u") for n, group in enumerate("gh")}
+    sources = {f"{group}/u": ArraySeries(noise(n), name="u") for n, group in enumerate("gh")}
     with opened(sources, tmp_path / "a.fhz") as dataset:
         for number, name in enumerate(sources):
-            np.testing.assert_allclose(dataset[name], values(number), atol=0.01)
+            np.testing.assert_allclose(dataset[name], noise(number), atol=0.01)
 
 
 def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
     half = {"x": Coordinate(name="x", values=np.arange(6) + 0.5)}
     sources = {
-        "u": ArraySeries(values(0), name="u"),
-        "v": ArraySeries(values(1), name="v", coords=half),
-        "w": ArraySeries(values(2, (3, 1, 5, 7)), name="w"),
-        "p": ArraySeries(values(3), name="p", coords=half),
+        "u": ArraySeries(noise(0), name="u"),
+        "v": ArraySeries(noise(1), name="v", coords=half),
+        "w": ArraySeries(noise(2, (3, 1, 5, 7)), name="w"),
+        "p": ArraySeries(noise(3), name="p", coords=half),
     }
     with opened(sources, tmp_path / "a.fhz") as dataset:
         dimensions = {name: dataset[name].dims[-1] for name in sources}
@@ -148,7 +266,7 @@ def test_a_dimension_without_positions_is_shared() -> None:
 
 def vector_file(path: Path, kind: str) -> dict[str, np.ndarray]:
     """A vector whose components have the names of the axes; their values."""
-    arrays = {name: values(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
+    arrays = {name: noise(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
     with h5py.File(path, "w") as file:
         for step, (name, array) in product((0, 1), arrays.items()):
             place = f"data/{step}/meshes/B/{name}" if kind == "openpmd" else f"velocity/{name}"
@@ -166,7 +284,7 @@ def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> 
     source, path = tmp_path / "run.h5", tmp_path / "run.fhz"
     arrays = vector_file(source, kind)
     word = {"openpmd": "B", "groups": "velocity", "arrays": "values"}[kind]
-    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, CONFIG)
+    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, BOUND)
     with xr.open_dataset(path, engine="fhash") as found:
         assert set(found.data_vars) == {f"{word}_{name}" for name in "xyz"}
         assert sum(each**2 for each in found.data_vars.values()).dims == ("time", "z", "y", "x")
@@ -182,8 +300,8 @@ def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> 
 
 
 def test_a_last_part_of_several_names_is_refused(tmp_path: Path) -> None:
-    arrays = {name: values(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
-    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", CONFIG)
+    arrays = {name: noise(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
+    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", BOUND)
     with fhash_codec.open(tmp_path / "run.fhz") as dataset:
         assert [dataset[name].name for name in ("E/x", "B_x", "rho")] == ["E_x", "B_x", "B/rho"]
         with pytest.raises(KeyError, match="2 variables named 'x'"):
@@ -207,7 +325,7 @@ def made(request, tmp_path_factory) -> tuple[Kind, Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> Path:
+def plain_run(tmp_path_factory) -> Path:
     """The container of a feature of an array, of several tiles; x is cut by the feature."""
     path = tmp_path_factory.mktemp("plain") / "run.fhz"
     values = smooth(5, 12, 20, 24).astype(np.float32)
@@ -217,7 +335,7 @@ def plain(tmp_path_factory) -> Path:
     return path
 
 
-def opened_xarray_backend(path: Path, **options: Any) -> xr.Dataset:
+def opened_alone(path: Path, **options: Any) -> xr.Dataset:
     return xr.open_dataset(path, engine=FhashBackend, **options)
 
 
@@ -239,7 +357,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
     name = kind.variable
     with (
         xr.open_dataset(source, decode_coords=coords) as whole,
-        opened_xarray_backend(container, decode_coords=coords) as stored,
+        opened_alone(container, decode_coords=coords) as stored,
     ):
         wanted, found = whole.isel(kind.select), stored
         if not coords:
@@ -261,7 +379,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
             )
 
 
-def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
+def test_values_are_read_when_they_are_asked_for(plain_run, monkeypatch) -> None:
     read = []
     original = fhash_codec.Volume.values_of_steps
     monkeypatch.setattr(
@@ -272,7 +390,7 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
             original(self, steps, *args, **kw),
         )[1],
     )
-    with opened_xarray_backend(plain) as stored:
+    with opened_alone(plain_run) as stored:
         part = stored["values"].isel(time=slice(3, None, -2), z=4)
         assert read == []
         assert part.shape == (2, 20, 24)
@@ -289,17 +407,20 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
         (-1, -2, -3, -4),
     ],
 )
-def test_indices_are_those_of_numpy(plain, key: tuple[Any, ...]) -> None:
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
+def test_indices_are_those_of_numpy(plain_run, key: tuple[Any, ...]) -> None:
+    with (
+        fhash_codec.open(plain_run) as volume,
+        opened_alone(plain_run) as stored,
+    ):
         whole = xr.Variable(volume.dims, volume[...])
         np.testing.assert_array_equal(stored["values"][key].values, whole[key].values)
 
 
-def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
-    with fhash_codec.open(plain) as volume:
+def test_dask_reads_tiles_with_the_same_bits(plain_run) -> None:
+    with fhash_codec.open(plain_run) as volume:
         whole = volume[...]
         tile = volume.chunks
-    with opened_xarray_backend(plain, chunks={}) as stored:
+    with opened_alone(plain_run, chunks={}) as stored:
         lazy = stored["values"]
         assert tuple(along[0] for along in lazy.chunks) == tile
         for scheduler in ("synchronous", "threads", "processes"):
@@ -308,10 +429,10 @@ def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
             assert found.tobytes() == whole.tobytes(), scheduler
 
 
-def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
+def test_another_file_of_the_same_name_is_refused(plain_run, tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    path.write_bytes(plain.read_bytes())
-    with opened_xarray_backend(path) as stored:
+    path.write_bytes(plain_run.read_bytes())
+    with opened_alone(path) as stored:
         data = pickle.dumps(stored)
     path.unlink()
     fhash_codec.encode(smooth(5, 12, 20, 24), path, QUICK)
@@ -319,8 +440,11 @@ def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
         pickle.loads(data)["values"].values  # noqa: B018 - reads them
 
 
-def test_levels_of_detail_have_every_other_vertex(plain) -> None:
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain, lod=1) as stored:
+def test_levels_of_detail_have_every_other_vertex(plain_run) -> None:
+    with (
+        fhash_codec.open(plain_run) as volume,
+        opened_alone(plain_run, lod=1) as stored,
+    ):
         z, y, x = volume.lod_vertices(1)
         assert stored["values"].shape == (5, len(z), len(y), len(x))
         np.testing.assert_array_equal(stored["x"], list(x))
@@ -333,13 +457,13 @@ def test_levels_of_detail_have_every_other_vertex(plain) -> None:
 @pytest.mark.parametrize(
     "options", [{"outside": "zero"}, {"lod": 1, "outside": "background"}, {"variable": "u"}]
 )
-def test_other_options_are_refused(plain, options: dict[str, Any]) -> None:
+def test_other_options_are_refused(plain_run, options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        opened_xarray_backend(plain, **options)
+        opened_alone(plain_run, **options)
 
 
-def test_a_container_is_known_by_its_end(plain, tmp_path) -> None:
-    (tmp_path / "run").write_bytes(plain.read_bytes())
+def test_a_container_is_known_by_its_end(plain_run, tmp_path) -> None:
+    (tmp_path / "run").write_bytes(plain_run.read_bytes())
     (tmp_path / "other").write_bytes(b"nothing")
     backend = FhashBackend()
     assert backend.guess_can_open("s3://bucket/run.fhz")
@@ -358,7 +482,7 @@ def test_a_dataset_is_encoded_by_its_accessor(tmp_path) -> None:
     kind = KINDS["rotated"]()
     source = xr.decode_cf(kind.dataset, decode_coords="all")
     source.fhash.encode(tmp_path / "run.fhz", effort=1, psnr=45.0)
-    with opened_xarray_backend(tmp_path / "run.fhz", decode_coords="all") as stored:
+    with opened_alone(tmp_path / "run.fhz", decode_coords="all") as stored:
         same = stored.assign(tas=stored["tas"].copy(data=source["tas"].values))
         xr.testing.assert_identical(without_own(source), without_own(same))
     with pytest.raises(InputError, match="unknown setting"):
@@ -378,7 +502,7 @@ def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None
     fhash_codec.encode_dataset(tmp_path / "two.nc", tmp_path / "run.fhz", QUICK)
     with (
         xr.open_dataset(tmp_path / "two.nc") as whole,
-        opened_xarray_backend(tmp_path / "run.fhz") as found,
+        opened_alone(tmp_path / "run.fhz") as found,
     ):
         same = found
         for name in ("tas", "pr"):
@@ -431,7 +555,7 @@ def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: st
             fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
     else:
         fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
-    with opened_xarray_backend(tmp_path / "run.fhz") as stored:
+    with opened_alone(tmp_path / "run.fhz") as stored:
         error = stored["t2m"].attrs["fhash_max_error"]
         assert "valid_min" not in stored["t2m"].attrs
         stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")
@@ -453,7 +577,11 @@ def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: s
     with open_series(source, var=made.variable) as series:
         fhash_codec.encode(series, tmp_path / "path.fhz", QUICK)
     numbers = {"decode_times": False}
-    for name, options in (("plain", numbers), ("all", {"decode_coords": "all"}), ("dates", {})):
+    for name, options in (
+        ("plain", numbers),
+        ("all", {"decode_coords": "all"}),
+        ("dates", {}),
+    ):
         with read(**options) as data:
             series = labelled_series(data, made.variable)
             fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)

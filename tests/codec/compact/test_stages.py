@@ -1,7 +1,8 @@
-"""The centre of a series: its plateau, or the mean without one."""
+"""Stages of planning: each choice pays, stays out where it does not, and keeps the promise."""
 
 from __future__ import annotations
 
+import lzma
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,10 +16,14 @@ from planned import plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact import predictor as choice
 from fhash_codec.compact import stages as planning
 from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling
-from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.goal import Goal, goal_of
 from fhash_codec.compact.head import EFFORTS, Budget, Effort
+from fhash_codec.compact.labels import ends_trials, holds_beside, look_at_labels, rank_share
+from fhash_codec.compact.plan import CodingPlan, plan
+from fhash_codec.compact.predictor import IntegerTile, best_predictor, fit_weights
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
     choose_tiles,
@@ -28,11 +33,229 @@ from fhash_codec.compact.stages import (
     mask_levels,
 )
 from fhash_codec.compact.step import find_step
-from fhash_codec.compact.tiles import Coding, Index, Tile
+from fhash_codec.compact.tiles import Blocks, Coding, Index, Tile
 from fhash_codec.compact.transform import Bases, basis_bytes, usual_transform
 from fhash_codec.features.features import dilate, parse_feature
+from fhash_codec.features.selection import select_features
+from fhash_codec.progress import silent
+from fhash_formats.series import ArraySeries
+from fhash_formats.transform.predict import Predictor, encode_predicted, passes_of
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
+
+Field = Callable[..., npt.NDArray[Any]]
+
+
+def plan_of(source: npt.NDArray[Any], config: EncodeConfig) -> tuple[CodingPlan, list[int]]:
+    """Return the plan of a series, and the progress on the way."""
+    series, done = ArraySeries(source), []
+    selection = select_features(series, config, silent)
+    value_range = selection.scanned.value_range
+    integers = source.dtype.kind in "iu"
+    goal = goal_of(config, value_range, source.nbytes, 3000, integers=integers)
+    blocks = Blocks(series, selection.extent, series.shape)
+
+    def progress(_what: str, part: int, of: int, _detail: str) -> None:
+        assert of == 7
+        if not done or part != done[-1]:
+            done.append(part)
+
+    with ThreadPoolExecutor(2) as workers:
+        features = selection.features
+        return plan(blocks, value_range, config, goal, 3000, workers, progress, features), done
+
+
+def test_effort_1_codes_no_sample_for_a_psnr(field: Field) -> None:
+    quick, done = plan_of(field(), EncodeConfig(effort=1, tile="2x4x5x8"))
+    assert quick.sample is None
+    assert quick.gains == []
+    assert quick.blocks.tile == (2, 4, 5, 8)
+    assert done == [0, 7]
+
+
+@pytest.mark.parametrize("factor", [1e200, 1e-200])
+def test_values_whose_squares_overflow_are_stored_without_loss(field: Field, factor: float) -> None:
+    exact, done = plan_of(field(dtype=np.float64) * factor, EncodeConfig(effort=2))
+    assert exact.coding.exact
+    assert exact.settings.double
+    assert done == []
+
+
+def counts() -> npt.NDArray[np.int16]:
+    """Counted events (6, 8, 24, 24) on a background of 50: smooth means, random numbers."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 8, 24, 24)), indexing="ij")
+    means = 4000 * np.exp(-8 * ((x - 0.3 - 0.3 * t) ** 2 + (y - 0.5) ** 2 + (z - 0.5) ** 2))
+    return (50 + np.random.default_rng(0).poisson(means)).astype(np.int16)
+
+
+@pytest.mark.parametrize(("psnr", "exact"), [(90.0, True), (60.0, False)])
+def test_integers_are_exact_where_a_psnr_leaves_hardly_any_error(psnr: float, exact: bool) -> None:
+    """A transform with a step that is finer than the integers takes more bytes than all of them."""
+    found, _ = plan_of(counts(), EncodeConfig(psnr=psnr, effort=2))
+    assert found.goal.lossless is exact
+    if exact:
+        asked, _ = plan_of(counts(), EncodeConfig(max_error=0.0, effort=2))
+        assert found.settings == asked.settings
+        assert found.size == asked.size
+
+
+def moving_regions() -> np.ndarray:
+    """Regions (6, 12, 48, 48) of sixty labels that move and do not follow an order."""
+    z, y, x = np.meshgrid(*(np.arange(n) for n in (12, 48, 48)), indexing="ij")
+    chance = np.random.default_rng(0)
+    points, speeds = chance.uniform(0, 48, (60, 3)), chance.normal(0, 0.7, (60, 3))
+    frames = []
+    for t in range(6):
+        u, v, w = (points + t * speeds).T[:, :, None, None, None]
+        frames.append(np.argmin((x - u) ** 2 + (y - v) ** 2 + (z - w / 4) ** 2, axis=0))
+    return (np.stack(frames) * 37 % 101).astype("i2")
+
+
+def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.ndarray]:
+    path = tmp_path / "a.fhz"
+    promise = {} if "psnr" in changes or "max_error" in changes else {"max_error": 0.0}
+    config = EncodeConfig(timings=False, **{"effort": 2, **promise, **changes})
+    figures = fhash_codec.encode(values, path, config, force=True)
+    with fhash_codec.open(path) as volume:
+        settings = volume.container.arrays["tables/level_1"].settings
+        used = {name for name in ("labels", "mask") if getattr(settings, name)}
+        return figures["bytes"], used, volume[...]
+
+
+def test_labels_take_fewer_bytes_than_xz(tmp_path) -> None:
+    values = moving_regions()
+    size, features, decoded = encoded(tmp_path, values)
+    assert "labels" in features
+    np.testing.assert_array_equal(decoded, values)
+    assert size < len(lzma.compress(values.tobytes(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def test_labels_in_floats_and_with_a_feature(tmp_path) -> None:
+    values = moving_regions().astype("f4")
+    values[values == values[0, 0, 0, 0]] = np.nan
+    _, features, decoded = encoded(tmp_path, values, features=("interval:10:60",), dilation=0)
+    assert {"labels", "mask"} <= features
+    inside = (values >= 10) & (values <= 60)
+    np.testing.assert_array_equal(decoded, np.where(inside, values, np.nan))
+
+
+@pytest.mark.parametrize("promise", [{"psnr": 45.0}, {"max_error": 1.0}])
+@pytest.mark.parametrize("effort", [1, 2])
+def test_labels_keep_other_promises_in_fewer_bytes(
+    tmp_path, promise: dict[str, float], effort: int
+) -> None:
+    values = moving_regions()
+    size, features, decoded = encoded(tmp_path, values, effort=effort, **promise)
+    assert "labels" in features
+    np.testing.assert_array_equal(decoded, values)
+    exact_size, _, _ = encoded(tmp_path, values, effort=effort)
+    assert size < 1.02 * exact_size
+
+
+def test_labels_under_a_promise_with_tiles_that_have_none(tmp_path) -> None:
+    """Tiles of too many different values keep the promise by a transform."""
+    values = np.tile(moving_regions(), (1, 1, 2, 2)).astype("f4")
+    noise = np.random.default_rng(0).normal(0, 20, (6, 12, 8, 8))
+    values[:, :, -8:, -8:] = noise
+    size, features, decoded = encoded(tmp_path, values, max_error=2.0, tile="6x12x16x16")
+    assert "labels" in features
+    assert np.abs(decoded - values).max() <= 2.0
+    np.testing.assert_array_equal(decoded[:, :, :48, :48], values[:, :, :48, :48])
+    assert size < encoded(tmp_path, values, tile="6x12x16x16")[0]
+
+
+def test_a_plateau_beside_a_shell_of_many_values_does_not_end_the_trials() -> None:
+    """Tiles of a sample may all lie on the plateau; those of the shell are no labels."""
+    regions = moving_regions().astype("f4")
+    shell = regions.copy()
+    shell[:, :, -16:, -16:] = np.random.default_rng(0).normal(0, 1, (6, 12, 16, 16))
+    with ThreadPoolExecutor(2) as workers:
+        for values, alone in ((regions, True), (shell, False)):
+            task = plan_task(values, workers, psnr=45.0)
+            tiled = task.blocks.retile((6, 12, 16, 16))
+            trial = look_at_labels(task, tiled, first_settings(task, tiled))
+            assert trial.alone is alone
+            assert ends_trials(trial, 1e9) is alone
+
+
+def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:
+    """The first tile is of two values, the one with the highest cost is smooth beside them."""
+    values = np.zeros((2, 8, 16, 64), "f4")
+    values[..., 5:11] = 1.0
+    values[..., 16:] = np.sin(np.tensordot((0.1, 0.11, 0.13, 0.17), np.indices((2, 8, 16, 48)), 1))
+    with ThreadPoolExecutor(2) as workers:
+        task = plan_task(values, workers, psnr=30.0)
+        tiled = task.blocks.retile((2, 8, 16, 16))
+        settings, coding = first_settings(task, tiled), Coding(filled=True)
+
+        def attempt(costs: list[float] | None, *, labels: bool) -> Attempt:
+            sample = Sample(tiled, 1, workers, costs)
+            found = replace(settings, labels=labels)
+            outcome = sample.run(found, coding)
+            return Attempt(sample=sample, settings=found, outcome=outcome, coding=coding)
+
+        plateau = attempt(None, labels=True)
+        smooth = attempt([0.0, 0.0, 1.0, 3.0], labels=False)
+        # Its tile is no label: by these settings it takes what a first guess takes, not less.
+        smooth = replace(smooth, outcome=replace(smooth.outcome, size=smooth.outcome.size - 1))
+        assert plateau.outcome.size < smooth.outcome.size
+        assert not holds_beside(task, plateau, smooth)
+        assert holds_beside(task, plateau, attempt(None, labels=False))
+
+
+def pieces(lengths: list[int]) -> np.ndarray:
+    """Random numbers (2, 6, 24, x) that are the same along each of some pieces of x."""
+    noise = np.random.default_rng(0).integers(0, 12, (2, 6, 24, len(lengths)))
+    return np.repeat(noise, lengths, axis=3).astype("u1")
+
+
+def test_the_rank_is_that_of_the_axis_with_the_fewest_vectors() -> None:
+    noise = np.random.default_rng(0).integers(0, 12, (2, 6, 24, 28)).astype("u1")
+    assert rank_share([noise]) > 0.7
+    assert rank_share([pieces([5, 9, 14])]) == 3 / 28
+    assert rank_share([pieces([5, 9, 14]), pieces([9, 5, 14])]) == 4 / 28
+    assert rank_share([np.zeros((1, 2, 3, 4), "i4")]) == 1.0
+
+
+def rough(dtype: str) -> npt.NDArray[Any]:
+    """Return noise between two ends, which a bound cuts into few values: no use for a transform."""
+    return np.random.default_rng(0).uniform(0, 1000, (4, 12, 16, 16)).astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64", "uint16"])
+def test_a_file_by_prediction_keeps_the_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: str
+) -> None:
+    def of_no_bytes(*given: Any, **named: Any) -> tuple[Predictor, int]:
+        best = best_predictor(*given, **named)
+        assert best is not None
+        return best[0], 0
+
+    monkeypatch.setattr(choice, "best_predictor", of_no_bytes)
+    values = rough(dtype)
+    path = tmp_path / "a.fhz"
+    report = fhash_codec.encode(values, path, fhash_codec.EncodeConfig(max_error=100.5, effort=3))
+    assert "prediction" in [gain["what"] for gain in report["gains"]]
+    with fhash_codec.open(path) as volume:
+        decoded = volume[...]
+    assert np.abs(decoded.astype(np.float64) - values.astype(np.float64)).max() <= 100.5
+
+
+def test_trained_weights_beat_none() -> None:
+    y, x = np.meshgrid(np.arange(48), np.arange(48), indexing="ij")
+    frame = 3000 * np.sin(x / 7 + y / 11) + 2000 * np.cos(x / 5 - y / 6)
+    steps = np.stack([frame * (1 + 0.1 * t) for t in range(4)])
+    integers = np.rint(steps).astype(np.int32)[:, None]
+    levels, order = (0, 0, 3, 3), (0, 1, 2, 3)
+    trained = fit_weights([IntegerTile(integers, None)], levels, order, 1)
+    zeros = (0,) * sum(len(refinement.taps) for refinement in passes_of(levels, order, 1))
+    sizes = []
+    for weights in (trained, zeros):
+        predictor = Predictor(
+            step=1.0, origin=0.0, levels=levels, order=order, reach=1, weights=weights
+        )
+        sizes.append(len(encode_predicted(integers, None, predictor)[0]))
+    assert sizes[0] < 0.8 * sizes[1]
 
 
 @pytest.mark.parametrize("effort", [1, 2])
@@ -102,9 +325,6 @@ def test_bases_that_are_too_fine_become_coarser(workers: ThreadPoolExecutor) -> 
     assert saved > 100
     assert new.size + basis_bytes(other.transform) < outcome.size + basis_bytes(settings.transform)
     assert new.psnr(GOAL.data_range) == pytest.approx(40.0, abs=0.2)
-
-
-Field = Callable[..., npt.NDArray[Any]]
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8"])
