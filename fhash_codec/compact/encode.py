@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.attempt import region_vertices
+from fhash_codec.compact.attempt import HeadHistory, region_vertices
 from fhash_codec.compact.goal import (
     EXCHANGE,
     RATIO_SLACK,
@@ -26,9 +26,9 @@ from fhash_codec.compact.goal import (
     integer_goal,
     promise,
 )
-from fhash_codec.compact.head import HEAD_BYTES, HeadHistory
+from fhash_codec.compact.head import HEAD_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
-from fhash_codec.compact.plan import CodingPlan, plan
+from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.step import (
     FINEST_PSNR,
     MAX_STEP_SHARE,
@@ -235,8 +235,6 @@ def code_to_size(table: CodedTable, window: ByteWindow, code_all: CodeAll) -> Co
     return best
 
 
-OVERHEAD_BYTES = 2000
-"""Approximate bytes of a container without its tiles, for the sizes after each stage."""
 PASSES = 4
 """Times that all tiles are coded at most for a promise that the sample did not foretell."""
 SAFE = 1e-3
@@ -295,10 +293,8 @@ def code_series(
             blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
             about = selection.scanned.value_range.moved(-blocks.origin)
             exactly = integer_goal(0, goal.data_range)
-            exact = plan(
-                *(blocks, about, config, exactly, OVERHEAD_BYTES),
-                *(workers, progress, selection.features),
-            )
+            features = selection.features
+            exact = plan(blocks, about, config, exactly, workers, progress, features)
             other = _code_all(replace(exact, goal=goal), workers, progress)
             table = other if other.outcome.size < table.outcome.size else table
     seconds = round(time.perf_counter() - begun, 3)
@@ -346,9 +342,7 @@ def plan_series(
     # No step of the quantiser reaches such a PSNR, and integers can be exact.
     beyond = integers and goal.psnr is not None and goal.psnr > FINEST_PSNR
     asked = integer_goal(0, goal.data_range) if beyond else goal
-    coding_plan = plan(
-        blocks, about, config, asked, OVERHEAD_BYTES, workers, progress, selection.features
-    )
+    coding_plan = plan(blocks, about, config, asked, workers, progress, selection.features)
     return coding_plan, goal, None if bulk is None else bulk.moved(origin)
 
 

@@ -30,7 +30,7 @@ from fhash_codec.compact.encode import (
     code_to_size,
 )
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.head_training import Pair, train_head
+from fhash_codec.compact.head_training import Budget, Pair, Shape, train_head
 from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
 from fhash_codec.compact.transform import usual_transform
@@ -397,7 +397,9 @@ def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
 def trained(pairs: list[Pair], settings: TileSettings) -> NeighbourHead:
     """A small head for some tiles."""
     low, high = settings.low, settings.high
-    found = train_head(pairs, low=low, high=high, updates=300, samples=60_000, hidden=(4, 4))
+    found = train_head(
+        pairs, low, high, Shape((4, 4), cross=False), Budget(updates=300, samples=60_000)
+    )
     assert found is not None
     return found.head
 

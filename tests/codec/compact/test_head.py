@@ -224,13 +224,8 @@ def mse(first: Floats, second: Floats) -> float:
 
 def test_a_front_is_sharpened_by_what_the_gain_says(front: tuple[Floats, Floats]) -> None:
     decoded, original = front
-    trained = train_head(
-        [Pair(decoded, original, None)],
-        low=-1.0,
-        high=2.0,
-        updates=300,
-        samples=200_000,
-    )
+    budget = Budget(updates=300, samples=200_000)
+    trained = train_head([Pair(decoded, original, None)], -1.0, 2.0, PERCEPTRON, budget)
     gained = 10 * np.log10(
         mse(np.clip(decoded, -1, 2), original) / mse(trained.head.apply(decoded), original)
     )
@@ -250,15 +245,10 @@ def far() -> tuple[Floats, Floats]:
 
 
 def test_a_cross_sees_farther(far: tuple[Floats, Floats]) -> None:
-    settings = {
-        "low": -8.0,
-        "high": 8.0,
-        "hidden": (8, 8),
-        "samples": 100_000,
-        "updates": 400,
-    }
+    budget = Budget(updates=400, samples=100_000)
     near, cross = (
-        train_head([Pair(*far, None)], cross=cross, **settings) for cross in (False, True)
+        train_head([Pair(*far, None)], -8.0, 8.0, Shape((8, 8), cross=cross), budget)
+        for cross in (False, True)
     )
     assert cross.gain_db > near.gain_db + 0.3
     gained = 10 * np.log10(mse(*far) / mse(cross.head.apply(far[0]), far[1]))
@@ -268,16 +258,9 @@ def test_a_cross_sees_farther(far: tuple[Floats, Floats]) -> None:
 
 @pytest.mark.parametrize("cross", [False, True])
 def test_the_same_seed_gives_the_same_head(front: tuple[Floats, Floats], cross: bool) -> None:
-    settings = {
-        "low": -1.0,
-        "high": 2.0,
-        "hidden": (4, 4),
-        "cross": cross,
-        "samples": 40_000,
-        "updates": 40,
-    }
+    shape, budget = Shape((4, 4), cross=cross), Budget(updates=40, samples=40_000)
     runs = [
-        train_head([Pair(*front, None)], seed=seed, **settings).head.to_bytes()
+        train_head([Pair(*front, None)], -1.0, 2.0, shape, budget, seed=seed).head.to_bytes()
         for seed in (4, 4, 5)
     ]
     assert runs[0] == runs[1] != runs[2]
@@ -288,14 +271,9 @@ def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) ->
     counted = np.zeros(original.shape, dtype=bool)
     counted[:, 2:9] = True
     other = np.where(counted, original, np.nan).astype(np.float32)
+    budget = Budget(updates=40, samples=40_000)
     heads = [
-        train_head(
-            [Pair(decoded, values, counted)],
-            low=-1.0,
-            high=2.0,
-            updates=40,
-            samples=40_000,
-        ).head
+        train_head([Pair(decoded, values, counted)], -1.0, 2.0, PERCEPTRON, budget).head
         for values in (original, other)
     ]
     assert heads[0].to_bytes() == heads[1].to_bytes()
@@ -316,7 +294,8 @@ def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) ->
     ids=["exact", "error too small", "error too large", "no voxel counts"],
 )
 def test_where_nothing_can_be_learned_there_is_no_head(pair: Pair) -> None:
-    assert train_head([pair], low=-3e38, high=3e38, updates=5, samples=4096) is None
+    budget = Budget(updates=5, samples=4096)
+    assert train_head([pair], -3e38, 3e38, PERCEPTRON, budget) is None
 
 
 def fronts() -> npt.NDArray[np.float32]:

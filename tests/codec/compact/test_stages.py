@@ -62,7 +62,7 @@ def plan_of(source: npt.NDArray[Any], config: EncodeConfig) -> tuple[CodingPlan,
 
     with ThreadPoolExecutor(2) as workers:
         features = selection.features
-        return plan(blocks, value_range, config, goal, 3000, workers, progress, features), done
+        return plan(blocks, value_range, config, goal, workers, progress, features), done
 
 
 def test_effort_1_codes_no_sample_for_a_psnr(field: Field) -> None:
