@@ -16,7 +16,7 @@ from fhash_codec.measure.errors import (
     range_and_sum,
     squared_errors,
 )
-from fhash_codec.measure.metrics import measure_quality, neighbours_of
+from fhash_codec.measure.metrics import Comparer, measure_quality, neighbours_of
 from fhash_codec.measure.value_range import Ranks, ValueRange
 from fhash_formats.errors import InputError
 
@@ -276,10 +276,15 @@ def psnr(errors) -> float:
     return -10 * math.log10(np.mean(np.concatenate(errors) ** 2))
 
 
+def quality_of(original, decode, steps, comparer, **options):
+    """The quality with the SSIM of all steps."""
+    return measure_quality(
+        comparer, original.__getitem__, decode, steps, list(range(steps)), **options
+    )
+
+
 def test_figures_are_those_of_the_steps_and_of_the_interpolated_source() -> None:
-    quality = measure_quality(
-        SOURCE.__getitem__, decoded, 7, 1.0, 0.0, neighbours=neighbours()
-    ).between
+    quality = quality_of(SOURCE, decoded, 7, Comparer(1.0, 0.0), neighbours=neighbours()).between
     own, linear, fringe, fringe_linear = [], [], [], []
     mean = (SOURCE[1].astype(float) + SOURCE[3]) / 2
     for step, frame in ((0, SOURCE[1]), (2, mean), (5, SOURCE[4]), (6, SOURCE[4])):
@@ -305,9 +310,8 @@ def test_vertices_that_a_key_frame_lacks_have_no_interpolated_source() -> None:
     gaps[1, 0], gaps[3, 1] = np.nan, np.inf
     found = neighbours(gaps)(2)
     assert np.isfinite(found.interpolated()[2:]).all()
-    quality = measure_quality(
-        SOURCE.__getitem__, decoded, 7, 1.0, 0.0, neighbours=neighbours(gaps)
-    ).between
+    near = neighbours(gaps)
+    quality = quality_of(SOURCE, decoded, 7, Comparer(1.0, 0.0), neighbours=near).between
     assert quality.psnr_linear is not None
 
 
@@ -324,8 +328,12 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
     decoded[outside] = np.nan
     original[0, 0, 0, :2] = np.nan
     calls = []
-    quality = measure_quality(
-        original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, lambda *call: calls.append(call)
+    quality = quality_of(
+        original,
+        decoded.__getitem__,
+        4,
+        Comparer(1.0, 0.5),
+        progress=lambda *call: calls.append(call),
     )
     finite = np.isfinite(original)
     inside = finite & ~outside
@@ -376,9 +384,8 @@ def test_the_bulk_is_measured_within_its_range_and_the_coreset() -> None:
     original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
     decoded[original > 0.75] += 1.0
     decoded[np.random.default_rng(3).random(original.shape) < 0.4] = np.nan
-    quality = measure_quality(
-        original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, bulk=ValueRange(0.25, 0.75)
-    )
+    comparer = Comparer(1.0, 0.5, ValueRange(0.25, 0.75))
+    quality = quality_of(original, decoded.__getitem__, 4, comparer)
     inside = np.isfinite(decoded) & (original >= 0.25) & (original <= 0.75)
     rmse = math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2))
     assert quality.bulk.rmse == pytest.approx(rmse, rel=1e-5)
@@ -396,13 +403,12 @@ def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held) -> None:
     monkeypatch.setattr("fhash_codec.measure.metrics.FRAMES_HELD", held)
     original, decoded = frames(9)
     calls = []
-    quality = measure_quality(
-        lambda step: original[step],
-        lambda step: decoded[step],
+    quality = quality_of(
+        original,
+        decoded.__getitem__,
         9,
-        1.0,
-        0.0,
-        lambda *call: calls.append(call),
+        Comparer(1.0, 0.0),
+        progress=lambda *call: calls.append(call),
     )
     assert [(call[1], call[2]) for call in calls] == [(step + 1, 9) for step in range(9)]
     assert [step.step for step in quality.per_step] == list(range(9))
