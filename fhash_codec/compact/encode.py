@@ -19,9 +19,8 @@ from fhash_codec.compact.goal import (
     EXCHANGE,
     RATIO_SLACK,
     SLOPE,
-    Bracket,
     Goal,
-    arithmetic_mean,
+    SizeSearch,
     goal_of,
     integer_goal,
     promise,
@@ -162,8 +161,6 @@ def measure_region(table: CodedTable) -> float:
 
 SIZE_PASSES = 10
 """Times that all tiles are coded at most."""
-USUAL_FALL = SLOPE / EXCHANGE
-"""Octaves of bytes that a step larger by a factor of e saves: the first assumption."""
 CodeAll = Callable[[CodingPlan], CodedTable]
 """Function that codes all tiles by a plan."""
 
@@ -211,24 +208,14 @@ def code_to_size(table: CodedTable, window: ByteWindow, code_all: CodeAll) -> Co
     if plan.goal.data_range <= 0:
         return table
     data_range = max(plan.goal.data_range, 1e-300)
-    bracket = Bracket(
-        math.log(data_range * MIN_STEP_SHARE),
-        math.log(data_range * MAX_STEP_SHARE),
-        middle=arithmetic_mean,
-    )
     target = max((window.low + window.high) / 2, 1.0)
-    fall, before = USUAL_FALL, None
+    search = SizeSearch(data_range, (MIN_STEP_SHARE, MAX_STEP_SHARE), target, drifts=False)
     for _ in range(SIZE_PASSES):
-        size, log_step = table.outcome.size, math.log(table.plan.settings.step)
+        settings, size = table.plan.settings, table.outcome.size
         if window.holds(table) or (size < window.low and is_exact(table)):
             break
-        bracket = bracket.narrowed(log_step, too_low=size > window.high)
-        if before is not None and (before[0] - log_step) * (size - before[1]) > 0:
-            measured = math.log2(size / before[1]) / (before[0] - log_step)
-            fall = min(max(measured, USUAL_FALL / 4), USUAL_FALL * 4)
-        before = log_step, size
-        log_step = bracket.inside(log_step + math.log2(max(size, 1) / target) / fall)
-        settings = with_step(table.plan.settings, math.exp(log_step), plan.goal)
+        log_step = search.after(math.log(settings.step), size, too_fine=size > window.high)
+        settings = with_step(settings, math.exp(log_step), plan.goal)
         table = code_all(replace(plan, settings=settings))
         if window.prefers(table, best):
             best = table

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from fhash_codec.features.bricks import brick_shape, build_coreset, parse_brick
-from fhash_codec.features.features import Everything, Interval, Isosurface, Segmentation, dilate
+from fhash_codec.features.features import (
+    Everything,
+    FeatureChoice,
+    Interval,
+    Isosurface,
+    Segmentation,
+    dilate,
+)
 from fhash_codec.features.occupancy import morton_index, pack, packed_bytes, unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.progress import silent
@@ -101,7 +108,8 @@ def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
     series = ArraySeries(array)
     seen = scan(series, silent)
     keys = tuple(range(series.shape[0])) if keys is None else keys
-    return build_coreset(series, seen, keys, features, dilation, silent, **kwargs), seen
+    choice = FeatureChoice(keys, features, dilation)
+    return build_coreset(series, seen, choice, silent, **kwargs), seen
 
 
 def check_against_direct_crop(array, features, keys, dilation, **kwargs) -> None:

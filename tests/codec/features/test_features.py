@@ -9,6 +9,7 @@ from fhash_codec.features.features import (
     Everything,
     Extent,
     Feature,
+    FeatureChoice,
     Interval,
     Isosurface,
     Mask,
@@ -30,7 +31,8 @@ VALUES = np.random.default_rng(0).random((4, 5, 6, 7))
 
 def extent_of(values: np.ndarray, features: tuple[Feature, ...], dilation: int = 0) -> Extent:
     series = ArraySeries(values)
-    return find_extent(series, scan(series, silent), (0, 1, 3), features, dilation, silent)
+    choice = FeatureChoice((0, 1, 3), features, dilation)
+    return find_extent(series, scan(series, silent), choice, silent)
 
 
 def test_masks_are_the_selected_vertices_in_the_box_of_all_key_frames() -> None:
@@ -61,7 +63,8 @@ def test_features_are_kept_apart_where_asked_and_make_up_the_whole() -> None:
     values[0, 2, 3, 4] = np.nan
     features = (Interval(0.9, 1.0), Everything(), Interval(0.0, 0.1))
     series = ArraySeries(values)
-    extent = find_extent(series, scan(series, silent), (0, 1, 3), features, 1, silent, apart=True)
+    choice = FeatureChoice((0, 1, 3), features, 1)
+    extent = find_extent(series, scan(series, silent), choice, silent, apart=True)
     for key in range(3):
         masks = [extent.mask_of(number, key) for number in range(3)]
         np.testing.assert_array_equal(np.logical_or.reduce(masks), extent.mask(key))

@@ -18,7 +18,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Interval
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.encode import Selection, select
 from fhash_codec.paper.engines import make_engine
@@ -176,7 +176,7 @@ def _noise_coreset(
     series = ArraySeries(np.random.default_rng(3).random(shape, dtype=np.float32))
     scanned = scan(series, silent)
     return build_coreset(
-        series, scanned, range(shape[0]), [Interval(low, 1.0)], 0, silent, fringe=fringe
+        series, scanned, FeatureChoice(range(shape[0]), [Interval(low, 1.0)]), silent, fringe=fringe
     )
 
 
@@ -338,7 +338,9 @@ def _coreset(bend: float) -> Coreset:
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 12, 20, 36)), indexing="ij")
     values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
     series = ArraySeries(values + bend * values**2)
-    return build_coreset(series, scan(series, silent), range(3), [Everything()], 0, silent)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(range(3), [Everything()]), silent
+    )
 
 
 @pytest.fixture(scope="session")

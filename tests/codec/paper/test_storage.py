@@ -15,7 +15,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Interval
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
@@ -45,7 +45,9 @@ def coreset_of(fringe: bool) -> Coreset:
         values[step, 2 * step : 2 * step + 2] = 1.0
     series = ArraySeries(values)
     scanned = scan(series, silent)
-    return build_coreset(series, scanned, range(3), [Interval(0.5, 2.0)], 0, silent, fringe=fringe)
+    return build_coreset(
+        series, scanned, FeatureChoice(range(3), [Interval(0.5, 2.0)]), silent, fringe=fringe
+    )
 
 
 @pytest.fixture
@@ -95,7 +97,9 @@ def test_without_a_fringe_nothing_is_rounded(coreset) -> None:
 @pytest.fixture(scope="module")
 def tiny() -> Coreset:
     series = ArraySeries(np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5))
-    return build_coreset(series, scan(series, silent), range(2), [Everything()], 0, silent)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(range(2), [Everything()]), silent
+    )
 
 
 class Stored:

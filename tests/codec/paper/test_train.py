@@ -16,7 +16,7 @@ import fhash_codec
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Interval
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.fit import (
@@ -32,6 +32,7 @@ from fhash_codec.paper.network import Architecture
 from fhash_codec.paper.train import (
     LOWER,
     MAX_RESTARTS,
+    Breaks,
     Diverged,
     Probe,
     TrainingProgress,
@@ -58,15 +59,8 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(setup, coreset, tmp_pa
     def ask(stage, done, total, note):
         stop.asked = done >= moment
 
-    assert not train(
-        engine,
-        plan,
-        coreset,
-        reached,
-        stop=stop,
-        save=lambda c: save_checkpoint(path, engine.state(), c),
-        progress=ask,
-    )
+    breaks = Breaks(stop=stop, save=lambda c: save_checkpoint(path, engine.state(), c))
+    assert not train(engine, plan, coreset, reached, breaks, ask)
     state, later = load_checkpoint(path)
     _, resumed = setup(coreset)
     resumed.restore(state)
@@ -128,7 +122,9 @@ class Engine:
 def built(field: np.ndarray, feature: object, fringe: bool) -> Coreset:
     series = ArraySeries(field)
     keys = range(len(field))
-    return build_coreset(series, scan(series, silent), keys, [feature], 0, silent, fringe=fringe)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(keys, [feature]), silent, fringe=fringe
+    )
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Feature, Interval
+from fhash_codec.features.features import Everything, Feature, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.engines.slab import (
@@ -223,7 +223,7 @@ def box_of_isabel(feature: Feature) -> Coreset:
         sparse=True,
     )
     series = ArraySeries(np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)
-    return build_coreset(series, scan(series, silent), range(4), [feature], 0, silent)
+    return build_coreset(series, scan(series, silent), FeatureChoice(range(4), [feature]), silent)
 
 
 @pytest.mark.parametrize("feature", [Everything(), Interval(1.1, 1.5)], ids=["all", "a feature"])
