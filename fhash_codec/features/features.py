@@ -480,7 +480,7 @@ class Extent:
 
 
 class FeatureChoice(NamedTuple):
-    """What is to be kept of a series."""
+    """Features at key frames that are to be kept of a series."""
 
     key_frames: Sequence[int]
     """Steps to look at."""

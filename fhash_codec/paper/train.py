@@ -256,7 +256,7 @@ SaveProgress = Callable[[TrainingProgress], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Breaks:
-    """What saves a training on its way, or ends it early.
+    """Request to stop, saving, and limit in time of a training.
 
     Attributes:
         stop: asks for an end, which comes after the running batch.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray
-import zarr
 
 import fhash_codec
 from fhash_codec import (
@@ -86,34 +84,6 @@ def test_every_variable_of_a_file_keeps_its_promise(tmp_path: Path, source: Path
         assert len(dataset.container.arrays) == 5 + 3
     sizes = [report["variables"][name]["bytes"] for name in bounds]
     assert sizes == sorted(sizes)
-
-
-def test_the_file_is_a_dataset_of_xarray(tmp_path: Path, source: Path) -> None:
-    path, config = tmp_path / "run.fhz", EncodeConfig(effort=1, max_error=0.01)
-    masked = EncodeConfig(effort=1, features=("interval:0.9:1.1",), dilation=0)
-    fhash_codec.encode_dataset(source, path, {"u": config, "v": config, "z": masked})
-    for consolidated in (None, True, False):
-        store = zarr.storage.ZipStore(path, mode="r")
-        with (
-            warnings.catch_warnings(),
-            xarray.open_zarr(store, consolidated=consolidated) as shown,
-            opened(path) as dataset,
-            xarray.open_dataset(source) as original,
-        ):
-            warnings.simplefilter("error")
-            for name in ("u", "v"):
-                np.testing.assert_array_equal(shown[name], dataset[name][...])
-                assert shown[name].dims == original[name].dims
-                assert shown[name].attrs == original[name].attrs
-                for dimension in shown[name].dims:
-                    np.testing.assert_array_equal(shown[dimension], original[dimension])
-            z, y, x = (slice(low, high) for low, high in dataset["z"].box)
-            np.testing.assert_array_equal(shown["z"], dataset["z"][:, z, y, x])
-            whole = [n == m for n, m in zip(shown["z"].shape, SHAPE, strict=True)]
-            names = [name in original.dims for name in shown["z"].dims]
-            assert names == whole
-            assert not all(whole)
-        store.close()
 
 
 def test_arrays_in_memory_and_datasets_of_xarray(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import math
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,9 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec import header as step_figures
 from fhash_codec.header import (
-    brief_history,
     brief_quality,
     check_name,
     full_header,
-    history_points,
     read_steps,
     write_steps,
 )
@@ -36,23 +33,6 @@ def test_names_of_data_are_refused(name) -> None:
 
 WRITER = ContainerWriter("unused.fhz")
 """A writer that gets nothing: few steps have their figures in the header."""
-
-
-def test_history_in_a_file_is_brief() -> None:
-    points = [{"seconds": n * 0.12345, "epoch": n, "psnr": 40.123} for n in range(1, 101)]
-    brief = brief_history(points, timings=True)
-    assert {name: len(values) for name, values in brief.items()} == {
-        **dict.fromkeys(("epoch", "seconds", "psnr"), 24)
-    }
-    last = {"seconds": 12.345, "epoch": 100, "psnr": 40.12}
-    assert history_points(brief)[-1] == last
-    assert brief_history(points[:2], timings=False) == {"epoch": [1, 2], "psnr": [40.12, 40.12]}
-    assert brief_history([], timings=True) == {}
-    assert history_points({"epoch": [1, 2], "psnr": [2.5, 3], "other": 5}) == [
-        {"seconds": None, "epoch": 1, "psnr": 2.5},
-        {"seconds": None, "epoch": 2, "psnr": 3},
-    ]
-    assert history_points({}) == []
 
 
 def header(quality: dict[str, Any], value_range: tuple[float, float] = (-1.0, 1.0)) -> Any:
@@ -85,28 +65,6 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
     other = {**window, "steps": [3], "data_range": 1.9}
     brief = brief_quality(WRITER, {"per_step": [], "ssim_window": other}, 2.0, 1)
     assert brief["ssim_window"] == other
-
-
-def test_a_file_tells_all_that_was_measured(tmp_path: Path) -> None:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 6, 7)), indexing="ij")
-    values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
-    report = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=45.0, effort=2))
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert "steps" in volume.container.header["quality"]
-        info = volume.info
-        assert volume.config == EncodeConfig(psnr=45.0, effort=2).to_dict()
-        assert info["config"] == volume.config
-    assert {"psnr_domain", "rmse_domain", "max_abs_error_domain"} <= info["quality"].keys()
-    assert info["quality"]["ssim_window"]["window"] == 11
-    assert info["model"]["gains"] == report["gains"]
-    assert {"what", "bytes", "seconds"} == report["gains"][0].keys()
-    for kept, measured in zip(
-        info["quality"]["per_step"], report["quality"]["per_step"], strict=True
-    ):
-        assert kept["step"] == measured["step"]
-        assert kept["rmse"] >= measured["rmse"] * (1 - 1e-12)
-        assert math.isclose(kept["rmse"], measured["rmse"], rel_tol=2e-3)
-        assert kept["psnr"] <= measured["psnr"]
 
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)

@@ -237,17 +237,6 @@ def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
         assert dataset.sizes["x_3"] == 7
 
 
-def test_a_coordinate_has_not_the_name_of_a_variable() -> None:
-    joined = SideBySide({"u": "x", "x": "x"})
-    assert joined.add("u", along(x=3), {"x": along(x=3)}) == {"x": "x_2"}
-    joined.add("x", along(x=3), {"x": along(x=3)})
-    assert {name: v.dims for name, v in joined.variables.items()} == {
-        "x_2": ("x_2",),
-        "u": ("x_2",),
-        "x": ("x_2",),
-    }
-
-
 def test_the_values_of_a_variable_are_not_there_again_beside_another() -> None:
     joined = SideBySide({"u": ("t", "x"), "mask": ("t", "x"), "height": ("t", "x")})
     found = joined.add("u", along(t=2, x=3), {"mask": along(x=3, t=2), "height": along()})

@@ -235,22 +235,6 @@ def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
         Writer.resume(tmp_path / "feature.fhz")
 
 
-def test_a_trained_head_is_shared_and_values_beyond_the_range_keep_the_bound(tmp_path) -> None:
-    path = tmp_path / "run.fhz"
-    config = EncodeConfig(max_error=BOUND, effort=5, tile=TILE)
-    values = (
-        frames_writer(9) * np.array([1, 1, 1, 1, 1, 1, 40, 40, 40], np.float32)[:, None, None, None]
-    )
-    with Writer(path, shape=SHAPE, config=config) as writer:
-        for values_of_step in values:
-            writer.append(values_of_step)
-    with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:].astype(float) - values).max() <= BOUND
-        assert volume.value_range.high == values.max()
-        assert volume.verify()
-        assert volume.info["quality"]["max_abs_error"] <= BOUND
-
-
 def test_coordinates_and_labels(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
@@ -314,6 +298,16 @@ def test_settings_that_cannot_be_kept_are_refused_at_once(tmp_path, options, mes
     with pytest.raises(InputError, match=message):
         Writer(path, **{"shape": SHAPE, **options})
     assert os.listdir(tmp_path) == []
+
+
+def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
+    path = tmp_path / "run.fhz"
+    with Writer(path, shape=SHAPE, max_error_rel=0.001, value_range=(-2, 2)) as writer:
+        for step in range(4):
+            writer.append(frame(step))
+    with fhash_codec.open(path) as volume:
+        assert volume.info["config"]["max_error"] == 0.004
+        assert np.abs(volume[:] - frames_writer(4)).max() <= 0.004
 
 
 def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(

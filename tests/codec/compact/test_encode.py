@@ -19,7 +19,6 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.compact import attempt as access
 from fhash_codec.compact.encode import (
-    SAFE,
     SIZE_PASSES,
     ByteWindow,
     CodedTable,
@@ -349,18 +348,6 @@ def test_a_series_larger_than_memory_is_coded_layer_by_layer(
 def outcome(psnr: float, size: int) -> Outcome:
     """Return an outcome of a PSNR over a range of 1."""
     return Outcome(size=size, squares=10 ** (-psnr / 10), count=1, max_error=1.0)
-
-
-@pytest.mark.parametrize("quick", [False, True])
-def test_an_aim_is_met_from_above_only(quick: bool) -> None:
-    aim = _Aim(psnr=40.0, data_range=1.0, quick=quick)
-    assert not aim.is_met(40.0, 3)
-    assert aim.is_met(40.0 + SAFE, 0)
-    assert aim.is_met(float("inf"), 0)
-    # An excess is worth a second pass, but no third.
-    assert not aim.is_met(41.0, 0)
-    assert aim.is_met(41.0, 1)
-    assert aim.next_target(39.0, 0) > aim.min_psnr
 
 
 def moving_sphere() -> npt.NDArray[Any]:

@@ -12,7 +12,6 @@ import pytest
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.goal import (
     DECIDED,
-    DEFAULT_PSNR,
     FAR_BELOW,
     Bracket,
     Goal,
@@ -91,28 +90,6 @@ def test_the_cheapest_is_found_from_everywhere(start: int, lowest: int) -> None:
     assert cheapest(run, start, 12, strides=(2, 1)) == f"at {lowest}"
     assert len(asked) == len(set(asked))
     assert all(0 <= number <= 12 for number in asked)
-
-
-@pytest.mark.parametrize(
-    ("options", "name", "expected"),
-    [
-        ({}, "psnr", DEFAULT_PSNR),
-        ({"psnr": 40.0}, "psnr", 40.0),
-        ({"max_error": 0.25}, "error", 0.25),
-        ({"max_error_rel": 0.01}, "error", 0.04),
-        ({"ratio": 8.0}, "size", 125.0),
-    ],
-    ids=str,
-)
-def test_a_goal_is_one_promise_in_units_of_the_data(
-    options: dict[str, float], name: str, expected: float
-) -> None:
-    config = EncodeConfig(**options)
-    goal = goal_of(config, ValueRange(low=-1.0, high=3.0), 1000, 50)
-    assert goal.data_range == 4.0
-    goals = {"psnr": goal.psnr, "error": goal.error, "size": goal.size}
-    assert {key: value for key, value in goals.items() if value is not None} == {name: expected}
-    assert promise(config) == (options or {"psnr": DEFAULT_PSNR})
 
 
 RANGE = ValueRange(low=0.0, high=100.0)

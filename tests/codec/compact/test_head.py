@@ -127,23 +127,6 @@ def _loss(data: Batches, parameters: npt.NDArray[np.float64], widths: tuple[int,
     return float(np.mean((np.clip(values[0], low, high) - target) ** 2))
 
 
-def test_a_step_is_adams() -> None:
-    trained, data = network(1), voxels(5, 1, 1)
-    mean, square = np.zeros((2, len(trained.parameters)))
-    rates, roots = factors(5)
-    for step in range(1, 6):
-        before = trained.parameters.copy()
-        once = rates[step - 1 : step], roots[step - 1 : step]
-        trained.learn(data, step, *once, as_in_file=False)
-        gradient = (trained.means - 0.9 * mean) / 0.1
-        assert np.linalg.norm(gradient) <= 1 + 1e-9
-        mean, square = trained.means.copy(), 0.999 * square + 0.001 * gradient**2
-        np.testing.assert_allclose(trained.squares, square, rtol=1e-9, atol=1e-15)
-        root = np.sqrt(trained.squares / (1 - 0.999**step))
-        expected = before - 0.01 * mean / (1 - 0.9**step) / (root + 1e-8)
-        np.testing.assert_allclose(trained.parameters, expected, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("as_in_file", [False, True])
 def test_the_bits_of_training_are_fixed(as_in_file: bool) -> None:
     """So that the same series gives the same bytes on every machine."""

@@ -21,7 +21,7 @@ from fhash_codec.compact import stages as planning
 from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling
 from fhash_codec.compact.goal import Goal, goal_of
 from fhash_codec.compact.head import EFFORTS, Budget, Effort
-from fhash_codec.compact.labels import ends_trials, holds_beside, look_at_labels, rank_share
+from fhash_codec.compact.labels import holds_beside, rank_share
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.predictor import IntegerTile, best_predictor, fit_weights
 from fhash_codec.compact.sample import Sample
@@ -162,20 +162,6 @@ def test_labels_under_a_promise_with_tiles_that_have_none(tmp_path) -> None:
     assert np.abs(decoded - values).max() <= 2.0
     np.testing.assert_array_equal(decoded[:, :, :48, :48], values[:, :, :48, :48])
     assert size < encoded(tmp_path, values, tile="6x12x16x16")[0]
-
-
-def test_a_plateau_beside_a_shell_of_many_values_does_not_end_the_trials() -> None:
-    """Tiles of a sample may all lie on the plateau; those of the shell are no labels."""
-    regions = moving_regions().astype("f4")
-    shell = regions.copy()
-    shell[:, :, -16:, -16:] = np.random.default_rng(0).normal(0, 1, (6, 12, 16, 16))
-    with ThreadPoolExecutor(2) as workers:
-        for values, alone in ((regions, True), (shell, False)):
-            task = plan_task(values, workers, psnr=45.0)
-            tiled = task.blocks.retile((6, 12, 16, 16))
-            trial = look_at_labels(task, tiled, first_settings(task, tiled))
-            assert trial.alone is alone
-            assert ends_trials(trial, 1e9) is alone
 
 
 def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:

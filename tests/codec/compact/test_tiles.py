@@ -384,17 +384,6 @@ SHAPES = [(12, 25, 125, 125), (600, 12, 14, 16), (2, 128, 160, 160), (40, 3, 160
 LONG = [(64, 128, 256, 256), (1, 512, 512, 512), (500, 3, 100, 400)]
 
 
-def test_the_mean_work_for_a_region_is_that_of_regions_at_all_places() -> None:
-    shape, tile = (6, 20, 40, 64), (3, 20, 8, 16)
-    places = [range(length - 16 + 1) for length in shape[1:]]
-    touched = [
-        np.mean([n * ((low + 15) // n - low // n + 1) for low in lows])
-        for n, lows in zip(tile[1:], places, strict=True)
-    ]
-    assert region_vertices(shape, tile) == pytest.approx(tile[0] * prod(touched), rel=0.07)
-    assert region_vertices(shape, shape) == prod(shape)
-
-
 @pytest.mark.parametrize("shape", [*SHAPES, *LONG, (1, 1, 1, 1), (3, 5, 7, 1)])
 def test_tiles_are_tried_from_the_fastest_region_to_the_whole(shape: Shape) -> None:
     tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES)

@@ -21,23 +21,18 @@ from fhash_codec.compact import tilings as tiling_trials
 from fhash_codec.compact.attempt import PRICES, PlanTask, Tiling, region_vertices
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import first_guess, first_settings
-from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile
+from fhash_codec.compact.tiles import Coding, Index, Outcome, Tile
 from fhash_codec.compact.tilings import Trials, choose_tiling, largest_tile
 from fhash_codec.compact.transform import (
     Bases,
     Gram,
     choose_transform,
-    estimated_step,
     gram_of,
     likely_transform,
     refit,
     usual_transform,
 )
-from fhash_codec.config import ACCESSES, EncodeConfig
-from fhash_codec.features.selection import select_features
-from fhash_codec.progress import silent
-from fhash_formats.series import ArraySeries
-from fhash_formats.transform.encoding import OFFSETS
+from fhash_codec.config import ACCESSES
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 
@@ -81,34 +76,6 @@ def test_a_basis_holds_the_lines_of_its_axis(axis: int, lines: int | None) -> No
     vector, line = basis.synthesis.reshape(-1), sample.lines[axis]
     overlap = abs(vector @ line) / np.linalg.norm(vector) / np.linalg.norm(line)
     assert overlap == pytest.approx(1.0, abs=1e-3)
-
-
-@pytest.mark.parametrize("tile", [(6, 10, 20, 20), (6, 20, 40, 40)], ids=str)
-def test_the_estimated_step_reaches_the_psnr(tile: tuple[int, int, int, int]) -> None:
-    rng = np.random.default_rng(0)
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 20, 40, 40)), indexing="ij")
-    source = np.tanh(
-        9 * (x + 0.4 * np.sin(5 * y + 2 * t) - 0.5 - 0.2 * z)
-    ) + 0.02 * rng.standard_normal(t.shape)
-    source = source.astype(np.float32)
-    series = ArraySeries(source)
-    selection = select_features(series, EncodeConfig(), silent)
-    blocks = Blocks(series, selection.extent, tile)
-    low, high = float(source.min()), float(source.max())
-    settings = TileSettings(
-        transform=usual_transform(tile), step=1.0, center=0.0, low=low, high=high, offsets=OFFSETS
-    )
-    coding = Coding(filled=True)
-    with ThreadPoolExecutor(2) as workers:
-        sample = Sample(blocks, source.size, workers)
-        for psnr in (40.0, 55.0):
-            step = estimated_step(
-                blocks, settings, coding, psnr=psnr, data_range=high - low, workers=workers
-            )
-            reached = sample.run(TileSettings(**{**vars(settings), "step": step}), coding).psnr(
-                high - low
-            )
-            assert reached == pytest.approx(psnr, abs=0.6)
 
 
 def planes(shape: tuple[int, int, int], dtype: npt.DTypeLike) -> npt.NDArray[Any]:

@@ -136,29 +136,6 @@ def test_step_of_time_inverts_the_times(times) -> None:
     np.testing.assert_allclose(keys.steps_of_times(times.reshape(2, 4)), np.arange(8).reshape(2, 4))
 
 
-CLOSE = {
-    "next to each other": 3.5e5 + 2.0**-34 * np.arange(4),
-    "smallest": 5e-324 * np.arange(4),
-    "largest": 1.7e308 * np.array([-1.0, 0.0, 0.5, 1.0]),
-    "both": np.array([0.0, 5e-324, 1.0, 1.7e308]),
-}
-"""Times between which float64 has none, or whose differences it has not."""
-
-
-@pytest.mark.parametrize("times", CLOSE.values(), ids=CLOSE)
-@pytest.mark.parametrize("sign", [1, -1])
-def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(
-    times, sign
-) -> None:
-    every = KeyTimes(times=sign * times, key_frames=(0, 1, 2, 3))
-    steps = np.linspace(0, 3, 25)
-    np.testing.assert_array_equal(every.key_indices(steps), steps)
-    assert every.steps_of_times(sign * times).tolist() == [0, 1, 2, 3]
-    few = KeyTimes(times=sign * times, key_frames=(0, 3))
-    assert [few.key_index(0), few.key_index(3)] == [0, 1]
-    assert (np.diff(few.key_indices(steps)) >= 0).all()
-
-
 def test_what_lies_outside_is_refused() -> None:
     keys = KeyTimes(times=UNEVEN[::-1].copy(), key_frames=(0, 7))
     for time in (-0.1, 10.5, np.nan, np.inf):

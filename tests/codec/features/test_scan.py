@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -21,7 +19,6 @@ from fhash_codec.features.scan import (
 )
 from fhash_codec.measure.value_range import Ranks, pieces
 from fhash_codec.progress import silent
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, StepsSeries
 
@@ -158,21 +155,6 @@ def test_integers_of_an_array_with_missing_values() -> None:
     series = ArraySeries(masked(1000 * GRID, -32768, "i2"), missing=[-32768])
     assert (series.dtype, series.source_dtype, series.fill) == (np.float32, np.int16, -32768)
     assert np.isnan(series.read(0)[MASK[0]]).all()
-
-
-def test_the_lowest_packed_integer_is_found_in_the_values_unpacked(tmp_path: Path) -> None:
-    counts = masked(4000 * GRID, -32767, "i2")[0]
-    for name, dtype in (("a", "i2"), ("b", "f4")):
-        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
-            file["sst"] = counts.astype(dtype)
-            file["sst"].attrs.update({"scale_factor": 0.01, "add_offset": 5.0})
-    words = r"'sst' has -322\.67 at .* --missing -322\.67 if"
-    with open_series(tmp_path / "a.h5") as series, pytest.raises(InputError, match=words):
-        scan(series, silent)
-    with open_series(tmp_path / "a.h5", missing=[-322.67]) as series:
-        assert scan(series, silent).value_range.low > 0
-    with open_series(tmp_path / "b.h5") as series:  # these are no counts of 16 bits
-        scan(series, silent)
 
 
 @pytest.mark.parametrize(

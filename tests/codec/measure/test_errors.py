@@ -151,17 +151,6 @@ def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     assert scaled.max_abs_error == pytest.approx(plain.max_abs_error * factor, rel=1e-6, abs=0)
 
 
-def test_the_psnr_of_denormals_does_not_come_from_their_rounding() -> None:
-    original = 5e-324 * np.arange(1000.0).reshape(1, 10, 100)
-    decoded = original.copy()
-    decoded[0, 0, :7] += 5e-324
-    errors = Errors(float(original.max()))
-    errors.add(0, original, decoded)
-    # The root mean square is less than the smallest number.
-    assert errors.psnr == pytest.approx(20 * math.log10(999 / math.sqrt(7 / 1000)))
-    assert errors.steps[0].psnr == errors.psnr
-
-
 def test_wrong_frames_are_refused() -> None:
     original, decoded = frames(1)
     with pytest.raises(InputError, match="one shape"):

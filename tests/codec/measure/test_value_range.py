@@ -139,17 +139,6 @@ def test_error_law_for_any_values(numbers) -> None:
     check_round_trip(np.array(numbers), min(numbers), max(numbers))
 
 
-def test_missing_values_become_nan_and_stay_so() -> None:
-    value_range = ValueRange(-1.0, 1.0)
-    unit = value_range.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
-    np.testing.assert_array_equal(
-        unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32)
-    )
-    np.testing.assert_array_equal(
-        value_range.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
-    )
-
-
 @pytest.mark.parametrize(("low", "high"), [(1.0, 0.0), (np.nan, 1.0), (0.0, np.inf)])
 def test_a_pair_that_is_no_range_is_refused(low, high) -> None:
     with pytest.raises(InputError, match="lower first"):

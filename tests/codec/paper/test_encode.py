@@ -19,7 +19,6 @@ from fhash_codec.paper.encode import select, sparse_tables
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.storage import load_network
 from fhash_codec.progress import silent
-from fhash_formats.container import Container
 from fhash_formats.errors import TrainingError
 from fhash_formats.series import ArraySeries
 
@@ -98,26 +97,6 @@ QUICK = EncodeConfig(profile="paper", epochs=6, width=16)
 def decoded(path) -> np.ndarray:
     with fhash_codec.open(path) as volume:
         return volume[...]
-
-
-@pytest.mark.parametrize(("tables", "loss"), [("float32", 0), ("float16", 1e-3), ("uint8", 0.05)])
-def test_tables_are_stored_as_asked_and_cost_what_they_cost(field, tmp_path, tables, loss) -> None:
-    source = field()
-    exact = fhash_codec.encode(
-        source,
-        tmp_path / "exact.fhz",
-        EncodeConfig(profile="paper", epochs=6, width=16, tables="float32"),
-    )
-    figures = fhash_codec.encode(
-        source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables=tables)
-    )
-    span = float(np.ptp(source))
-    assert (
-        np.abs(decoded(tmp_path / "a.fhz") - decoded(tmp_path / "exact.fhz")).max() <= loss * span
-    )
-    with Container.open(tmp_path / "a.fhz") as container:
-        assert container.arrays["tables/level_1"].dtype == np.dtype(tables)
-    assert (figures["bytes"] < 0.75 * exact["bytes"]) == (tables != "float32")
 
 
 def test_the_file_decodes_to_what_the_torch_model_gives(field, tmp_path) -> None:

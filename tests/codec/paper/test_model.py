@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from itertools import pairwise, product
+from itertools import product
 from math import prod
 
 import numpy as np
@@ -19,10 +19,9 @@ from fhash_codec.paper.model import (
     PaperModel,
     PointSampler,
     PointTables,
-    input_slopes,
     sample_points,
 )
-from fhash_codec.paper.network import Architecture, ArrayTable, Network
+from fhash_codec.paper.network import Architecture, Network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
 
@@ -134,43 +133,6 @@ def test_wrong_arguments_are_refused(networks) -> None:
         sample_points(net, np.zeros((2, 2)), 0, 0, 0)
 
 
-def test_slopes_by_the_inputs_are_differences() -> None:
-    architecture = Architecture.for_box((4, 6, 9), 3, width=8)
-    random = np.random.default_rng(0)
-    tables = [
-        random.standard_normal((*level, 2)).astype(np.float32) for level in architecture.levels
-    ]
-    layers = tuple(
-        (random.standard_normal((n, m)).astype(np.float32) / 4, random.random(n, dtype=np.float32))
-        for m, n in pairwise([architecture.inputs, 8, 1])
-    )
-
-    def network() -> Network:
-        return Network(
-            levels=architecture.levels,
-            embedding_size=2,
-            tables=[ArrayTable(table) for table in tables],
-            layers=layers,
-            box_size=architecture.box_size,
-            key_frames=3,
-        )
-
-    vertices = np.array([[0, 1, 2, 2], [3, 0, 1, 2], [5, 4, 0, 1], [8, 0, 3, 7]], dtype=np.float64)
-    slopes = input_slopes(network(), vertices)
-    assert slopes.shape == (architecture.inputs, 4)
-    for number, table in enumerate(tables):
-        for e in range(2):
-            # A shift of the whole level shifts every interpolated embedding by as much.
-            values = []
-            for shift in (1e-3, -1e-3):
-                table[..., e] += np.float32(shift)
-                values.append(sample_points(network(), *vertices))
-                table[..., e] -= np.float32(shift)
-            difference = np.subtract(*values) / 2e-3
-            close = np.isclose(slopes[2 * number + e], difference, atol=5e-3, rtol=0.02)
-            assert close.sum() >= 3  # a kink of the network may lie between
-
-
 SHAPES = [
     # Box (z, y, x), key frames, fold, embedding size, hidden layers, width.
     ((1, 1, 1), 1, 2, 1, 1, 16),
@@ -236,28 +198,6 @@ def test_tables_at_one_time_give_the_same_bits(library, networks, network) -> No
         PointSampler(tables, path=path).evaluate(places, values)
         PointSampler(tables, key_index, path).evaluate([np.zeros(1), *places[1:]], once)
         np.testing.assert_array_equal(once, values)
-
-
-def test_points_beside_borders_are_read_where_they_are_evaluated(networks, library) -> None:
-    """One point a call: a cell that was not read would show at once."""
-    network = networks.random((7, 50, 125), 3, 2, 2, 1)
-    for level in network.levels[1:4]:
-        border = [
-            k * (s - 1) / max(r - 1, 1)
-            for k, s, r in zip((1, 2, 11, 29), (3, 7, 50, 125), level, strict=True)
-        ]
-        border = [min(b, s - 1.0) for b, s in zip(border, (3, 7, 50, 125), strict=True)]
-        for end in (0.0, 1e9):
-            place = [
-                min(float(np.nextafter(b, end)), s - 1.0)
-                for b, s in zip(border, (3, 7, 50, 125), strict=True)
-            ]
-            np.testing.assert_allclose(
-                sample_points(network, *place),
-                networks.reference(network, [np.array([p]) for p in place]),
-                rtol=1e-5,
-                atol=1e-5,
-            )
 
 
 def test_a_path_that_is_not_there_is_refused(networks, library) -> None:

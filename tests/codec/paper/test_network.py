@@ -142,21 +142,6 @@ def test_more_ones_than_a_count_holds_are_refused(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
-@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_a_sparse_frame_reads_as_a_dense_one(share: float, dtype: str) -> None:
-    frame, dense = frame_of(share, dtype)
-    for region in (
-        (slice(0, 5), slice(0, 7), slice(0, 13)),
-        (slice(1, 4), slice(0, 7), slice(0, 13)),
-        (slice(2, 3), slice(1, 6), slice(4, 5)),
-        (slice(4, 5), slice(6, 7), slice(0, 13)),
-    ):
-        read = frame.read(region)
-        assert read.dtype == dense.dtype
-        np.testing.assert_array_equal(read, dense[region])
-
-
-@pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_a_frame_between_two_has_the_bits_of_dense_ones(dtype: str) -> None:
     (before, dense_before), (after, dense_after) = (
         frame_of(share, dtype, seed) for share, seed in ((0.2, 3), (0.3, 4))

@@ -24,11 +24,9 @@ from fhash_codec.paper.storage import (
     Needed,
     SparseTable,
     StoredTable,
-    corners,
     fringe_step,
     needed_by,
     round_fringe,
-    spread,
     table_chunk,
     write_tables,
 )
@@ -75,17 +73,6 @@ def test_only_the_fringe_is_rounded_and_by_half_a_step_at_most(coreset, scale) -
         multiples = rounded[~inside] / step
         np.testing.assert_array_equal(multiples, np.rint(multiples))
         assert not np.signbit(rounded[~inside][rounded[~inside] == 0]).any()
-
-
-def test_the_step_is_a_power_of_two_below_half_of_the_root_mean_square(coreset) -> None:
-    table = finest()
-    outside = np.concatenate(
-        [table(key)[~unpack(coreset.occupancy[key], coreset.box.shape)].ravel() for key in range(3)]
-    )
-    root = np.sqrt(np.mean(outside[outside != 0].astype(float) ** 2))
-    step = fringe_step(coreset, 3, table)
-    assert np.log2(step) == np.floor(np.log2(step))
-    assert step <= root / 2 < 2 * step
 
 
 def test_without_a_fringe_nothing_is_rounded(coreset) -> None:
@@ -203,21 +190,6 @@ def test_a_mixing_beyond_float32_is_damage(tmp_path, coded_small) -> None:
         pytest.raises(DamagedFileError, match="not finite"),
     ):
         volume.read(0)
-
-
-@pytest.mark.parametrize(("length", "resolution"), [(1, 1), (5, 3), (5, 5), (9, 2), (20, 7)])
-def test_corners_are_those_of_the_interpolation(length, resolution) -> None:
-    position = np.arange(length) * (resolution - 1) / max(length - 1, 1)
-    first, last = corners(length, resolution)
-    np.testing.assert_array_equal(first, np.floor(position + 1e-12))
-    np.testing.assert_array_equal(last, np.ceil(position - 1e-12))
-    weighs = np.zeros((length, resolution), bool)
-    weighs[np.arange(length), first] = weighs[np.arange(length), last] = True
-    for seed in range(5):
-        mask = np.random.default_rng(seed).random((2, length)) < 0.3
-        np.testing.assert_array_equal(
-            spread(mask, 1, resolution), (weighs.T[None] & mask[:, None]).any(axis=2)
-        )
 
 
 @pytest.mark.parametrize("fringe", [False, True])

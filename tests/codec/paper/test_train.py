@@ -322,11 +322,6 @@ CONFIG_FIT_ON_CUDA = EncodeConfig(
 )
 
 
-@pytest.fixture
-def architecture_fit_on_cuda(coreset: Coreset) -> Architecture:
-    return Architecture.for_box(coreset.box.shape, 3, width=8)
-
-
 @pytest.mark.parametrize("tables", ["float16", "transform"])
 def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
     values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
@@ -338,24 +333,3 @@ def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
     assert figures["device"] == "cuda"
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         assert np.isfinite(volume[:]).any()
-
-
-def test_a_training_that_diverges_begins_again_on_the_device(
-    coreset: Coreset,
-    architecture_fit_on_cuda: Architecture,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    limits = iter([0.0, *[1e9] * 100])
-    check = fhash_codec.paper.train._Loop.check_errors
-    monkeypatch.setattr(
-        "fhash_codec.paper.train._Loop.check_errors",
-        lambda self: (
-            monkeypatch.setattr("fhash_codec.paper.train.DIVERGED", next(limits)),
-            check(self),
-        ),
-    )
-    config = replace(CONFIG_FIT_ON_CUDA, epochs=1)
-    with pretended_cuda(), pytest.warns(FhashWarning, match="begins again"):
-        trained = train_model(coreset, architecture_fit_on_cuda, config, tmp_path / "a.fhz")
-    assert (trained.device, trained.restarts) == ("cuda", 1)

@@ -25,7 +25,6 @@ from fhash_codec.views.arrays import (
     shown_axes,
 )
 from fhash_codec.views.view import ZarrView
-from fhash_formats.series import Coordinate
 
 VALUES = np.arange(35, dtype=np.int16).reshape(5, 7)
 
@@ -206,32 +205,6 @@ def test_vertices_lead_to_positions_where_these_are_even(feature: Path) -> None:
             # latitudes descend: a scale must be positive, so that it counts vertices
             assert scale["scale"][2] == level.stride
             assert translation["translation"][2] == level.first[1]
-
-
-@pytest.mark.parametrize(
-    ("values", "units", "scale", "unit"),
-    [
-        ([0.0, 1.0, 3.0], "m", 1.0, None),
-        ([0.0, 2.0, 4.0], "km", 2.0, "kilometer"),
-        ([0.0, 2.0, 4.0], "Meters", 2.0, "meter"),
-        ([0.0, 2.0, 4.0], "s", 2.0, None),
-        ([3.0, 2.0, 1.0], "m", 1.0, None),
-        ([1.0, 1.0, 1.0], "m", 1.0, None),
-        ([0.0, np.inf, 1.0], "m", 1.0, None),
-        ([-1e308, 0.0, 1e308], "m", 1.0, None),
-        (np.float32([0.1, 0.2, 0.3]).tolist(), "m", 0.1, "meter"),
-    ],
-)
-def test_uneven_positions_count_vertices(
-    whole: Path, values: list[float], units: str, scale: float, unit: str | None
-) -> None:
-    with fhash_codec.open(whole) as volume:
-        coordinate = Coordinate(name="x", values=np.array(values), attributes={"units": units})
-        entry = multiscale("a", {**volume.coords, "x": coordinate}, NAMES, {"a": Level(volume, 0)})
-        assert entry["axes"][3].get("unit") == unit
-        (given, _) = entry["datasets"][0]["coordinateTransformations"]
-        assert given["scale"][3] == pytest.approx(scale)
-        assert all(0 < number < np.inf for number in given["scale"])
 
 
 SHAPE = (3, 20, 24)

@@ -19,31 +19,6 @@ from fhash_codec import EncodeConfig, Volume
 from fhash_codec.views.view import FEW_BYTES, MOST_BYTES, ZarrView, opened_view, view_chunks
 from fhash_formats.series import ArraySeries, Coordinate
 
-
-@pytest.mark.parametrize(
-    ("shape", "tile", "itemsize", "chunk"),
-    [
-        # one tile of all steps: a frame each, or several where frames are small
-        ((12, 25, 125, 125), (12, 25, 125, 125), 4, (1, 25, 125, 125)),
-        ((12, 13, 63, 63), (12, 13, 63, 63), 4, (6, 13, 63, 63)),
-        # a tile of a good size stays
-        ((12, 25, 125, 125), (4, 25, 42, 42), 4, (4, 25, 42, 42)),
-        # steps are cut by divisors, so that no chunk reaches into the next tile
-        ((40, 25, 125, 125), (10, 25, 125, 125), 1, (5, 25, 125, 125)),
-        # huge frames: blocks of like sides
-        ((3, 512, 512, 512), (1, 512, 512, 512), 4, (1, 64, 64, 128)),
-        # tiny tiles are joined, in space first
-        ((12, 25, 125, 125), (4, 9, 9, 9), 4, (4, 25, 36, 18)),
-        ((1000, 4, 4, 4), (10, 4, 4, 4), 8, (320, 4, 4, 4)),
-        ((1, 1, 1, 1), (4, 8, 8, 8), 8, (1, 1, 1, 1)),
-    ],
-)
-def test_chunks_by_tile(
-    shape: tuple[int, ...], tile: tuple[int, ...], itemsize: int, chunk: tuple[int, ...]
-) -> None:
-    assert view_chunks(shape, tile, itemsize) == chunk
-
-
 sides = st.tuples(st.integers(1, 99), *[st.integers(1, 700)] * 3)
 
 

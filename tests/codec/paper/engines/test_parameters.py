@@ -18,7 +18,6 @@ from fhash_codec.paper.engines.parameters import (
     Upsampling,
     adam_step,
     adam_step_on_device,
-    axis_matrices,
     catch_up,
     catch_up_numbers,
     corrections,
@@ -57,21 +56,6 @@ def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
 
 
 CPU = torch.device("cpu")
-
-
-@pytest.mark.parametrize(
-    ("size", "corners", "length", "count"),
-    [(1, 1, 1, 1), (5, 5, 5, 1), (5, 3, 2, 3), (20, 7, 6, 4), (9, 2, 4, 3)],
-)
-def test_axis_matrices_give_every_vertex_its_position(size, corners, length, count) -> None:
-    start, weights = axis_matrices(size, corners, length, count)
-    assert (start >= 0).all()
-    assert (start + weights.shape[2] <= corners).all()
-    np.testing.assert_allclose(weights.sum(axis=2), 1, rtol=1e-15)
-    position = (weights * (start[:, None, None] + np.arange(weights.shape[2]))).sum(axis=2)
-    vertex = np.minimum(np.arange(count * length), size - 1)
-    expected = vertex * (corners - 1) / max(size - 1, 1)
-    np.testing.assert_allclose(position.ravel(), expected, rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize(("shape", "low"), [((3, 9, 10, 20), 0.3), ((2, 20, 30, 40), 0.9995)])
