@@ -1,4 +1,11 @@
-"""Goals of an encode, the search for the coarsest setting that keeps one, and what is promised."""
+"""Goals of an encode, the search for the coarsest setting that keeps one, and what is promised.
+
+A PSNR is searched by secants of the log step (`PsnrSearch`), a number of bytes by secants within a
+bracket (`SizeSearch`): on a sample in step.py, on all tiles in encode.py. Under a bound the
+cheapest of a few steps is looked for (`cheapest`). The error of trained tables has a search of its
+own in paper/table_step.py, which shares `Bracket`. None of them knows a codec: callers do the
+trials.
+"""
 
 from __future__ import annotations
 
