@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from math import prod
 from pathlib import Path
@@ -16,8 +16,15 @@ import numpy.typing as npt
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.measure.errors import find_bulk
-from fhash_codec.measure.metrics import NeighboursOf, measure_quality, neighbours_of
+from fhash_codec.measure.metrics import (
+    Comparer,
+    Comparison,
+    NeighboursOf,
+    measure_quality,
+    neighbours_of,
+)
 from fhash_codec.measure.ssim import BUDGET as SSIM_BUDGET
+from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
@@ -114,6 +121,11 @@ def ssim_budget(config: EncodeConfig) -> int:
     return QUICK_SSIM_BUDGET if config.effort == 1 else SSIM_BUDGET
 
 
+def steps_of_ssim(series: Series, budget: int = SSIM_BUDGET) -> list[int]:
+    """The steps of a series whose SSIM is measured, within a number of vertices; none for 0."""
+    return ssim_steps(series.shape[0], prod(series.shape[1:]), budget) if budget else []
+
+
 def diff(
     source: Source, path: Place, *, variable: str | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
@@ -174,14 +186,13 @@ def measure(
     series: Series,
     volume: Volume,
     progress: Progress,
-    *,
-    ssim_budget: int = SSIM_BUDGET,
-    **options: Any,
+    measured: Sequence[int] | None = None,
+    observe: Callable[[Comparison], None] = lambda comparison: None,
 ) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
-    ssim_budget: vertices whose SSIM is measured; with 0 it is None. options: further ones of
-    `measure_quality`.
+    measured: steps whose SSIM is measured; as many as there is time for if None (`steps_of_ssim`).
+    observe: called with the comparison of each step, in their order.
 
     The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
@@ -194,17 +205,15 @@ def measure(
     origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
     read = partial(_differences, series, origin) if far else series.read
     bulk = _bulk(series, volume)
+    about_bulk = None if bulk is None else bulk.moved(-origin)
     quality = measure_quality(
+        Comparer(float(data_range), volume.background - origin, about_bulk, observe),
         read,
         DecodedFrames(volume, exact=exact, origin=origin if far else None).read,
         series.shape[0],
-        float(data_range),
-        volume.background - origin,
+        steps_of_ssim(series) if measured is None else measured,
         progress,
-        bulk=None if bulk is None else bulk.moved(-origin),
-        neighbours=_neighbours(read, series.shape[0], volume),
-        ssim_budget=ssim_budget,
-        **options,
+        _neighbours(read, series.shape[0], volume),
     )
     series.check()
     figures = quality.to_dict()

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.compact.encode import DecodedTiles, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
-from fhash_codec.comparison import measure, report, ssim_budget
+from fhash_codec.comparison import measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device, need_torch
@@ -243,8 +243,8 @@ class _Measured:
         ):
             if decoded:
                 _take_decoded(volume.container, decoded)
-            vertices = ssim_budget(self._config)
-            self.quality = measure(self._series, volume, self._progress, ssim_budget=vertices)
+            measured = steps_of_ssim(self._series, ssim_budget(self._config))
+            self.quality = measure(self._series, volume, self._progress, measured)
         low, high = header["value_range"]
         steps = header["domain"]["shape"][0]
         quality = brief_quality(self._writer, self.quality, high - low, steps)

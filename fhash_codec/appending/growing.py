@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.tiles import Coding, Tile, code
+from fhash_codec.compact.tiles import Coding, Outcome, Tile, Worked, code, code_tiles, padded_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_quality, full_header, write_coordinates
-from fhash_codec.measure.errors import Values, error_sums, psnr
+from fhash_codec.measure.errors import ErrorSums, Values, error_sums, psnr
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container import (
     SOURCE,
@@ -35,7 +35,7 @@ from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, S
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
-from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
+from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import exact_number, is_within
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import TRELLIS_WEIGHT, WEIGHT, CodedTile
@@ -48,26 +48,15 @@ Its float may lie above the decimal number.
 """
 
 
-class StepErrors(NamedTuple):
-    """Errors of one step, scaled by the power of two of its `Figures`."""
-
-    number: int
-    """Number of values."""
-    squares: float
-    """Sum of the squared errors."""
-    largest: float
-    """Largest absolute error."""
-
-
 class Figures:
     """Errors of the steps of a file so far.
 
     Attributes:
         scale: power of two by which errors are multiplied before they are squared.
-        steps: errors of each step.
+        steps: errors of each step, scaled.
     """
 
-    def __init__(self, scale: float, steps: Sequence[StepErrors] = ()) -> None:
+    def __init__(self, scale: float, steps: Sequence[ErrorSums] = ()) -> None:
         self.scale = scale
         self.steps = list(steps)
 
@@ -98,15 +87,15 @@ class Figures:
                 )
             root = float(pair[0]) * ROUNDED_ONCE * scale
             largest = min(float(pair[1]), limit) * ROUNDED_ONCE * scale
-            errors.append(StepErrors(count, count * root * root, largest))
+            errors.append(ErrorSums(count, count * root * root, largest))
         return cls(scale, errors)
 
-    def measure(self, original: Values, decoded: Values) -> StepErrors:
+    def measure(self, original: Values, decoded: Values) -> ErrorSums:
         """The errors of a decoded frame (z, y, x)."""
         sums = error_sums(original, decoded, None, self.scale)
         if sums.number != original.size:
             raise RuntimeError("a decoded frame has values that are not finite")
-        return StepErrors(sums.number, sums.squares, sums.largest)
+        return sums
 
     def header(self, writer: ContainerWriter, data_range: float) -> dict[str, Any]:
         """The header's `quality`.
@@ -143,24 +132,19 @@ class Figures:
 
 DECODED_AGAIN = 8
 """Tiles of which one is decoded from its bytes, as a reader does it."""
-Index = tuple[int, int, int]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CodedLayer:
-    """A layer of tiles, coded.
-
-    Attributes:
-        streams: bytes of each tile, in C order.
-        errors: of each step.
-        nonzero: number of coefficients that are not 0.
-        value_range: of the values, in data units.
-    """
+class CodedLayer(NamedTuple):
+    """A layer of tiles, coded."""
 
     streams: list[bytes]
-    errors: list[StepErrors]
+    """Bytes of each tile, in C order."""
+    errors: list[ErrorSums]
+    """Scaled errors of each step."""
     nonzero: int
+    """Number of coefficients that are not 0."""
     value_range: ValueRange
+    """Range of the values, in data units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,50 +173,36 @@ class LayerCoder:
         values = np.stack(frames)
         decoded = np.empty_like(values)
         grid = [-(-n // length) for n, length in zip(values.shape[1:], self.tile[1:], strict=True)]
-        streams, nonzero = [], 0
-        indices: list[Index] = [(z, y, x) for z, y, x in product(*map(range, grid))]
-        tiles = (self._tile(values, index) for index in indices)
-        coded = map_ahead(workers, self._code, enumerate(tiles), 2 * usable_threads())
-        for index, tile in zip(indices, coded, strict=True):
-            region = chunk_region(index, self.tile[1:], values.shape[1:])
-            part = decoded[(slice(None), *region)]
-            part[...] = tile.decoded[tuple(slice(0, n) for n in part.shape)]
-            streams.append(tile.data)
-            nonzero += tile.nonzero
+
+        def work(job: tuple[int, tuple[int, ...]]) -> Worked:
+            number, index = job
+            region = (slice(None), *chunk_region(index, self.tile[1:], values.shape[1:]))
+            coded, outcome = self._code(number, padded_tile(values[region], None, self.tile))
+            decoded[region] = coded.decoded[tuple(slice(0, n) for n in decoded[region].shape)]
+            return coded.data, outcome, None
+
+        coded = code_tiles(enumerate(product(*map(range, grid))), work, workers)
         errors = [figures.measure(*pair) for pair in zip(values, decoded, strict=True)]
         value_range = ValueRange(*_ends(values))
-        return CodedLayer(streams=streams, errors=errors, nonzero=nonzero, value_range=value_range)
+        nonzero = coded.outcome.nonzero
+        return CodedLayer(coded.streams, errors, nonzero, value_range)
 
-    def _tile(self, values: npt.NDArray[Any], index: Index) -> Tile:
-        """A tile of a layer; beyond the end of an axis border values are repeated and not counted.
-
-        As `Blocks.read` makes it.
-        """
-        region = (slice(None), *chunk_region(index, self.tile[1:], values.shape[1:]))
-        part = values[region]
-        padding = [(0, n - m) for n, m in zip(self.tile, part.shape, strict=True)]
-        if not any(after for _, after in padding):
-            return Tile(np.ascontiguousarray(part), None)
-        counted = np.pad(np.ones(part.shape, bool), padding)
-        return Tile(np.pad(part, padding, mode="edge"), counted)
-
-    def _code(self, job: tuple[int, Tile]) -> CodedTile:
+    def _code(self, number: int, tile: Tile) -> tuple[CodedTile, Outcome]:
         """Code a tile, by settings of its own where its values leave the range of the shared ones.
 
         The bound holds either way. The shared ones clip such values, and the residual then has to
         bring them back; of the two codings the one with fewer bytes is taken.
         """
-        number, tile = job
         own = replace(self.coding, own_settings=True)
-        trials = [(code(tile, other, own)[0], other) for other in self._wider(tile)]
+        trials = [(code(tile, other, own), other) for other in self._wider(tile)]
         if not self._is_far(tile):
-            trials.insert(0, (code(tile, self.settings, self.coding)[0], self.settings))
-        coded, settings = min(trials, key=lambda trial: len(trial[0].data))
+            trials.insert(0, (code(tile, self.settings, self.coding), self.settings))
+        (coded, outcome), settings = min(trials, key=lambda trial: len(trial[0][0].data))
         if number % DECODED_AGAIN == 0:
             again = decode_tile(coded.data, self.tile, self.dtype, settings)
             if not np.array_equal(again, coded.decoded):
                 raise RuntimeError(f"tile {number} decodes to other values than its encoder found")
-        return coded
+        return coded, outcome
 
     def _is_far(self, tile: Tile) -> bool:
         """Whether the differences from the origin that tiles share are beyond int64."""

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.series_plan import CodedLayers, SeriesPlan, bounded, code_layers
+from fhash_codec.appending.series_plan import SeriesPlan, bounded, code_layers
 from fhash_codec.compact.encode import all_tiles
-from fhash_codec.compact.tiles import Blocks
-from fhash_codec.comparison import measure, report, ssim_budget
+from fhash_codec.compact.tiles import Blocks, CodedTiles
+from fhash_codec.comparison import measure, report, ssim_budget, steps_of_ssim
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Extent, packed_masks, resolve_features
 from fhash_codec.features.scan import Scan, scan_steps
@@ -34,7 +34,6 @@ from fhash_codec.header import (
 )
 from fhash_codec.measure.errors import ErrorSums
 from fhash_codec.measure.metrics import Comparer, Comparison
-from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
@@ -245,7 +244,7 @@ class _Job:
         self,
         writer: ContainerWriter,
         blocks: Blocks,
-        coded: CodedLayers,
+        coded: CodedTiles,
         missing: Mapping[int, npt.NDArray[np.uint8]],
     ) -> dict[str, Any]:
         """Write coordinates, masks and tiles; the header without its quality."""
@@ -287,16 +286,14 @@ class _Job:
     ) -> tuple[dict[str, Any], npt.NDArray[np.float64], list[int]]:
         """The quality of what is written, the errors of each step, and the steps of the SSIM."""
         rows: list[list[float]] = []
-        z, y, x = self.series.shape[1:]
-        budget = ssim_budget(self.plan.config)
-        whole = ssim_steps(self.series.shape[0], z * y * x, budget) if budget else []
+        whole = steps_of_ssim(self.series, ssim_budget(self.plan.config))
         with Volume(writer.preview(header)) as volume:
             quality = measure(
                 StepsSeries(self.series, self.steps),
                 volume,
                 progress,
-                ssim_measured=[step - self.steps.start for step in whole if step in self.steps],
-                observe=lambda comparison: rows.append(_row(comparison)),
+                [step - self.steps.start for step in whole if step in self.steps],
+                lambda comparison: rows.append(_row(comparison)),
             )
         return quality, np.array(rows, dtype=np.float64), whole
 

@@ -17,7 +17,17 @@ from fhash_codec.boxes import Box
 from fhash_codec.compact.encode import CodedTable, plan_series, table_header
 from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.sample import fill
-from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, fits_memory, total
+from fhash_codec.compact.tiles import (
+    Blocks,
+    CodedTiles,
+    Coding,
+    Outcome,
+    Tile,
+    Worked,
+    code,
+    code_tiles,
+    fits_memory,
+)
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.scan import Scan
 from fhash_codec.features.selection import Source, mask_files, open_source, select_features
@@ -33,7 +43,7 @@ from fhash_formats.errors import (
 )
 from fhash_formats.series import AXES, Series
 from fhash_formats.support.files import check_output, replacing
-from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
+from fhash_formats.support.threads import thread_pool
 from fhash_formats.support.values import plain_json
 from fhash_formats.transform.decoding import transform_for
 from fhash_formats.transform.encoding import RATIOS
@@ -137,26 +147,13 @@ def _coding(record: Record) -> Coding:
     return Coding(weight=weight, error=error, density=density, **options)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CodedLayers:
-    """Some layers of tiles, coded.
-
-    Attributes:
-        streams: bytes of each tile, in C order.
-        outcome: size and error of all of them.
-    """
-
-    streams: list[bytes]
-    outcome: Outcome
-
-
 def code_layers(
     blocks: Blocks,
     recipe: Recipe,
     layers: range,
     workers: ThreadPoolExecutor,
     progress: Progress,
-) -> CodedLayers:
+) -> CodedTiles:
     """Code some layers of tiles along time, with the bytes that they have in a whole table.
 
     blocks: the series in the tiles of the recipe. One layer is in memory at a time.
@@ -165,23 +162,18 @@ def code_layers(
     "coding".
     """
 
-    def work(tile: Tile) -> tuple[bytes, Outcome]:
+    def work(tile: Tile) -> Worked:
         if recipe.filling is not None:
             tile = fill(tile, recipe.filling.settings, recipe.filling.density)
         coded, outcome = code(tile, recipe.settings, recipe.coding)
-        return coded.data, outcome
+        return coded.data, outcome, None
 
     assert blocks.tile == recipe.tile
     count = len(layers) * math.prod(blocks.grid[1:])
     _, *grid = blocks.grid
     indices = ((t, z, y, x) for t, z, y, x in product(layers, *map(range, grid)))
     tiles = (blocks.read(index) for index in indices)
-    streams, outcomes = [], []
-    for data, outcome in map_ahead(workers, work, tiles, 2 * usable_threads()):
-        streams.append(data)
-        outcomes.append(outcome)
-        progress("coding", len(streams), count, "")
-    return CodedLayers(streams=streams, outcome=total(outcomes))
+    return code_tiles(tiles, work, workers, lambda done: progress("coding", done, count, ""))
 
 
 FORMAT = "fhash plan"

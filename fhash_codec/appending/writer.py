@@ -20,7 +20,7 @@ from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, cont
 from fhash_codec.compact.attempt import parse_tile
 from fhash_codec.compact.encode import training_header
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.plan import plan
+from fhash_codec.compact.plan import OVERHEAD_BYTES, plan
 from fhash_codec.compact.tiles import Blocks
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import FeatureSelection, Source, open_source, select_features
@@ -42,9 +42,6 @@ from fhash_formats.series import (
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.support.values import exact_number, json_attributes
-
-OVERHEAD_BYTES = 2000
-"""Approximate bytes of a file without its tiles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +119,6 @@ def plan_layers(
             expected,
             promised,
             goal,
-            OVERHEAD_BYTES,
             workers,
             silent,
             selection.features,

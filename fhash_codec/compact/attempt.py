@@ -12,7 +12,6 @@ from math import prod
 from typing import Any
 
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.head import HeadHistory
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
@@ -386,6 +385,13 @@ class PlanTask:
         """Thoroughness of filling the vertices that do not count, see `fill`."""
         effort = self.config.effort
         return 8 if effort >= 4 else 4 if effort > 1 else 1
+
+
+HeadHistory = list[dict[str, float | None]]
+"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
+
+`samples` is the number of voxels that it learns from, the same at each point.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,21 +14,20 @@ from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.attempt import region_vertices
+from fhash_codec.compact.attempt import HeadHistory, region_vertices
 from fhash_codec.compact.goal import (
     EXCHANGE,
     RATIO_SLACK,
     SLOPE,
-    Bracket,
     Goal,
-    arithmetic_mean,
+    SizeSearch,
     goal_of,
     integer_goal,
     promise,
 )
-from fhash_codec.compact.head import HEAD_BYTES, HeadHistory
+from fhash_codec.compact.head import HEAD_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
-from fhash_codec.compact.plan import CodingPlan, plan
+from fhash_codec.compact.plan import OVERHEAD_BYTES, CodingPlan, plan
 from fhash_codec.compact.step import (
     FINEST_PSNR,
     MAX_STEP_SHARE,
@@ -43,12 +42,12 @@ from fhash_codec.compact.tiles import (
     Outcome,
     Tile,
     TileRun,
-    Values,
+    Worked,
     code,
+    code_tiles,
     fits_memory,
     measured,
     recoded,
-    total,
 )
 from fhash_codec.compact.transform import refit, usual_transform
 from fhash_codec.config import EncodeConfig
@@ -61,7 +60,7 @@ from fhash_codec.progress import Progress, stage
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.series import Series
-from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
+from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.values import at_origin
 
@@ -162,8 +161,6 @@ def measure_region(table: CodedTable) -> float:
 
 SIZE_PASSES = 10
 """Times that all tiles are coded at most."""
-USUAL_FALL = SLOPE / EXCHANGE
-"""Octaves of bytes that a step larger by a factor of e saves: the first assumption."""
 CodeAll = Callable[[CodingPlan], CodedTable]
 """Function that codes all tiles by a plan."""
 
@@ -211,32 +208,20 @@ def code_to_size(table: CodedTable, window: ByteWindow, code_all: CodeAll) -> Co
     if plan.goal.data_range <= 0:
         return table
     data_range = max(plan.goal.data_range, 1e-300)
-    bracket = Bracket(
-        math.log(data_range * MIN_STEP_SHARE),
-        math.log(data_range * MAX_STEP_SHARE),
-        middle=arithmetic_mean,
-    )
     target = max((window.low + window.high) / 2, 1.0)
-    fall, before = USUAL_FALL, None
+    search = SizeSearch(data_range, (MIN_STEP_SHARE, MAX_STEP_SHARE), target, drifts=False)
     for _ in range(SIZE_PASSES):
-        size, log_step = table.outcome.size, math.log(table.plan.settings.step)
+        settings, size = table.plan.settings, table.outcome.size
         if window.holds(table) or (size < window.low and is_exact(table)):
             break
-        bracket = bracket.narrowed(log_step, too_low=size > window.high)
-        if before is not None and (before[0] - log_step) * (size - before[1]) > 0:
-            measured = math.log2(size / before[1]) / (before[0] - log_step)
-            fall = min(max(measured, USUAL_FALL / 4), USUAL_FALL * 4)
-        before = log_step, size
-        log_step = bracket.inside(log_step + math.log2(max(size, 1) / target) / fall)
-        settings = with_step(table.plan.settings, math.exp(log_step), plan.goal)
+        log_step = search.after(math.log(settings.step), size, too_fine=size > window.high)
+        settings = with_step(settings, math.exp(log_step), plan.goal)
         table = code_all(replace(plan, settings=settings))
         if window.prefers(table, best):
             best = table
     return best
 
 
-OVERHEAD_BYTES = 2000
-"""Approximate bytes of a container without its tiles, for the sizes after each stage."""
 PASSES = 4
 """Times that all tiles are coded at most for a promise that the sample did not foretell."""
 SAFE = 1e-3
@@ -295,10 +280,8 @@ def code_series(
             blocks = coding_plan.blocks.retile(coding_plan.blocks.shape)
             about = selection.scanned.value_range.moved(-blocks.origin)
             exactly = integer_goal(0, goal.data_range)
-            exact = plan(
-                *(blocks, about, config, exactly, OVERHEAD_BYTES),
-                *(workers, progress, selection.features),
-            )
+            features = selection.features
+            exact = plan(blocks, about, config, exactly, workers, progress, features)
             other = _code_all(replace(exact, goal=goal), workers, progress)
             table = other if other.outcome.size < table.outcome.size else table
     seconds = round(time.perf_counter() - begun, 3)
@@ -346,9 +329,7 @@ def plan_series(
     # No step of the quantiser reaches such a PSNR, and integers can be exact.
     beyond = integers and goal.psnr is not None and goal.psnr > FINEST_PSNR
     asked = integer_goal(0, goal.data_range) if beyond else goal
-    coding_plan = plan(
-        blocks, about, config, asked, OVERHEAD_BYTES, workers, progress, selection.features
-    )
+    coding_plan = plan(blocks, about, config, asked, workers, progress, selection.features)
     return coding_plan, goal, None if bulk is None else bulk.moved(origin)
 
 
@@ -497,15 +478,16 @@ def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bo
         return True
     plain = replace(settings, head=None)
 
-    def measure(job: tuple[bytes, Index | Tile]) -> Outcome:
+    def measure(job: tuple[bytes, Index | Tile]) -> Worked:
         stream, source = job
         tile = _tile_of(blocks, source)
-        return measured(tile, recoded(tile, stream, plain), plain, table.plan.coding)
+        coded = recoded(tile, stream, plain)
+        return stream, measured(tile, coded, plain, table.plan.coding), None
 
     sources = (_readable(blocks, index) for index in blocks.indices())
     jobs = zip(table.streams, sources, strict=True)
     with stage("coding", "gain of the head in all tiles"):
-        without = total(list(map_ahead(workers, measure, jobs, 2 * usable_threads())))
+        without = code_tiles(jobs, measure, workers).outcome
     gain = aim.psnr_of(table.outcome) - aim.psnr_of(without)
     size = table.outcome.size
     own = len(settings.head.to_bytes()) + HEAD_BYTES
@@ -536,31 +518,28 @@ def _code_all(
     """
     blocks, keeps_decoded = coding_plan.blocks, coding_plan.keeps_decoded
 
-    def work(source: Index | Tile | TileRun) -> tuple[bytes, Outcome, Values | None]:
+    def work(source: Index | Tile | TileRun) -> Worked:
         if isinstance(source, TileRun):
             return source.stream, source.outcome, None
         tile = _tile_of(blocks, source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome, coded.decoded if keeps_decoded else None
 
-    streams: list[bytes] = []
-    decoded_tiles: list[Values | None] = []
-    outcomes: list[Outcome] = []
     indices = list(blocks.indices())
-    sources = _sources(coding_plan, indices)
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
-        for data, outcome, values in map_ahead(workers, work, sources, 2 * usable_threads()):
-            streams.append(data)
-            outcomes.append(outcome)
-            decoded_tiles.append(values)
-            progress("coding", len(streams), len(indices), note)
-    kept = zip(indices, decoded_tiles, strict=True)
+        coded = code_tiles(
+            _sources(coding_plan, indices),
+            work,
+            workers,
+            lambda count: progress("coding", count, len(indices), note),
+        )
+    kept = zip(indices, coded.decoded, strict=True)
     return CodedTable(
         plan=coding_plan,
-        streams=streams,
-        outcome=total(outcomes),
+        streams=coded.streams,
+        outcome=coded.outcome,
         decoded={index: values for index, values in kept if values is not None},
     )
 

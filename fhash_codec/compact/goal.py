@@ -1,4 +1,11 @@
-"""Goals of an encode, the search for the coarsest setting that keeps one, and what is promised."""
+"""Goals of an encode, the search for the coarsest setting that keeps one, and what is promised.
+
+A PSNR is searched by secants of the log step (`PsnrSearch`), a number of bytes by secants within a
+bracket (`SizeSearch`): on a sample in step.py, on all tiles in encode.py. Under a bound the
+cheapest of a few steps is looked for (`cheapest`). The error of trained tables has a search of its
+own in paper/table_step.py, which shares `Bracket`. None of them knows a codec: callers do the
+trials.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +32,8 @@ MIN_APART = 1e-9
 """Smallest difference of two log steps from which a slope is taken."""
 EXCHANGE = 4.5
 """dB that an octave of bytes buys, where no search says it better."""
+USUAL_FALL = SLOPE / EXCHANGE
+"""Octaves of bytes that a step larger by a factor of e saves: the first assumption."""
 MIN_LOSS = 0.02
 """Smallest difference in dB of two outcomes from which their exchange rate is taken."""
 
@@ -97,6 +106,51 @@ class Bracket:
         if self.low < prediction < self.high:
             return prediction
         return self.middle(self.low, self.high)
+
+
+class SizeSearch:
+    """Search for the quantiser step at which tiles take a number of bytes.
+
+    The bytes are predicted to fall by a number of octaves for each factor of e of the step, which
+    secants measure; a prediction stays inside the steps that are too fine and too coarse.
+    """
+
+    def __init__(
+        self, data_range: float, shares: tuple[float, float], target: float, *, drifts: bool
+    ) -> None:
+        """Begin a search.
+
+        data_range: of the values; above 0.
+        shares: finest and coarsest step, as shares of this range.
+        target: the number of bytes.
+        drifts: whether a measured fall may be up to 3 times the one believed before, or else up to
+            4 times the usual one.
+        """
+        low, high = (math.log(data_range * share) for share in shares)
+        self._bracket = Bracket(low, high, middle=arithmetic_mean)
+        self._target, self._drifts = target, drifts
+        self._fall = USUAL_FALL
+        self._before: tuple[float, int] | None = None
+
+    def inside(self, log_step: float) -> float:
+        """Return the nearest log step within what the search allows."""
+        return min(max(log_step, self._bracket.low), self._bracket.high)
+
+    def after(self, log_step: float, size: int, *, too_fine: bool) -> float:
+        """Take up a trial, and return the log step to try next.
+
+        too_fine: whether these bytes are too many.
+        """
+        self._bracket = self._bracket.narrowed(log_step, too_low=too_fine)
+        if self._before is not None:
+            log_step_before, size_before = self._before
+            if (log_step_before - log_step) * (size - size_before) > 0:
+                measured = math.log2(size / size_before) / (log_step_before - log_step)
+                usual, times = (self._fall, 3) if self._drifts else (USUAL_FALL, 4)
+                self._fall = min(max(measured, usual / times), usual * times)
+        self._before = log_step, size
+        octaves = math.log2(max(size, 1) / self._target)
+        return self._bracket.inside(log_step + octaves / self._fall)
 
 
 def exchange(points: Sequence[tuple[float, float]], usual: float) -> float:

@@ -10,52 +10,14 @@ from functools import partial
 from threading import Event
 from typing import NamedTuple
 
+from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
 from fhash_codec.compact.goal import step_after_gain
-from fhash_codec.compact.head_training import Pair, TrainedHead, train_head
+from fhash_codec.compact.head_training import Budget, Pair, Shape, TrainedHead, train_head
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.step import octave_gain
+from fhash_codec.compact.step import AIM, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.progress import Parts, skip, stage
-from fhash_formats.transform.head import CROSS, INPUTS
 from fhash_formats.transform.tile_format import TileSettings
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Widths of the two hidden layers of a head, and whether it looks at the voxels of a cross."""
-
-    widths: tuple[int, int]
-    cross: bool
-
-    @property
-    def weights(self) -> int:
-        """Number of weights, biases not included."""
-        first, second = self.widths
-        return INPUTS * first + self._seen * first * second + second
-
-    @property
-    def products(self) -> int:
-        """Multiplications for a voxel in training."""
-        first, second = self.widths
-        return self._seen * (INPUTS * first + first * second) + second
-
-    @property
-    def _seen(self) -> int:
-        """Voxels whose first layer the second layer sees."""
-        return len(CROSS) if self.cross else 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Budget:
-    """Length of the training of a head."""
-
-    updates: int
-    """Number of training updates."""
-    samples: int
-    """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
-    rate: float = 1e-2
-    """Highest learning rate. A short training gains as much as one of twice its length where it
-    learns three times as fast; a long one does not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,11 +141,6 @@ def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
     return size * share - WEIGHT_BYTES * shape.weights - HEAD_BYTES
 
 
-HeadHistory = list[dict[str, float | None]]
-"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
-
-`samples` is the number of voxels that it learns from, the same at each point.
-"""
 StepSearch = Callable[[TileSettings], tuple[TileSettings, Outcome]]
 """Search for the step that keeps the promise, from that of the settings on."""
 MIN_GAIN = 0.02
@@ -216,48 +173,35 @@ class _Candidate(NamedTuple):
 
 
 def choose_head(
-    sample: Sample,
-    settings: TileSettings,
-    outcome: Outcome,
-    coding: Coding,
+    task: PlanTask,
+    attempt: Attempt,
     find_step: StepSearch,
     look: Callable[[TileSettings], Outcome],
-    tried: list[Outcome],
-    *,
-    aim: float | None,
-    data_range: float,
-    effort: int,
-    seed: int,
-    parts: Parts | None = None,
 ) -> tuple[TileSettings, Outcome, HeadHistory]:
     """Return settings with a head and a larger step if they make the sample smaller.
 
     Otherwise the settings and their outcome are returned as they are. The last result is the
     training history of the best head, empty if none was trained.
 
-    outcome: outcome of the settings, without a head.
-    coding: coding without a bound, for the values that a head is trained on.
+    attempt: without a head.
     find_step: search for the step that keeps the promise with a head.
     look: codes the sample once, as that search does.
-    tried: outcomes of that search without a head.
-    aim: PSNR in dB that is searched for, at which sizes are compared; None for a bound, which all
-        outcomes keep.
-    data_range: range of the values, in data units.
-    parts: progress of the planning, which is told about the training.
     """
+    sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
+    data_range, effort = task.goal.data_range, task.config.effort
+    # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
+    aim = None if task.goal.psnr is None else task.goal.psnr + AIM
     if outcome.size < MIN_BYTES:
         skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
         return settings, outcome, []
-    training = _Training(seed=seed)
-    parts = parts or Parts()
-    tell = partial(parts.report, "training")
+    tell = partial(task.parts.report, "training")
     with stage("head trial", "gain of a quick training, by which heads are chosen"):
-        pairs = training_pairs(sample, settings, coding)
-        trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
+        pairs = training_pairs(sample, settings, attempt.coding)
+        trial = _trained(task, pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
         skip("head", "its trial gains nothing")
         return settings, outcome, []
-    octave = octave_gain(tried, data_range)
+    octave = octave_gain(attempt.tried, data_range)
     shapes = likely_heads(outcome.size, expected_gain(trial.gain_db), octave, effort)
     if not shapes:
         gained = f"its trial gained {trial.gain_db:.2f} dB"
@@ -271,12 +215,12 @@ def choose_head(
             lost = outcome.psnr(data_range) - look(coarser).psnr(data_range)
             coarser = _coarsened(settings, coarser, lost, trial.gain_db)
         if trial.gain_db > NEAR_GAIN or not sample.complete:
-            pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
+            pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
 
         def train(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
-            return training.run(pairs, coarser, shape, EFFORTS[effort].budget_of(shape), tell)
+            return _trained(task, pairs, coarser, shape, EFFORTS[effort].budget_of(shape), tell)
 
-        heads = [head for head in _side_by_side(shapes, train, parts) if head is not None]
+        heads = [head for head in _side_by_side(shapes, train, task.parts) if head is not None]
         without = _Compared(outcome, octave, aim, data_range)
         best = _searched(without, [(head, coarser) for head in heads], find_step, look)
     if best is None:
@@ -367,7 +311,8 @@ def _history(candidate: _Candidate, data_range: float) -> HeadHistory:
         {
             "seconds": seconds,
             "epoch": update,
-            "psnr": _finite(psnr_without + gain),
+            # The header holds no infinity: that of values without an error.
+            "psnr": psnr if math.isfinite(psnr := psnr_without + gain) else None,
             "samples": trained.samples,
         }
         for seconds, update, gain in trained.history
@@ -405,11 +350,6 @@ def _side_by_side(
             stopped.set()
 
 
-def _finite(psnr: float) -> float | None:
-    """Return a PSNR that the header can hold: None for that of values without an error."""
-    return psnr if math.isfinite(psnr) else None
-
-
 def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
     """Return the tiles as they decode without a head, with their originals and masks."""
     decoded = sample.decoded(replace(settings, head=None, mask=None), coding)
@@ -419,33 +359,14 @@ def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> li
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Training:
-    """Training of heads: the part of its options that is the same for all heads."""
-
-    seed: int
-
-    def run(
-        self,
-        pairs: Sequence[Pair],
-        settings: TileSettings,
-        shape: Shape,
-        budget: Budget,
-        progress: Callable[[float], None],
-    ) -> TrainedHead | None:
-        """Train a head; None where there is nothing to learn.
-
-        progress: called with the share of the training that is done.
-        """
-        return train_head(
-            pairs,
-            low=settings.low,
-            high=settings.high,
-            hidden=shape.widths,
-            cross=shape.cross,
-            updates=budget.updates,
-            samples=budget.samples,
-            rate=budget.rate,
-            seed=self.seed,
-            progress=progress,
-        )
+def _trained(
+    task: PlanTask,
+    pairs: Sequence[Pair],
+    settings: TileSettings,
+    shape: Shape,
+    budget: Budget,
+    progress: Callable[[float], None],
+) -> TrainedHead | None:
+    """Train a head for settings; arguments and result are those of `train_head`."""
+    low, high, seed = settings.low, settings.high, task.config.seed
+    return train_head(pairs, low, high, shape, budget, seed=seed, progress=progress)

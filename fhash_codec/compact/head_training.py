@@ -362,16 +362,51 @@ class TrainedHead:
     """Voxels that it learned from."""
 
 
+@dataclass(frozen=True)
+class Shape:
+    """Widths of the two hidden layers of a head, and whether it looks at the voxels of a cross."""
+
+    widths: tuple[int, int]
+    cross: bool
+
+    @property
+    def weights(self) -> int:
+        """Number of weights, biases not included."""
+        first, second = self.widths
+        return INPUTS * first + self._seen * first * second + second
+
+    @property
+    def products(self) -> int:
+        """Multiplications for a voxel in training."""
+        first, second = self.widths
+        return self._seen * (INPUTS * first + first * second) + second
+
+    @property
+    def _seen(self) -> int:
+        """Voxels whose first layer the second layer sees."""
+        return len(CROSS) if self.cross else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Length of the training of a head."""
+
+    updates: int
+    """Number of training updates."""
+    samples: int
+    """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
+    rate: float = 1e-2
+    """Highest learning rate. A short training gains as much as one of twice its length where it
+    learns three times as fast; a long one does not."""
+
+
 def train_head(
     pairs: Sequence[Pair],
-    *,
     low: float,
     high: float,
-    updates: int,
-    samples: int,
-    rate: float = 1e-2,
-    hidden: tuple[int, int] = (12, 8),
-    cross: bool = False,
+    shape: Shape,
+    budget: Budget,
+    *,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> TrainedHead | None:
@@ -382,11 +417,7 @@ def train_head(
 
     pairs: decoded and original tiles (t, z, y, x) in data units.
     low, high: range that decoded values are clipped to.
-    updates: number of training updates, 1 or more.
-    samples: approximate number of voxels to learn from; a fifth as many measure the gain.
-    rate: highest learning rate.
-    hidden: widths of the hidden layers.
-    cross: whether the head looks at the hidden values of neighbours, see `NeighbourHead`.
+    budget: at least one update; a fifth as many further samples measure the gain.
     progress: called with the share of the training that is done, 0 to 1, after every few updates.
         What it raises ends the training.
     """
@@ -396,24 +427,26 @@ def train_head(
     bounds = np.float32(low), np.float32(high)
     learned, tested = (
         draw(pairs, max(1, round(count / BATCH_VOXELS)) * BATCH_VOXELS, random, *bounds)
-        for count in (samples, samples // 5)
+        for count in (budget.samples, budget.samples // 5)
     )
     sigma = _sigma(learned)
     if not SIGMA_RANGE[0] <= sigma <= SIGMA_RANGE[1]:
         return None
     value_range = ErrorRange(low=bounds[0], high=bounds[1], sigma=sigma)
-    offsets = CROSS if cross else CROSS[:1]
+    offsets = CROSS if shape.cross else CROSS[:1]
     training, held_out = (
         batches(pairs, drawn, offsets, random, value_range) for drawn in (learned, tested)
     )
-    networks = [Network(hidden, len(offsets), random) for _ in range(STARTS)]
-    history, network = _optimise(networks, training, held_out, _rates(updates, rate), progress)
+    networks = [Network(shape.widths, len(offsets), random) for _ in range(STARTS)]
+    history, network = _optimise(
+        networks, training, held_out, _rates(budget.updates, budget.rate), progress
+    )
     head = NeighbourHead(
         layers=network.layers(),
         sigma=float(sigma),
         low=float(bounds[0]),
         high=float(bounds[1]),
-        cross=cross,
+        cross=shape.cross,
     )
     return TrainedHead(
         head=head,

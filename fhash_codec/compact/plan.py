@@ -12,6 +12,7 @@ from typing import Any
 from fhash_codec.compact.attempt import (
     Attempt,
     GainLog,
+    HeadHistory,
     PlanTask,
     Tiling,
     cheap_tiling,
@@ -19,7 +20,6 @@ from fhash_codec.compact.attempt import (
     parse_tile,
 )
 from fhash_codec.compact.goal import Goal, integer_goal
-from fhash_codec.compact.head import HeadHistory
 from fhash_codec.compact.labels import (
     LabelTrial,
     ends_trials,
@@ -65,6 +65,8 @@ ROUNDING_ERROR = 12**-0.5
 """Root of the mean squared error of rounding to integers, in data units."""
 NEARLY = 0.5
 """Distance in dB that a sample may be below a promise that all tiles then keep."""
+OVERHEAD_BYTES = 2000
+"""Approximate bytes of a container without its tiles, for the sizes after each stage."""
 STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
@@ -101,7 +103,6 @@ def plan(
     value_range: ValueRange,
     config: EncodeConfig,
     goal: Goal,
-    overhead: int,
     workers: ThreadPoolExecutor,
     progress: Progress,
     features: Sequence[Feature],
@@ -109,12 +110,11 @@ def plan(
     """Choose tiles, fill values, transform, step, head and predictor, on a sample of the tiles.
 
     blocks: the series as one tile.
-    overhead: approximate bytes of the file that are no tiles.
     features: what is selected.
 
     Raises InputError for a tile or a ratio that cannot be had.
     """
-    gains = GainLog(overhead)
+    gains = GainLog(OVERHEAD_BYTES)
     fixed_tile = parse_tile(config.tile, blocks.shape)
     tile = fixed_tile or first_tile(blocks.shape)
     if _squares_overflow(value_range, goal):
@@ -137,7 +137,7 @@ def plan(
     exact_task = replace(
         task,
         goal=integer_goal(0, goal.data_range),
-        gains=GainLog(overhead),
+        gains=GainLog(OVERHEAD_BYTES),
         parts=Parts("planning exact values", STAGES, progress),
     )
     exact = _planned(exact_task, tiled)

@@ -492,7 +492,7 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
 
 def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     """Train a head, and keep it if the file gets smaller by it."""
-    config, goal = task.config, task.goal
+    goal = task.goal
     if not _asked(task, "head"):
         return attempt
     if reason := _without_head(task, attempt):
@@ -505,20 +505,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     def look(settings: TileSettings) -> Outcome:
         return attempt.sample.run(settings, goal.bounded(attempt.coding))
 
-    settings, outcome, history = choose_head(
-        attempt.sample,
-        attempt.settings,
-        attempt.outcome,
-        attempt.coding,
-        find,
-        look,
-        attempt.tried,
-        aim=None if goal.psnr is None else goal.psnr + AIM,
-        data_range=goal.data_range,
-        effort=config.effort,
-        seed=config.seed,
-        parts=task.parts,
-    )
+    settings, outcome, history = choose_head(task, attempt, find, look)
     if settings.head is None:
         settings, outcome = _at_the_promise(task, attempt)
     task.gains.note("head" if settings.head is not None else "head (left out)", outcome)

@@ -12,10 +12,9 @@ from fhash_codec.compact.goal import (
     EXCHANGE,
     RATIO_SLACK,
     SLOPE,
-    Bracket,
     Goal,
     PsnrSearch,
-    arithmetic_mean,
+    SizeSearch,
     cheapest,
     exchange,
     step_after_gain,
@@ -304,25 +303,13 @@ def _step_for_size(
     """Search for the step at which the tiles take a number of bytes."""
     if data_range == 0:
         return settings, sample.run(settings, coding)
-    data_range = max(data_range, 1e-300)
-    bracket = Bracket(
-        math.log(data_range * 2.0**-24), math.log(data_range * 4), middle=arithmetic_mean
-    )
+    search = SizeSearch(max(data_range, 1e-300), (2.0**-24, 4.0), size, drifts=True)
     log_step = math.log(settings.step)
-    fall = SLOPE / EXCHANGE  # octaves of bytes that a step larger by a factor of e saves
-    previous: tuple[float, int] | None = None
     for _ in range(2 * tries + 2):
-        log_step = min(max(log_step, bracket.low), bracket.high)
+        log_step = search.inside(log_step)
         settings = replace(settings, step=math.exp(log_step))
         outcome = sample.run(settings, coding)
         if abs(outcome.size - size) < 0.005 * size:
             break
-        bracket = bracket.narrowed(log_step, too_low=outcome.size > size)
-        if previous is not None:
-            log_step_before, size_before = previous
-            if (log_step_before - log_step) * (outcome.size - size_before) > 0:
-                measured = math.log2(outcome.size / size_before) / (log_step_before - log_step)
-                fall = min(max(measured, fall / 3), fall * 3)
-        previous = log_step, outcome.size
-        log_step = bracket.inside(log_step + math.log2(outcome.size / size) / fall)
+        log_step = search.after(log_step, outcome.size, too_fine=outcome.size > size)
     return settings, outcome

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.support.threads import chunk_region
+from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import WEIGHT, CodedTile, encode_tile, exact_tile
@@ -62,6 +63,21 @@ def fits_memory(series: Series) -> bool:
     """Whether a whole series would stay in memory as a box of vertices."""
     itemsize = (series.source_dtype or series.dtype).itemsize
     return prod(series.shape) * itemsize <= MAX_BYTES_IN_MEMORY
+
+
+def padded_tile(values: Values, in_coreset: Mask | None, tile: Shape) -> Tile:
+    """Return values (t, z, y, x) as a tile; beyond their end border values are repeated.
+
+    in_coreset: which of them count; None for all. Vertices beyond the end do not count.
+    """
+    padding = [(0, n - m) for n, m in zip(tile, values.shape, strict=True)]
+    if not any(after for _, after in padding):
+        if in_coreset is None or in_coreset.all():
+            return Tile(np.ascontiguousarray(values), None)
+        return Tile(np.ascontiguousarray(values), np.ascontiguousarray(in_coreset))
+    if in_coreset is None:
+        in_coreset = np.ones(values.shape, bool)
+    return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
 
 
 class _BoxInMemory:
@@ -204,14 +220,7 @@ class Blocks:
         in_coreset = None
         if layer.counted is not None:
             in_coreset = layer.counted[region]
-        padding = [(0, n - m) for n, m in zip(self.tile, values.shape, strict=True)]
-        if not any(after for _, after in padding):
-            if in_coreset is None or in_coreset.all():
-                return Tile(np.ascontiguousarray(values), None)
-            return Tile(np.ascontiguousarray(values), np.ascontiguousarray(in_coreset))
-        if in_coreset is None:
-            in_coreset = np.ones(values.shape, bool)
-        return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
+        return padded_tile(values, in_coreset, self.tile)
 
     def counted_values(self) -> Iterator[Values]:
         """Yield the values that count of each step, less the origin.
@@ -407,6 +416,46 @@ def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> 
         bulk_squares=math.fsum(weight * o.bulk_squares for weight, o in pairs),
         bulk_count=sum(weight * o.bulk_count for weight, o in pairs),
     )
+
+
+Source = TypeVar("Source")
+"""Whatever a tile is made of: its values, its index, or its stream."""
+Worked = tuple[bytes, Outcome, Values | None]
+"""Stream of a tile, its outcome, and its values as it decodes; None where these are not kept."""
+
+
+class CodedTiles(NamedTuple):
+    """Tiles that were coded one after the other."""
+
+    streams: list[bytes]
+    """Bytes of each tile."""
+    outcome: Outcome
+    """Size and error of all of them."""
+    decoded: list[Values | None]
+    """Values of each tile as it decodes, where they are kept."""
+
+
+def code_tiles(
+    sources: Iterable[Source],
+    work: Callable[[Source], Worked],
+    workers: ThreadPoolExecutor,
+    tell: Callable[[int], None] = lambda count: None,
+) -> CodedTiles:
+    """Code tiles in threads; few are worked on at a time, so that memory stays bounded.
+
+    sources: of the tiles, in their order; taken in the calling thread.
+    work: codes a tile, in any thread.
+    tell: called with the number of tiles that are done.
+    """
+    streams: list[bytes] = []
+    outcomes: list[Outcome] = []
+    decoded: list[Values | None] = []
+    for stream, outcome, values in map_ahead(workers, work, sources, 2 * usable_threads()):
+        streams.append(stream)
+        outcomes.append(outcome)
+        decoded.append(values)
+        tell(len(streams))
+    return CodedTiles(streams, total(outcomes), decoded)
 
 
 MAX_BYTES = 64 << 20

@@ -33,8 +33,8 @@ from fhash_codec.compact.transform import likely_transform, tile_costs, usual_tr
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import FeatureSelection, select_features
 from fhash_codec.measure.errors import find_bulk
-from fhash_codec.measure.metrics import measure_quality
-from fhash_codec.measure.ssim import BUDGET
+from fhash_codec.measure.metrics import Comparer, measure_quality
+from fhash_codec.measure.ssim import BUDGET, ssim_steps
 from fhash_codec.progress import recording, silent
 from fhash_formats.series import Series
 from fhash_formats.support.threads import usable_threads
@@ -318,16 +318,10 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
     values = np.nan_to_num(values.astype(np.float32))
     changed = values + np.float32(look.task.goal.expected_error)
     rates = []
-    for ssim_budget in (0, BUDGET):
+    for measured in ([], ssim_steps(steps, plane, BUDGET)):
         begun = now()
-        measure_quality(
-            lambda step: values[step],
-            lambda step: changed[step],
-            steps,
-            look.task.goal.data_range,
-            0.0,
-            ssim_budget=ssim_budget,
-        )
+        comparer = Comparer(look.task.goal.data_range, 0.0)
+        measure_quality(comparer, values.__getitem__, changed.__getitem__, steps, measured)
         rates.append((now() - begun) / (steps * plane))
     return rates[0], max(rates[1] - rates[0], 0.0)
 

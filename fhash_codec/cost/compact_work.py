@@ -20,10 +20,10 @@ from fhash_codec.compact.head import (
     TRAINING_VERTICES,
     TRIAL_BUDGET,
     TRIAL_HEAD,
-    Budget,
     expected_gain,
     likely_heads,
 )
+from fhash_codec.compact.head_training import Budget
 from fhash_codec.compact.labels import ends_trials
 from fhash_codec.compact.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.stages import (

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from fhash_codec.compact.head import training_pairs
+from fhash_codec.compact.head import TRIAL_HEAD, training_pairs
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     CHOSEN_AT,
     MEASUREMENTS,
     STARTS,
+    Budget,
     train_head,
 )
 from fhash_codec.config import EncodeConfig
@@ -49,16 +50,9 @@ def probe_head(look: Look, rates: Rates, config: EncodeConfig) -> HeadProbe | No
     coding = replace(search_coding(look, config.effort), error=None)
     pairs = training_pairs(rates.sample, rates.settings, coding)
     begun = now()
-    trained = train_head(
-        pairs,
-        low=rates.settings.low,
-        high=rates.settings.high,
-        hidden=(8, 8),
-        cross=True,
-        updates=HEAD_UPDATES,
-        samples=HEAD_SAMPLES,
-        seed=config.seed,
-    )
+    low, high = rates.settings.low, rates.settings.high
+    budget = Budget(updates=HEAD_UPDATES, samples=HEAD_SAMPLES)
+    trained = train_head(pairs, low, high, TRIAL_HEAD, budget, seed=config.seed)
     if trained is None:
         return None
     seconds = now() - begun

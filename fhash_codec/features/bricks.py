@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import TypeVar
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box, Sizes
 from fhash_codec.features import occupancy
-from fhash_codec.features.features import Extent, Feature, find_extent
+from fhash_codec.features.features import Extent, FeatureChoice, find_extent
 from fhash_codec.features.scan import Scan
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
@@ -89,9 +88,7 @@ class Coreset:
 def build_coreset(
     series: Series,
     scan: Scan,
-    key_frames: Sequence[int],
-    features: Sequence[Feature],
-    dilation: int,
+    choice: FeatureChoice,
     progress: Progress,
     *,
     fringe: bool = False,
@@ -99,8 +96,6 @@ def build_coreset(
 ) -> Coreset:
     """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
 
-    features: resolved, see `resolve_features`.
-    dilation: in vertices.
     fringe: whether vertices in the coreset of a neighbouring key frame only are samples as well
         (`Extent.with_fringe`). One without a finite value has that of the neighbour.
     brick: the shape of a brick (z, y, x); `brick_shape` of the box if None.
@@ -108,8 +103,8 @@ def build_coreset(
     Raises InputError if the features select nothing at all; single key frames may be empty. Warns
     of a feature that selects nothing while others do. Progress stages: "selecting", "gathering".
     """
-    several = len(features) > 1
-    extent = find_extent(series, scan, key_frames, features, dilation, progress, apart=several)
+    key_frames = choice.key_frames
+    extent = find_extent(series, scan, choice, progress, apart=len(choice.features) > 1)
     box, size = extent.box, extent.box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))

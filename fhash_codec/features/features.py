@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -479,12 +479,21 @@ class Extent:
         return bits.view(np.bool_).reshape(self.domain)[self.box.slices()]
 
 
+class FeatureChoice(NamedTuple):
+    """Features at key frames that are to be kept of a series."""
+
+    key_frames: Sequence[int]
+    """Steps to look at."""
+    features: Sequence[Feature]
+    """Features, resolved (`resolve_features`); a vertex of any of them is kept."""
+    dilation: int = 0
+    """Vertices by which they grow."""
+
+
 def find_extent(
     series: Series,
     scan: Scan,
-    key_frames: Sequence[int],
-    features: Sequence[Feature],
-    dilation: int,
+    choice: FeatureChoice,
     progress: Progress,
     ranks: Ranks | None = None,
     *,
@@ -498,6 +507,7 @@ def find_extent(
     Other parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
     """
     z, y, x = series.shape[1:]
+    key_frames, features, dilation = choice
     everything = any(isinstance(feature, Everything) for feature in features)
     if everything and not scan.missing and not apart:
         return _everywhere(scan, key_frames, (z, y, x), progress)

@@ -15,7 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.features.features import Extent, Feature, Mask, find_extent, resolve_features
+from fhash_codec.features.features import (
+    Extent,
+    Feature,
+    FeatureChoice,
+    Mask,
+    find_extent,
+    resolve_features,
+)
 from fhash_codec.features.key_frames import select_key_frames, time_axis
 from fhash_codec.features.scan import Scan, scan
 from fhash_codec.measure.value_range import Ranks
@@ -551,9 +558,8 @@ def select_features(
     )
     selected = None if everything else ranks
     with stage("features", f"vertices of {', '.join(map(str, features))}"):
-        extent = find_extent(
-            series, scanned, key_frames, features, config.dilation, progress, selected
-        )
+        choice = FeatureChoice(key_frames, features, config.dilation)
+        extent = find_extent(series, scanned, choice, progress, selected)
     return FeatureSelection(scanned=scanned, features=features, extent=extent, ranks=ranks)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.measure.errors import BulkQuality, Errors, ErrorSums, StepQuality, Values
-from fhash_codec.measure.ssim import BUDGET, SIGMA, WINDOW, ssim, ssim_steps
+from fhash_codec.measure.ssim import SIGMA, WINDOW, ssim
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.support.threads import usable_threads
@@ -235,8 +235,22 @@ class Comparer:
     The figures are added up in the order of the steps, whatever the number of threads.
     """
 
-    def __init__(self, data_range: float, background: float, bulk: ValueRange | None) -> None:
+    def __init__(
+        self,
+        data_range: float,
+        background: float,
+        bulk: ValueRange | None = None,
+        observe: Callable[[Comparison], None] = lambda comparison: None,
+    ) -> None:
+        """Begin without steps.
+
+        data_range: of the original series, in data units.
+        background: decoded value outside the coreset for the figures over the domain.
+        bulk: of the original series (`find_bulk`); no figures of it if None.
+        observe: called with each step that is added.
+        """
         self.coreset, self.domain = Errors(data_range, bulk), Errors(data_range)
+        self._observe = observe
         self.between = BetweenErrors(data_range)
         self.similarity, self.similar_vertices = 0.0, 0
         # Of all threads together: reading, decoding and comparing, and the SSIM alone.
@@ -292,6 +306,7 @@ class Comparer:
         self.similar_vertices += vertices
         self.seconds += comparison.seconds
         self.ssim_seconds += comparison.ssim_seconds
+        self._observe(comparison)
         return figures
 
     def tell_ssim(self, steps: int, elapsed: float) -> None:
@@ -329,44 +344,31 @@ class Comparer:
 
 
 def measure_quality(
+    comparer: Comparer,
     original_frames: Callable[[int], Values],
     decode: Callable[[int], Values],
     steps: int,
-    data_range: float,
-    background: float,
+    measured: Sequence[int],
     progress: Progress = silent,
-    *,
-    bulk: ValueRange | None = None,
     neighbours: NeighboursOf | None = None,
-    ssim_budget: int = BUDGET,
-    ssim_measured: Sequence[int] | None = None,
-    observe: Callable[[Comparison], None] = lambda comparison: None,
 ) -> Quality:
     """Compare all steps of a decoded series with the original.
 
+    comparer: new; what it observes are the comparisons of the steps, in their order.
     original_frames, decode: step -> frame (z, y, x) of the original, and of the decoded series. A
         vertex is in the coreset if its decoded value is finite.
-    data_range: of the original series, in data units.
-    background: decoded value outside the coreset for the figures over the domain, in data units.
-    bulk: of the original series, in data units (`find_bulk`); no figures of it if None.
+    measured: steps whose SSIM over the coreset is measured (`ssim_steps`).
     neighbours: of the key frames, see `neighbours_of`; None if every step is a key frame.
-    ssim_budget: vertices whose SSIM is measured (`ssim_steps`); with 0 it is None, of no step.
-    ssim_measured: steps whose SSIM is measured, in place of those of a budget.
-    observe: called with the comparison of each step, in their order.
 
-    At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
-    of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
-    Progress stage: "measuring".
+    At most FRAMES_HELD frames of each series are in memory. Raises InputError for frames of
+    different shapes. Progress stage: "measuring".
     """
-    comparer = Comparer(data_range, background, bulk)
-    measured, begun = [-1], time.perf_counter()
+    begun = time.perf_counter()
     threads, waiting = usable_threads(), deque[Future[Comparison]]()
 
     def collect() -> None:
         """Wait for the first step under way, and add it."""
-        comparison = waiting.popleft().result()
-        figures = comparer.add(comparison)
-        observe(comparison)
+        figures = comparer.add(waiting.popleft().result())
         # The figure of all steps so far: those of single steps would go up and down.
         psnr = comparer.coreset.psnr
         note = "" if psnr is None else f"{psnr:.1f} dB so far"
@@ -377,9 +379,6 @@ def measure_quality(
             reading = time.perf_counter()
             original, decoded = original_frames(step), decode(step)
             comparer.seconds += time.perf_counter() - reading
-            if step == 0:
-                measured = ssim_steps(steps, original.size, ssim_budget) if ssim_budget else []
-                measured = measured if ssim_measured is None else list(ssim_measured)
             at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
             while len(waiting) >= at_once:
                 collect()
@@ -397,4 +396,4 @@ def measure_quality(
         while waiting:
             collect()
     comparer.tell_ssim(len(measured), time.perf_counter() - begun)
-    return comparer.quality(measured)
+    return comparer.quality(list(measured))

@@ -1,1 +1,6 @@
-"""The paper profile: the published F-Hash."""
+"""The paper profile: the published F-Hash, trained from a random start.
+
+network, storage and model: reading; fit and train: the training; tables and table_step: coded
+tables; engines: implementations of a training step.
+Imports compact for coded tables alone. Reading imports no torch.
+"""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick
-from fhash_codec.features.features import Feature
+from fhash_codec.features.features import Feature, FeatureChoice
 from fhash_codec.features.scan import Scan
 from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
@@ -62,9 +62,7 @@ def select(
         coreset = build_coreset(
             series,
             scanned,
-            key_frames,
-            features,
-            config.dilation,
+            FeatureChoice(key_frames, features, config.dilation),
             progress,
             fringe=config.fringe == "trained",
             brick=brick,
@@ -123,8 +121,12 @@ def encode_paper(
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
     loss, vertices = None, parameter_count(architecture.levels, 1)
     if config.tables == "transform":
+        # No other tables need this module.
+        from fhash_codec.paper.table_step import write_coded
+
+        promised = _promised(selection, series, config)
         with stage("tables", "--tables transform: coded at a loss that the promise allows"):
-            loss = _write_coded_tables(writer, series, selection, trained, config, progress)
+            loss = write_coded(writer, architecture, coreset, trained, promised, progress)
     else:
         with stage("writing", "tables"):
             vertices = write_tables(
@@ -193,30 +195,6 @@ def _promised(selection: Selection, series: Series, config: EncodeConfig) -> flo
     """
     every_step = len(selection.coreset.key_frames) == series.shape[0]
     return config.psnr if every_step and config.tables == "transform" else None
-
-
-def _write_coded_tables(
-    writer: ContainerWriter,
-    series: Series,
-    selection: Selection,
-    trained: TrainedModel,
-    config: EncodeConfig,
-    progress: Progress,
-) -> float:
-    """Write the tables through the coder of the profile compact; return the PSNR lost, in dB."""
-    # Only `--tables transform` needs these modules.
-    from fhash_codec.paper.table_step import write_coded
-
-    return write_coded(
-        writer,
-        selection.architecture,
-        selection.coreset,
-        trained.fine,
-        trained.tables,
-        trained.layers,
-        _promised(selection, series, config),
-        progress,
-    )
 
 
 def _header(

@@ -293,19 +293,12 @@ class _Fitting:
 
     def _trained_to_end(self, engine: Engine, plan: TrainingPlan, stop: StopRequest) -> bool:
         """Train to the end of a plan; return whether it was reached."""
-        from fhash_codec.paper.train import train
+        from fhash_codec.paper.train import Breaks, train
 
         finished_before = self._reached.epoch == plan.epochs
         save = partial(self._save, engine, stop)
-        done = train(
-            engine,
-            plan,
-            self._coreset,
-            self._reached,
-            stop=stop,
-            save=save,
-            progress=self._progress,
-        )
+        breaks = Breaks(stop=stop, save=save)
+        done = train(engine, plan, self._coreset, self._reached, breaks, self._progress)
         # Later work may fail or be interrupted as well. A training worth keeping is kept until
         # the output file is complete.
         worth_keeping = stop.asked or self._reached.seconds > KEEP_SECONDS

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.boxes import TableSource
 from fhash_formats.errors import DamagedFileError, InputError
 
 Resolution = tuple[int, int, int, int]
@@ -315,22 +316,6 @@ def between(before: SparseFrame, after: SparseFrame, after_weight: np.float32) -
 
 Layer = tuple[Floats, Floats]
 """Weight (out, in) and bias (out,)."""
-
-
-class TableSource(Protocol):
-    """A level's table, in memory or elsewhere."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Lengths of the axes (t, z, y, x, embedding)."""
-        ...
-
-    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Return the embeddings of a region, float32 or float16.
-
-        The region is 5 slices of step 1 with explicit ends.
-        """
-        ...
 
 
 @runtime_checkable

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.boxes import TABLE_AXES, Box
+from fhash_codec.boxes import TABLE_AXES, Box, TableSource
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import Bits, read_bits, write_bits
@@ -23,7 +23,6 @@ from fhash_codec.paper.network import (
     NumberType,
     Resolution,
     SparseFrame,
-    TableSource,
 )
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE

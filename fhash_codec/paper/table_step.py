@@ -16,6 +16,7 @@ from fhash_codec.compact.goal import Bracket, geometric_mean
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, Tile, code
 from fhash_codec.compact.transform import Gram, Result, choose_transform, usual_transform
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.network import Architecture, Floats, Layer, Network
 from fhash_codec.paper.storage import component_name
 from fhash_codec.paper.tables import (
@@ -402,35 +403,6 @@ class CodedTables:
     error: float
 
 
-def code_tables(
-    architecture: Architecture,
-    coreset: Coreset,
-    fine: Floats,
-    tables: list[Floats],
-    layers: list[tuple[Floats, Floats]],
-    psnr: float | None,
-    workers: ThreadPoolExecutor,
-    progress: Progress,
-) -> CodedTables:
-    """Code trained tables with the largest quantiser step that keeps the allowed error.
-
-    Args:
-        architecture: the sizes of the tables.
-        coreset: the training samples.
-        fine: finest embeddings (E, samples), in the order of `Coreset.values`.
-        tables: the coarser tables, each (buckets, E).
-        layers: weight and bias of each layer.
-        psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it
-            before they are coded. Without it, coding may cost MAX_LOSS.
-        workers: threads for the coding.
-        progress: called before each trial.
-    """
-    bricks = Bricks(coreset)
-    trained = trained_tables(architecture, coreset, bricks, fine, tables)
-    samples = Samples(coreset, bricks, tile_shape(architecture.levels[0]))
-    return _Coding(architecture, trained, layers, samples, psnr, workers, progress).run()
-
-
 class _Coding:
     """The coding of trained tables with the largest quantiser step that keeps the allowed error."""
 
@@ -622,18 +594,24 @@ def write_coded(
     writer: ContainerWriter,
     architecture: Architecture,
     coreset: Coreset,
-    fine: Floats,
-    tables: list[Floats],
-    layers: list[tuple[Floats, Floats]],
+    model: TrainedModel,
     psnr: float | None,
     progress: Progress,
 ) -> float:
     """Code and write a trained model; return the dB of PSNR that this costs.
 
-    The arguments are those of `code_tables`, after the container that is being written.
+    The quantiser step is the largest that keeps the allowed error.
+
+    psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it
+        before they are coded. Without it, coding may cost MAX_LOSS.
+    progress: called before each trial.
     """
+    bricks = Bricks(coreset)
+    tables = trained_tables(architecture, coreset, bricks, model.fine, model.tables)
+    samples = Samples(coreset, bricks, tile_shape(architecture.levels[0]))
     with thread_pool() as workers:
-        coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
+        coding = _Coding(architecture, tables, model.layers, samples, psnr, workers, progress)
+        coded = coding.run()
         for level, table in enumerate(coded.tables, start=1):
             _write_table(writer, level, table)
     write_layers(writer, coded.layers, coded.layer_settings)

@@ -254,16 +254,29 @@ class TrainingProgress:
 SaveProgress = Callable[[TrainingProgress], None]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Breaks:
+    """Request to stop, saving, and limit in time of a training.
+
+    Attributes:
+        stop: asks for an end, which comes after the running batch.
+        save: called with the progress every `save_seconds`, and before `stop` ends the training.
+        save_seconds: least time between two calls of `save`.
+        budget_seconds: time after which the training ends.
+    """
+
+    stop: StopRequest | None = None
+    save: SaveProgress | None = None
+    save_seconds: float = 60.0
+    budget_seconds: float = float("inf")
+
+
 def train(
     engine: Engine,
     plan: TrainingPlan,
     coreset: Coreset,
     reached: TrainingProgress,
-    *,
-    stop: StopRequest | None = None,
-    save: SaveProgress | None = None,
-    save_seconds: float = 60.0,
-    budget_seconds: float = float("inf"),
+    breaks: Breaks = Breaks(),
     progress: Progress = silent,
 ) -> bool:
     """Train from where `reached` stands to the end of the plan. Return whether that was reached.
@@ -277,10 +290,7 @@ def train(
         plan: batches and learning rates.
         coreset: the training samples.
         reached: how far the training has come; changed in place.
-        stop: asks for an end, which comes after the running batch.
-        save: called with `reached` every `save_seconds`, and before `stop` ends the training.
-        save_seconds: least time between two calls of `save`.
-        budget_seconds: time after which the training ends.
+        breaks: what saves the training or ends it early.
         progress: called after each batch.
 
     Raises:
@@ -288,17 +298,17 @@ def train(
             USUAL_RATE left nothing but a constant.
     """
     loop = _Loop(engine, plan, coreset, reached)
-    saving = _Saving(save, save_seconds)
+    saving = _Saving(breaks)
     while reached.epoch < plan.epochs:
         for chosen in plan.order(reached.epoch)[reached.batch :]:
             loop.train_batch(chosen)
-            asked = stop is not None and stop.asked
+            asked = breaks.stop is not None and breaks.stop.asked
             due = saving.due(asked)
             if due or reached.batch % WATCHED == 0 or reached.batch == plan.batches:
                 loop.check_errors()
             if due:
                 saving.save(reached)
-            if asked or reached.seconds > budget_seconds:
+            if asked or reached.seconds > breaks.budget_seconds:
                 return False
             done = reached.epoch * plan.batches + reached.batch
             progress("training", done, plan.epochs * plan.batches, loop.note)
@@ -371,8 +381,8 @@ class _Loop:
 class _Saving:
     """The clock that says when the next checkpoint is due."""
 
-    def __init__(self, save: SaveProgress | None, seconds: float) -> None:
-        self._save, self._seconds = save, seconds
+    def __init__(self, breaks: Breaks) -> None:
+        self._save, self._seconds = breaks.save, breaks.save_seconds
         self._saved = time.perf_counter()
 
     def due(self, asked: bool) -> bool:

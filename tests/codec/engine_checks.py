@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-from readable_paper import NaiveEngine
-from torch import Tensor
-
 from fhash_codec.paper.engines.parameters import Parameters
 
 RATE = 0.01
@@ -29,22 +25,3 @@ def assert_near(ours: Parameters, theirs: Parameters) -> None:
         # A thousandth of one Adam step.
         assert float(apart.median()) < 1e-3 * RATE
         assert float((apart > 1e-3).double().mean()) < 0.01
-
-
-def assert_gradient_of_autograd(gradient: Tensor, used: Tensor, oracle: NaiveEngine) -> None:
-    """A gradient by coarse tables and layers is that of autograd, beside its largest entry.
-
-    used: positions of the coarse numbers in the gradient, see `Upsampling.used`.
-    """
-    tables = torch.cat(
-        [table.grad.flatten() for table in list(oracle.model.tables)[1:] if table.grad is not None]
-    )
-    gradients = [tables[used]]
-    for weight, bias in zip(oracle.model.weights, oracle.model.biases, strict=True):
-        assert weight.grad is not None
-        assert bias.grad is not None
-        gradients.append(torch.column_stack([weight.grad, bias.grad]))
-    expected = torch.cat([part.flatten() for part in gradients]).float()
-    apart = (gradient - expected).abs() / expected.abs().max()
-    assert float(apart.median()) < 1e-7
-    assert float((apart > 1e-5).double().mean()) < 0.001

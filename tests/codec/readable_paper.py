@@ -19,11 +19,11 @@ import torch
 from torch import Tensor, nn
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.parameters import (
     BETA1,
     BETA2,
     EPSILON,
+    Chosen,
     Parameters,
     initial_parameters,
 )

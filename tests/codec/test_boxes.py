@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +17,10 @@ from fhash_codec import EncodeConfig, RegionError
 from fhash_codec.boxes import (
     BLOCK,
     Box,
-    Mlp,
     Table,
     bounding_box,
-    ceil_halvings,
     coarse_vertices,
     expand_index,
-    fuse,
     index_ranges,
     shared_part,
     slice_of,
@@ -52,20 +47,6 @@ def mask_of(box: Box) -> npt.NDArray[np.bool_]:
     return mask
 
 
-def test_a_box_is_the_tuple_of_its_spans() -> None:
-    spans = ((1, 4), (2, 3), (0, 7))
-    box = Box(*spans)
-    assert box == spans
-    assert hash(box) == hash(spans)
-    assert Box.of([[1, 4], [2, 3], [0, 7]]) == box
-    assert json.dumps(box) == json.dumps(spans) == "[[1, 4], [2, 3], [0, 7]]"
-    assert pickle.loads(pickle.dumps(box)) == box
-    assert box.first == (1, 2, 0)
-    assert Box.of_shape((3, 1, 7)) == ((0, 3), (0, 1), (0, 7))
-    with pytest.raises(ValueError, match="unpack"):
-        Box.of([(0, 1), (0, 1)])
-
-
 @pytest.mark.parametrize("box", BOXES[::5], ids=str)
 def test_slices_cut_out_the_shape_of_a_box(box: Box) -> None:
     grid = np.moveaxis(np.indices(SHAPE), 0, -1)
@@ -83,16 +64,6 @@ def test_the_intersection_holds_the_vertices_of_both_boxes() -> None:
         both = mask_of(first) & mask_of(second)
         assert common == bounding_box(both)
         assert common is None or bool(both[common.slices()].all())
-
-
-def test_bounding_boxes_are_the_smallest_and_their_fusion_holds_all() -> None:
-    mask = np.zeros((5, 6, 7), bool)
-    assert bounding_box(mask) is None
-    assert fuse([None, None]) is None
-    mask[1, 2, 3] = mask[4, 2, 6] = True
-    box = bounding_box(mask)
-    assert box == ((1, 5), (2, 3), (3, 7))
-    assert fuse([box, None, Box((0, 2), (4, 6), (3, 4))]) == ((0, 5), (2, 6), (3, 7))
 
 
 QUICK = {"timings": False}
@@ -308,16 +279,3 @@ def test_other_indices_are_refused_model_parts(index: Any) -> None:
 def test_a_table_is_no_view() -> None:
     with pytest.raises(ValueError, match="decoded"):
         np.asarray(Table(1, Source(), "float32"), copy=False)
-
-
-def test_lengths_after_halvings_are_rounded_up() -> None:
-    assert ceil_halvings((9, 8, 1), 1) == (5, 4, 1)
-    assert ceil_halvings((9, 8, 1), 3) == (2, 1, 1)
-    assert ceil_halvings((9, 8, 1), 0) == (9, 8, 1)
-
-
-def test_an_mlp_counts_its_numbers() -> None:
-    weights, biases = np.zeros((3, 4), np.float32), np.zeros(3, np.float32)
-    mlp = Mlp(weights=(weights,), biases=(biases,), activation="relu", stencil="corners")
-    assert mlp.parameters == 15
-    assert mlp.layers == ((weights, biases),)

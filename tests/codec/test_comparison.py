@@ -91,19 +91,6 @@ def test_the_figures_are_those_of_the_file(field, tmp_path) -> None:
         assert again[name] == figures[name], name
 
 
-def test_figures_count_the_steps_between_key_frames(field, tmp_path) -> None:
-    source = field((5, 6, 8, 10))
-    figures = fhash_codec.encode(
-        source,
-        tmp_path / "a.fhz",
-        EncodeConfig(profile="paper", key_frames="every:2", epochs=30, width=16),
-    )
-    steps = {point["step"]: point["psnr"] for point in figures["quality"]["per_step"]}
-    assert sorted(steps) == [0, 1, 2, 3, 4]
-    assert figures["key_frames"] == [0, 2, 4]
-    assert min(steps[0], steps[2], steps[4]) > max(steps[1], steps[3])
-
-
 def test_the_source_is_counted_as_it_lies_on_disk(tmp_path: Path) -> None:
     folder = tmp_path / "a.zarr" / "c"
     folder.mkdir(parents=True)
@@ -114,8 +101,3 @@ def test_the_source_is_counted_as_it_lies_on_disk(tmp_path: Path) -> None:
     assert bytes_on_disk([folder.parent, tmp_path / "b.raw"]) == 10
     assert bytes_on_disk([]) is None
     assert bytes_on_disk([tmp_path / "gone"]) is None
-
-
-def test_an_array_has_no_source_on_disk(field, tmp_path) -> None:
-    figures = fhash_codec.encode(field((2, 4, 5, 6)), tmp_path / "a.fhz", EncodeConfig(effort=1))
-    assert (figures["source_bytes"], figures["source_ratio"]) == (None, None)

@@ -25,16 +25,6 @@ def test_from_dict_of_to_dict_is_the_same_even_through_json(config) -> None:
     assert EncodeConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-def test_the_two_psnrs_may_be_promised_together() -> None:
-    config = EncodeConfig(psnr=50.0, psnr_bulk=40.0)
-    assert EncodeConfig.from_dict(config.to_dict()) == config
-
-
-def test_every_field_has_help() -> None:
-    for name, field in EncodeConfig.__dataclass_fields__.items():
-        assert field.metadata["help"], name
-
-
 def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
     with pytest.raises(InputError, match=r"'learning_rat'.*'learning_rate'"):
         EncodeConfig.from_dict({"learning_rat": 0.1})
@@ -101,20 +91,3 @@ def test_settings_may_be_given_as_python_values() -> None:
     assert EncodeConfig(profile="paper", key_frames=[0, 3]).key_frames == "0,3"
     with pytest.raises(InputError, match="mask="):
         EncodeConfig(features=(np.ones(3, bool),))
-
-
-@pytest.mark.parametrize(("fold", "size", "width"), [(0, 0, 0), (5, 3, 32)])
-def test_the_sizes_of_a_model_suit_its_tables_unless_they_are_given(fold, size, width) -> None:
-    usual = {"float16": (2, 2, 64), "uint8": (2, 2, 64), "transform": (8, 1, 16)}
-    for tables, sizes in usual.items():
-        config = EncodeConfig(
-            profile="paper", tables=tables, fold=fold, embedding_size=size, width=width
-        )
-        found = (config.model_fold, config.model_embedding_size, config.model_width)
-        assert found == ((fold, size, width) if fold else sizes)
-
-
-def test_stages_to_leave_out_have_one_order_however_they_are_named() -> None:
-    for without in ("ssim,head", ("ssim", "head"), ["head, ssim", "head"]):
-        assert EncodeConfig(without=without).without == ("head", "ssim")  # type: ignore[arg-type]
-    assert EncodeConfig(profile="paper", without=("ssim",)).without == ("ssim",)

@@ -15,7 +15,7 @@ from cf_files import smooth
 import fhash_codec
 from fhash_codec import Dataset, EncodeConfig, InputError, Volume
 from fhash_codec import dataset as shared_volumes
-from fhash_codec.dataset import acquire, place_of, release, volumes_of
+from fhash_codec.dataset import acquire, release, volumes_of
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError as InputError_shared_volumes
 from fhash_formats.errors import MissingInputError
@@ -76,18 +76,6 @@ def test_one_variable_is_opened_by_name(run: tuple[Arrays, Path]) -> None:
             opening(path, variable="w")
 
 
-def test_a_file_of_one_variable_knows_its_name(tmp_path: Path, run: tuple[Arrays, Path]) -> None:
-    path = tmp_path / "one.fhz"
-    fhash_codec.encode(run[0]["v"], path, EncodeConfig(effort=1))
-    with fhash_codec.open(path) as volume, fhash_codec.open(path, variable="values") as same:
-        assert isinstance(volume, Volume)
-        assert isinstance(same, Volume)
-        assert volume.variable is None
-        np.testing.assert_array_equal(volume[...], same[...])
-    with pytest.raises(InputError, match="no variable 'v'; it holds values"):
-        fhash_codec.open(path, variable="v")
-
-
 def test_datasets_and_their_volumes_pickle_by_path(run: tuple[Arrays, Path]) -> None:
     _, path = run
     with fhash_codec.open(path, fill=-1) as dataset:
@@ -97,17 +85,6 @@ def test_datasets_and_their_volumes_pickle_by_path(run: tuple[Arrays, Path]) -> 
             assert list(again) == list(dataset)
             assert (again["v"].fill, volume.fill, volume.variable) == (-1, -1, "a/u")
             np.testing.assert_array_equal(volume[1], dataset["a/u"][1])
-
-
-def test_what_is_told_of_a_variable_is_its_own(run: tuple[Arrays, Path]) -> None:
-    _, path = run
-    with fhash_codec.open(path) as dataset:
-        infos = {name: volume.info for name, volume in dataset.items()}
-        assert sum(info["bytes"] for info in infos.values()) < path.stat().st_size
-        assert infos["v"]["ratio"] == infos["v"]["raw_bytes"] / infos["v"]["bytes"]
-        assert "v" in infos["v"]["arrays"]
-        assert "a_u" in infos["a/u"]["arrays"]
-        assert dataset["a/u"].describe()["tables"][0]["path"] == "a_u"
 
 
 QUICK = EncodeConfig(effort=1, psnr=30, without=("ssim",))
@@ -173,8 +150,3 @@ def test_a_forked_process_opens_the_file_again(run_shared_volumes: Path, monkeyp
 def test_a_missing_file_is_said_to_be_missing(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError):
         acquire(str(tmp_path / "none.fhz"))
-
-
-def test_a_place_is_absolute_or_a_url() -> None:
-    assert place_of("a.fhz") == os.path.join(os.getcwd(), "a.fhz")
-    assert place_of("https://host/a.fhz") == "https://host/a.fhz"

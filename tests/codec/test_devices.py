@@ -32,17 +32,6 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch) -> None:
     assert choose_device("cpu") == choose_device("auto") == torch.device("cpu")
 
 
-def test_auto_is_a_cuda_device_where_there_is_one(monkeypatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert choose_device("auto") == choose_device("cuda") == torch.device("cuda")
-    assert choose_device("cpu") == torch.device("cpu")
-
-
-def test_torch_is_found_where_it_is_installed() -> None:
-    assert has_torch()
-    need_torch("a test")
-
-
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     assert not has_torch()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import math
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +15,14 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec import header as step_figures
 from fhash_codec.header import (
-    brief_history,
     brief_quality,
     check_name,
-    figure_attributes,
     full_header,
-    history_line,
-    history_points,
     read_steps,
-    source_attributes,
     write_steps,
 )
 from fhash_formats import open_series
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.header import CONFIG_DEFAULTS
-from fhash_formats.series import ArraySeries, SourceMetadata
-
-
-@pytest.mark.parametrize("name", ["run.fhz", "run", "run.zip", "run.h5.fhz"])
-def test_other_names_are_allowed(name) -> None:
-    check_name(Path(name))
 
 
 @pytest.mark.parametrize("name", ["run.h5", "RUN.NC", "a.b.vti", "run.zarr"])
@@ -44,70 +31,8 @@ def test_names_of_data_are_refused(name) -> None:
         check_name(Path(name))
 
 
-NOTHING: dict[str, object] = {"per_step": [], "ssim_window": {}}
 WRITER = ContainerWriter("unused.fhz")
 """A writer that gets nothing: few steps have their figures in the header."""
-
-
-def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
-    steps = [
-        {"step": 0, "psnr": 45.129876, "rmse": 0.00123456789, "max_abs_error": 0.25},
-        dict.fromkeys(("psnr", "rmse", "max_abs_error")),
-    ]
-    quality = {
-        "psnr": 44.9999999,
-        "rmse": 1.23456701,
-        "max_abs_error": 0.1234561,
-        "ssim": None,
-        "ssim_window": {"window": 11},
-    }
-    assert brief_quality(WRITER, {**quality, "per_step": steps}, 1.0, 2) == {
-        "psnr": 44.9999,
-        "rmse": 1.23457,
-        "max_abs_error": 0.123457,
-        "ssim": None,
-        "ssim_window": {"window": 11},
-        "steps": {"rmse": [5816, 0, -2], "max_abs_error": [1204, 0, -2]},
-    }
-
-
-def test_the_bulk_in_a_file_is_its_range_and_its_psnr() -> None:
-    bulk = {"psnr": 40.1234567, "rmse": 0.01, "range": [1.0, 2.5]}
-    assert brief_quality(WRITER, {**NOTHING, "bulk": bulk}, 1.0, 0)["bulk"] == {
-        "psnr": 40.1234,
-        "range": [1.0, 2.5],
-    }
-    assert brief_quality(WRITER, {**NOTHING, "bulk": None}, 1.0, 0)["bulk"] is None
-
-
-def test_history_in_a_file_is_brief() -> None:
-    points = [{"seconds": n * 0.12345, "epoch": n, "psnr": 40.123} for n in range(1, 101)]
-    brief = brief_history(points, timings=True)
-    assert {name: len(values) for name, values in brief.items()} == {
-        **dict.fromkeys(("epoch", "seconds", "psnr"), 24)
-    }
-    last = {"seconds": 12.345, "epoch": 100, "psnr": 40.12}
-    assert history_points(brief)[-1] == last
-    assert brief_history(points[:2], timings=False) == {"epoch": [1, 2], "psnr": [40.12, 40.12]}
-    assert brief_history([], timings=True) == {}
-    assert history_points({"epoch": [1, 2], "psnr": [2.5, 3], "other": 5}) == [
-        {"seconds": None, "epoch": 1, "psnr": 2.5},
-        {"seconds": None, "epoch": 2, "psnr": 3},
-    ]
-    assert history_points({}) == []
-
-
-def test_a_history_with_the_largest_numbers_is_rounded() -> None:
-    largest = np.finfo(np.float64).max
-    point = {"seconds": largest, "epoch": 1, "psnr": -largest}
-    assert history_points(brief_history([point], timings=True)) == [point]
-
-
-def test_exact_values_have_no_psnr_in_the_history() -> None:
-    points = [{"seconds": 0.5, "epoch": n, "psnr": math.inf if n > 1 else 40.0} for n in (1, 2)]
-    brief = brief_history(points, timings=False)
-    assert brief == {"epoch": [1, 2], "psnr": [40.0, None]}
-    assert history_points(brief)[1] == {"seconds": None, "epoch": 2, "psnr": None}
 
 
 def header(quality: dict[str, Any], value_range: tuple[float, float] = (-1.0, 1.0)) -> Any:
@@ -140,39 +65,6 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
     other = {**window, "steps": [3], "data_range": 1.9}
     brief = brief_quality(WRITER, {"per_step": [], "ssim_window": other}, 2.0, 1)
     assert brief["ssim_window"] == other
-
-
-@pytest.mark.parametrize(("level", "ends"), [(-1, (0.0, 1.0)), (5, (3.0, 3.0)), (-2, (0.0, 1.0))])
-def test_a_step_without_error_or_range_has_no_psnr(level: int, ends: tuple[float, float]) -> None:
-    quality = {"steps": {"rmse": [0, level], "max_abs_error": [0, 0]}}
-    full = full_header(header(quality, ends), {})
-    assert full["quality"]["per_step"][0]["psnr"] is None
-
-
-def test_the_settings_left_out_are_settings_of_the_encoder() -> None:
-    assert CONFIG_DEFAULTS.keys() <= EncodeConfig().to_dict().keys()
-
-
-def test_a_file_tells_all_that_was_measured(tmp_path: Path) -> None:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 6, 7)), indexing="ij")
-    values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
-    report = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=45.0, effort=2))
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert "steps" in volume.container.header["quality"]
-        info = volume.info
-        assert volume.config == EncodeConfig(psnr=45.0, effort=2).to_dict()
-        assert info["config"] == volume.config
-    assert {"psnr_domain", "rmse_domain", "max_abs_error_domain"} <= info["quality"].keys()
-    assert info["quality"]["ssim_window"]["window"] == 11
-    assert info["model"]["gains"] == report["gains"]
-    assert {"what", "bytes", "seconds"} == report["gains"][0].keys()
-    for kept, measured in zip(
-        info["quality"]["per_step"], report["quality"]["per_step"], strict=True
-    ):
-        assert kept["step"] == measured["step"]
-        assert kept["rmse"] >= measured["rmse"] * (1 - 1e-12)
-        assert math.isclose(kept["rmse"], measured["rmse"], rel_tol=2e-3)
-        assert kept["psnr"] <= measured["psnr"]
 
 
 QUICK = EncodeConfig(effort=1, psnr=45, without=("ssim",), timings=False)
@@ -231,13 +123,6 @@ def test_both_profiles_and_plain_files_keep_everything(tmp_path, config) -> None
         np.testing.assert_equal(dict(found.variable_attributes), wanted.variable_attributes)
 
 
-def test_the_same_source_gives_the_same_bytes(tmp_path) -> None:
-    source = plain_file(tmp_path / "a.nc")
-    for name in ("a.fhz", "b.fhz"):
-        fhash_codec.encode(source, tmp_path / name, QUICK)
-    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
-
-
 def test_history_has_the_date_where_times_are_kept(tmp_path) -> None:
     source = plain_file(tmp_path / "a.nc")
     config = EncodeConfig(
@@ -251,40 +136,6 @@ def test_history_has_the_date_where_times_are_kept(tmp_path) -> None:
     assert rest.startswith(f"fhash {fhash_codec.__version__}: fhash encode a.nc")
     for words in ("--feature interval:270:280", "--effort 1", "--max-error 0.5"):
         assert f" {words}" in line
-
-
-def test_an_array_has_no_source(tmp_path) -> None:
-    fhash_codec.encode(ArraySeries(smooth(2, 4, 5, 6)), tmp_path / "a.fhz", QUICK)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume.metadata is None
-        assert "source" not in volume.container.header
-
-
-def test_a_foreign_header_has_a_line_as_well() -> None:
-    header: dict[str, Any] = {
-        "encoder": {"version": "9"},
-        "model": {"profile": "paper"},
-        "source": {"date": 3, "file": None},
-        "config": {"profile": "paper", "timings": False, "other": 1, "features": ["all"]},
-    }
-    assert history_line(header) == "fhash 9: fhash encode --profile paper --no-timings"
-
-
-def test_a_file_of_copied_tiles_says_that_it_was_packed() -> None:
-    header = {
-        "encoder": {"version": "0.9", "seed": 0, "command": "pack"},
-        "source": {"file": "run.zarr", "date": "2026-01-02T03:04:05Z"},
-        "config": {"max_error": 0.5},
-        "model": {"profile": "compact"},
-    }
-    assert history_line(header) == "2026-01-02T03:04:05Z fhash 0.9: fhash pack run.zarr"
-
-
-def test_attributes_tell_what_the_file_knows() -> None:
-    assert figure_attributes({"quality": {}}) == {}
-    known = {"quality": {"max_abs_error": 0.5, "psnr": None}}
-    assert figure_attributes(known) == {"fhash_max_error": 0.5}
-    assert source_attributes(SourceMetadata(dimensions={}, file="a.nc")) == {"fhash_source": "a.nc"}
 
 
 RMSE = [0.001, 0.0, None, 0.00123456, 0.5]
@@ -327,14 +178,6 @@ def test_figures_are_never_better_than_they_are(most: int, monkeypatch: Any) -> 
             new = step[name]
             assert new == old if not old else old * (1 - 1e-12) <= new <= old * 1.00125
     assert steps[4]["max_abs_error"] == 1.9
-
-
-@pytest.mark.parametrize("ends", [(2.0, 2.0), (0.0, 1e-300), (-1e308, 1e307), (-1.7e308, 1.7e308)])
-def test_figures_of_any_range(ends: tuple[float, float]) -> None:
-    steps, _ = back([1e-300, 3.0], [1e-299, 1e300], ends)
-    assert steps[0]["rmse"] == pytest.approx(1e-300, rel=2e-3)
-    assert steps[1]["rmse"] == pytest.approx(3.0, rel=2e-3)
-    assert steps[1]["max_abs_error"] == 1e300
 
 
 def test_levels_beyond_float64_have_no_figure() -> None:

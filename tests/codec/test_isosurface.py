@@ -49,27 +49,6 @@ def test_a_sphere_is_one_closed_surface_seen_from_the_lower_values(turned: str) 
     assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
 
 
-def test_uneven_coordinates_keep_their_places() -> None:
-    axes = coords()
-    axes["x"] = Coordinate(
-        name="x", values=np.sort(np.random.default_rng(0).uniform(-1.5, 1.5, 31))
-    )
-    frame = np.broadcast_to(axes["x"].values, (35, 33, 31))
-    np.testing.assert_allclose(
-        isosurface(frame, 0.25, axes).vertices[:, 0], 0.25, rtol=0, atol=1e-6
-    )
-
-
-def test_cells_without_a_value_are_left_out() -> None:
-    axes = coords()
-    frame = distance(axes)
-    frame[:, :, :16] = np.nan
-    frame[20, 20, 28] = np.inf
-    mesh = isosurface(frame, 1.0, axes)
-    assert mesh.vertices[:, 0].min() >= axes["x"].values[16] - 1e-9
-    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1.0, rtol=0, atol=2e-3)
-
-
 @pytest.mark.parametrize(("factor", "offset"), [(1e-3, 101325.0), (1e-200, 0.0), (1e200, 0.0)])
 def test_values_that_float32_does_not_tell_apart(factor: float, offset: float) -> None:
     axes = coords()

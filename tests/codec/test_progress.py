@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from fhash_codec import progress as stage_clock
-from fhash_codec.progress import OTHER, Parts, attribute, recording, silent, skip, stage
+from fhash_codec.progress import OTHER, Parts, attribute, recording, skip, stage
 
 Call = tuple[str, int, int, str]
 
@@ -38,14 +38,6 @@ def test_parts_are_counted_when_the_next_one_begins(parts: Parts, calls: list[Ca
     ]
 
 
-def test_a_known_share_is_reported_in_percent_and_once_each(
-    parts: Parts, calls: list[Call]
-) -> None:
-    for share in (-1.0, 0.001, 0.5, 0.502, 1.0, 2.0):
-        parts.report("training", share)
-    assert calls == [("training", percent, 100, "") for percent in (0, 50, 100)]
-
-
 def test_other_threads_count_and_do_not_call(parts: Parts, calls: list[Call]) -> None:
     parts.begin("head")
     go_on, shares = threading.Event(), [0.0]
@@ -69,27 +61,6 @@ def test_other_threads_count_and_do_not_call(parts: Parts, calls: list[Call]) ->
     assert ("training", 90, 100, "") not in calls
     parts.tick()
     assert calls[-1] == ("planning", 0, 3, "head, 2 tiles tried")
-
-
-def test_a_wait_ends_when_a_work_fails(parts: Parts) -> None:
-    release = threading.Event()
-
-    def fail() -> None:
-        raise ArithmeticError
-
-    with ThreadPoolExecutor(2) as workers:
-        works = [workers.submit(release.wait, 30), workers.submit(fail)]
-        try:
-            parts.wait(works, "training", lambda: 0.0, poll_seconds=0.01)
-        finally:
-            release.set()
-        with pytest.raises(ArithmeticError):
-            works[1].result()
-
-
-def test_silence_reports_nothing() -> None:
-    assert silent("coding", 1, 2, "") is None  # type: ignore[func-returns-value]
-    Parts().tick()
 
 
 class _Hands:
@@ -129,15 +100,6 @@ def test_a_stage_inside_another_takes_its_seconds_from_that_one(hands: _Hands) -
     assert (stages["inner"].times, stages["inner"].why) == (2, "twice")
 
 
-def test_an_error_ends_a_stage_as_well() -> None:
-    with recording() as clock:
-        with pytest.raises(ValueError, match="no"), stage("broken", "tried"):
-            raise ValueError("no")
-        with stage("next", "on it goes"):
-            pass
-    assert [entry.stage for entry in clock.stages()] == ["broken", "next", OTHER]
-
-
 def test_what_is_left_out_was_never_entered_and_says_why() -> None:
     with recording() as clock:
         skip("head", "--without head")
@@ -154,14 +116,3 @@ def test_seconds_between_those_of_a_stage_are_given_to_another(hands: _Hands) ->
         hands.seconds += 5
         attribute("ssim", "likeness", 3.0)
     assert [entry.seconds for entry in clock.stages()] == [2, 3, 0]
-
-
-def test_without_a_clock_nothing_is_recorded() -> None:
-    with stage("alone", "nobody counts"):
-        attribute("part", "nor this", 1.0)
-    skip("left out", "nor that")
-    with recording() as outer:
-        with recording() as inner, stage("inside", "its own record"):
-            pass
-        assert [entry.stage for entry in inner.stages()] == ["inside", OTHER]
-    assert [entry.stage for entry in outer.stages()] == [OTHER]

@@ -9,7 +9,7 @@ import cftime
 import numpy as np
 import pytest
 
-from fhash_codec.times import is_dated, number_text, time_of, time_range, time_text, times_of
+from fhash_codec.times import number_text, time_of, time_range, time_text, times_of
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 
@@ -59,20 +59,6 @@ def test_calendars_of_models() -> None:
         time_of(march, "2000-02-29", "run.fhz")
 
 
-@pytest.mark.parametrize("text", ["2001-03-01", "2001-02-12T00:01", "3", "nan", "-inf"])
-def test_outside_names_the_range_in_dates(text: str) -> None:
-    message = r"run\.fhz: time .* is outside the series, 2001-02-10 to 2001-02-12 \(0 to 2 days"
-    with pytest.raises(RegionError, match=message):
-        time_of(HALF_DAYS, text, "run.fhz")
-
-
-def test_dates_need_a_calendar() -> None:
-    with pytest.raises(InputError, match=r"no dates \(their units are 's'\); give a number 0 to 1"):
-        time_of(times([0, 1], "s"), "2001-02-10", "run.fhz")
-    with pytest.raises(InputError, match=r"'soon' is no date; write it as .*2001-02-10 to"):
-        time_of(HALF_DAYS, "soon", "run.fhz")
-
-
 def test_texts_tell_steps_apart() -> None:
     assert time_text(HALF_DAYS, 0.5) == "2001-02-10T12:00"
     assert time_text(HALF_DAYS, 1) == "2001-02-11"
@@ -84,12 +70,6 @@ def test_texts_tell_steps_apart() -> None:
     assert number_text(times([1e-300, 1e300], "s"), 1e300) == "1e+300"
     assert number_text(times([0, 1e-300, 1e300], "s"), 1e-300) == "1e-300"
     assert time_text(times([0, float("nan")]), float("nan")) == "nan days since 2001-02-10"
-
-
-def test_dates_need_finite_times() -> None:
-    assert is_dated(HALF_DAYS)
-    assert not is_dated(times([0, 1], "s"))
-    assert not is_dated(times([0, float("inf")]))
 
 
 @pytest.mark.parametrize(
@@ -109,10 +89,6 @@ def test_dates_need_finite_times() -> None:
 )
 def test_dates_of_python_numpy_and_cftime(time: Any, expected: float) -> None:
     assert time_of(HALF_DAYS, time, "run.fhz") == expected
-
-
-def test_a_year_of_numpy_is_its_beginning() -> None:
-    assert time_of(times([325, 326]), np.datetime64("2002"), "run.fhz") == 325
 
 
 @pytest.mark.parametrize("calendar", ["noleap", "360_day", "all_leap", "julian"])

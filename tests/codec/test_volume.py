@@ -1,28 +1,25 @@
-"""Features apart: a volume with some features of its file, decoded and drawn."""
+"""A container read like an array, here or elsewhere."""
 
 from __future__ import annotations
 
+import io
 import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError, Scene
-from fhash_codec.boxes import Box
+from fhash_codec import EncodeConfig, InputError, RegionError
 from fhash_codec.features.features import dilate
-from fhash_codec.rendering.tracking import parse_tracked, tracking_scene
 from fhash_codec.volume import (
     decoded_type,
     feature_names,
-    holds,
     holds_features_apart,
     only_features,
-    placed,
     rounded,
 )
-from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate
 
 LOW, HIGH = "interval:0:0.2", "interval:0.8:1"
@@ -114,37 +111,6 @@ def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
                 )
 
 
-def test_the_card_names_the_features_apart(run) -> None:
-    with fhash_codec.open(run) as volume:
-        occupancy = volume.describe()["occupancy"]
-        assert occupancy["apart"] == [LOW, HIGH]
-        stored = volume.container.arrays
-        assert occupancy["bytes"] == sum(
-            array.nbytes_stored for name, array in stored.items() if "occupancy/" in name
-        )
-
-
-def test_a_picture_of_one_feature_skips_the_other(run) -> None:
-    opaque = {"opacity": [[0, 0.5], [1, 0.5]]}
-    scene = Scene.from_dict({"size": [24, 24], "transfer_function": opaque})
-    with fhash_codec.open(run) as volume:
-        renderer = fhash_codec.Renderer(volume)
-        both = renderer.render(scene)
-        one = renderer.render(Scene.from_dict({**scene.to_dict(), "features": [LOW]}))
-        assert 0 < one.counters["samples"] < both.counters["samples"]
-        assert one.scene["features"] == [LOW]
-        np.testing.assert_array_equal(renderer.render(scene).rgba, both.rgba)
-
-
-def test_tracking_one_feature_of_several_leaves_out_the_rest(run) -> None:
-    with fhash_codec.open(run) as volume:
-        shown = {}
-        for texts in ([LOW], [LOW, HIGH], ["interval:0:0.1"], ["interval:0:0.1", LOW]):
-            tracked = parse_tracked(texts, volume)
-            shown[len(shown)] = tracking_scene(Scene(), tracked, volume).features
-    assert shown == {0: (LOW,), 1: (), 2: (), 3: ()}
-
-
 QUICK = {"effort": 1, "timings": False}
 
 
@@ -180,16 +146,6 @@ def test_a_bound_below_one_keeps_integers_exactly(tmp_path, dtype, promise) -> N
         assert volume[...].dtype == np.asarray(volume).dtype == values.dtype
         assert volume.read(1).dtype == volume.read_lod(1, 1).dtype == decoded_type(values.dtype)
         assert volume.values(0.5).dtype == decoded_type(values.dtype)
-
-
-@pytest.mark.parametrize("promise", [{"psnr": 40.0}, {"max_error": 2.5}, {"psnr": 15.0}])
-def test_other_promises_keep_the_type_as_well(tmp_path, promise) -> None:
-    fhash_codec.encode(labels(), tmp_path / "a.fhz", EncodeConfig(**promise, **QUICK))
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume[0].dtype == np.int16
-        np.testing.assert_array_equal(volume[...], [volume.read(t) for t in range(3)])
-        if "max_error" in promise:
-            assert np.abs(volume[...] - labels()).max() <= 2
 
 
 def test_vertices_without_a_value_need_a_fill_value(tmp_path) -> None:
@@ -243,31 +199,6 @@ def test_floats_have_nan_unless_a_fill_value_is_asked_for(tmp_path) -> None:
         assert (volume.values(0.5) == -1).sum() >= (volume[0] == -1).sum()
 
 
-def test_values_between_those_of_a_network_stay_floats(tmp_path) -> None:
-    config = EncodeConfig(profile="paper", epochs=1, width=4, timings=False)
-    fhash_codec.encode(labels(), tmp_path / "a.fhz", config)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume[...].dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("dtype", "number", "held"),
-    [
-        ("i1", 127, True),
-        ("i1", 128, False),
-        ("u1", -1, False),
-        ("i2", 1.5, False),
-        ("i2", 2.0, True),
-        ("i4", float("nan"), False),
-        ("f4", float("nan"), True),
-        ("f4", 1e39, False),
-        ("u8", 2**64 - 1, True),
-    ],
-)
-def test_numbers_that_a_type_holds(dtype, number, held) -> None:
-    assert holds(np.dtype(dtype), number) is held
-
-
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i4", "i8", "u8"])
 def test_rounding_stays_within_the_type(dtype) -> None:
     limits = np.iinfo(dtype)
@@ -277,20 +208,6 @@ def test_rounding_stays_within_the_type(dtype) -> None:
     assert whole[0] == whole[5] == limits.min
     assert int(whole[1]) == int(whole[4]) >= limits.max - 2 ** max(limits.bits - 53, 0)
     assert whole[2:4].tolist() == [0, 2]
-
-
-def test_values_are_placed_where_the_mask_says_and_nan_elsewhere() -> None:
-    values = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
-    mask = values != 3
-    box = Box.of(((1, 3), (0, 2), (2, 4)))
-    result = placed(values, mask, box, (3, 2, 5))
-    assert result.dtype == np.float32
-    assert result.shape == (3, 2, 5)
-    assert np.isnan(result).sum() == 30 - 7
-    np.testing.assert_array_equal(result[1:, :, 2:4][mask], values[mask])
-    whole = Box.of_shape((2, 2, 2))
-    assert placed(values, np.ones_like(mask), whole, (2, 2, 2)) is values
-    assert np.isnan(placed(values, mask, whole, (2, 2, 2))[0, 1, 1])
 
 
 @pytest.fixture
@@ -340,24 +257,6 @@ def test_any_part_holds_the_same_bits_as_that_slice_of_the_whole(volume, index) 
     assert part.dtype == values.dtype
 
 
-@pytest.mark.parametrize(
-    ("index", "message"),
-    [
-        (5, "index 5 is outside axis t of 5"),
-        (np.s_[0, -10], "index -10 is outside axis z of 9"),
-        (np.s_[0, 0, 0, 0, 0], "5 parts"),
-        (np.s_[..., 0, ...], "4 axes"),
-        ([0, 1], "not by list"),
-        (np.s_[0, None], "not by NoneType"),
-        (True, "not by bool"),
-        (1.5, "not by float"),
-    ],
-)
-def test_other_indices_are_refused(volume, index, message) -> None:
-    with pytest.raises(IndexError, match=message):
-        volume[index]
-
-
 def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume) -> None:
     field, _ = encoded
     for step in range(5):
@@ -371,18 +270,6 @@ def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume) -> No
             assert np.abs(filled - field[step])[occupied].mean() < 0.15
     with pytest.raises(InputError, match="outside is 'zero'; allowed: nan, background"):
         volume.read(0, outside="zero")
-
-
-def test_occupancy_is_the_dilated_feature_and_between_key_frames_that_of_either(
-    encoded, volume
-) -> None:
-    field, _ = encoded
-    for step in (0, 2, 4):
-        feature = (field[step] >= 0.5) & (field[step] <= 2)
-        assert (volume.occupancy(step) >= feature).all()
-    np.testing.assert_array_equal(volume.occupancy(1), volume.occupancy(0) | volume.occupancy(2))
-    np.testing.assert_array_equal(volume.occupancy(3.5), volume.occupancy(2) | volume.occupancy(4))
-    np.testing.assert_array_equal(volume.occupancy(2.0), volume.occupancy(2))
 
 
 @pytest.mark.parametrize("profile", ["paper", "compact"])
@@ -410,21 +297,6 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t) -
             )
         with pytest.raises(RegionError, match="axis x"):
             volume.occupancy(t, ((0, 6), (0, 7), (0, 9)))
-
-
-@pytest.mark.parametrize(
-    ("t", "region", "message"),
-    [
-        (5, None, "step 5 is outside 0..4"),
-        (-0.5, None, "outside 0..4"),
-        (float("nan"), None, "outside 0..4"),
-        (0, ((0, 10), (0, 1), (0, 1)), "region 0:10 of axis z"),
-        (0, ((0, 1), (3, 3), (0, 1)), "region 3:3 of axis y is empty"),
-    ],
-)
-def test_regions_outside_are_refused(volume, t, region, message) -> None:
-    with pytest.raises(RegionError, match=message):
-        volume.read(t, region)
 
 
 def test_sampling_at_vertices_gives_the_decoded_values(volume) -> None:
@@ -455,28 +327,6 @@ def test_sampling_outside_the_domain_is_nan_and_broadcasts(volume) -> None:
             volume.sample(z=0, y=0, x=0, **both)
 
 
-def test_gradients_are_per_vertex_and_per_step(volume) -> None:
-    random = np.random.default_rng(0)
-    t, z, y, x = (random.random(400) * (n - 1) for n in volume.shape)
-    values, gradient = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
-    np.testing.assert_array_equal(values, volume.sample(t=t, z=z, y=y, x=x))
-    inside = np.isfinite(values)
-    assert inside.sum() > 40
-    step = 1e-3
-    for axis, name in enumerate("tzyx"):
-        at = dict(zip("tzyx", (t, z, y, x), strict=True))
-        high, low = (
-            volume.sample(**{**at, name: np.clip(at[name] + s, 0, volume.shape[axis] - 1)})
-            for s in (step, -step)
-        )
-        difference = (high - low) / (2 * step)
-        close = np.isclose(gradient[:, axis], difference, rtol=0.05, atol=5e-3)[
-            inside & np.isfinite(difference)
-        ]
-        # A kink of the network or the border of a cell may lie between the two points.
-        assert close.mean() > 0.9, name
-
-
 @pytest.mark.parametrize("times", [[2.0, 3.0, 4.0, 30.0, 31.0], [31.0, 30.0, 4.0, 3.0, 2.0]])
 def test_physical_times_may_be_uneven_and_descend(tmp_path, times) -> None:
     field = np.linspace(0, 1, 5, dtype=np.float32)[:, None, None, None] * np.ones(
@@ -493,24 +343,6 @@ def test_physical_times_may_be_uneven_and_descend(tmp_path, times) -> None:
         np.testing.assert_array_equal(volume.sample(time=times, z=1, y=1, x=1), volume[:, 1, 1, 1])
         with pytest.raises(RegionError):
             volume.step_of_time(31.5)
-
-
-def test_dates_stand_for_times_where_the_series_has_a_calendar(tmp_path) -> None:
-    field = np.arange(2.0)[:, None, None, None] + np.zeros((1, 2, 3, 4))
-    for units in ("hours since 2001-02-10", "s"):
-        time = Coordinate(name="time", values=np.array([0.0, 12.0]), attributes={"units": units})
-        series = ArraySeries(field, coords={"t": time})
-        fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1), force=True)
-        dates = np.array(["2001-02-10T03:00", "2001-02-10T12:00"], "datetime64[ns]")
-        with fhash_codec.open(tmp_path / "t.fhz") as volume:
-            if units == "s":
-                with pytest.raises(InputError, match="the times are no dates"):
-                    volume.step_of_time(dates[0])
-                continue
-            assert volume.step_of_time("2001-02-10T03:00") == 0.25
-            assert volume.step_of_time(dates[0]) == 0.25
-            sampled = volume.sample(time=dates, z=1, y=1, x=1)
-            np.testing.assert_array_equal(sampled, volume.sample(t=[0.25, 1], z=1, y=1, x=1))
 
 
 def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_path) -> None:
@@ -547,105 +379,6 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch) -> Non
         assert len([name for name, _ in read if name == "parts/0.occupancy.bits"]) == 1
 
 
-def test_info_is_json_and_says_what_is_in_the_file(encoded, volume) -> None:
-    import json
-
-    info = json.loads(json.dumps(volume.info, allow_nan=False))
-    assert info["bytes"] == encoded[1].stat().st_size
-    assert info["key_frames"] == [0, 2, 4]
-    assert info["raw_bytes"] == encoded[0].nbytes
-    assert info["features"] == ["interval:0.5:2"]
-    assert volume.verify() == len(info["arrays"])
-
-
-def test_a_missing_file_is_named(tmp_path) -> None:
-    with pytest.raises(MissingInputError, match=r"none\.fhz"):
-        fhash_codec.open(tmp_path / "none.fhz")
-
-
-@pytest.mark.parametrize(
-    ("source", "decoded"),
-    [
-        ("uint8", "float32"),
-        ("int16", "float32"),
-        ("float16", "float32"),
-        ("float32", "float32"),
-        ("int32", "float64"),
-        ("float64", "float64"),
-    ],
-)
-def test_decoded_values_are_floats_as_wide_as_the_source_needs(source, decoded) -> None:
-    assert decoded_type(np.dtype(source)) == np.dtype(decoded)
-
-
-def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path) -> None:
-    import tracemalloc
-
-    peaks = []
-    for steps in (4, 32):
-        path = tmp_path / f"{steps}.fhz"
-        field = np.random.default_rng(0).random((steps, 16, 24, 24), dtype=np.float32)
-        fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=8))
-        with fhash_codec.open(path) as volume:
-            volume.read(1)
-            tracemalloc.start()
-            with fhash_codec.open(path) as fresh:
-                fresh.read(steps - 1)
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
-    # The directory grows by about a kilobyte a frame; a frame's finest table alone would be 37.
-    assert peaks[1] - peaks[0] < 28 * 4_000
-
-
-def test_what_a_compact_file_leaves_out(tmp_path) -> None:
-    """Coordinates are in the header, and every step is a key frame.
-
-    Without occupancy the whole box is in the coreset.
-    """
-    shape, box = (2, 3, 4, 5), (2, 4, 3)
-    header = {
-        "required_features": ["transform"],
-        "encoder": {"version": "0", "seed": 0},
-        "variable": {"name": "v", "units": "", "dtype": "float32", "attributes": {}},
-        "domain": {"shape": list(shape)},
-        "value_range": [0, 1],
-        "background": 0,
-        "feature_bounding_box": [[1, 3], [0, 4], [2, 5]],
-        "features": ["all"],
-        "dilation": 0,
-        "coreset_fraction": 0.5,
-        "model": {
-            "profile": "compact",
-            "levels": [[2, *box]],
-            "embedding_size": 1,
-            "tables": "float32",
-            "parameters": 0,
-            "head": None,
-        },
-        "coordinates": {
-            "time": {"values": [1, 5]},
-            "z": {},
-            "y": {"start": 2},
-            "x": {"step": 0.5, "name": "lon"},
-        },
-        "config": {},
-        "training": {"seconds": None, "epochs": 0, "device": "cpu"},
-        "quality": {},
-    }
-    with ContainerWriter(tmp_path / "a.fhz") as writer:
-        writer.add_whole("tables/level_1", np.zeros((2, *box), dtype=np.float32))
-        writer.commit(header)
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert volume.coords["x"].name == "lon"
-        assert volume.coords["x"].values.tolist() == [0, 0.5, 1, 1.5, 2]
-        assert volume.info["key_frames"] == [0, 1]
-        assert volume.step_of_time(2) == 0.25
-        for t in (0, 0.5):
-            occupied = np.zeros(shape[1:], dtype=bool)
-            occupied[1:3, 0:4, 2:5] = True
-            np.testing.assert_array_equal(volume.occupancy(t), occupied)
-
-
 def wind(dtype: str) -> np.ndarray:
     """Speeds that touch zero along moving fronts."""
     t, _, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 6, 14, 15)), indexing="ij")
@@ -666,3 +399,109 @@ def test_no_value_leaves_the_range_of_the_series(tmp_path, dtype, promise) -> No
     for decoded in read:
         assert values.min() <= decoded.min()
         assert decoded.max() <= values.max()
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A container of noise, which makes large tiles: 12 of 1 x 16 x 16 x 16."""
+    noise = np.random.default_rng(1).normal(size=(2, 16, 32, 48)).astype(np.float32)
+    path = tmp_path_factory.mktemp("remote") / "noise.fhz"
+    config = EncodeConfig(effort=1, max_error=1e-6, tile="1x16x16x16", without=("ssim",))
+    fhash_codec.encode(noise, path, config)
+    return path
+
+
+@pytest.fixture
+def url(path: Path, range_server) -> str:
+    return range_server.put("noise.fhz", path.read_bytes())
+
+
+def test_requests_and_bytes(path, url, range_server) -> None:
+    """The limits that docs/remote.md promises."""
+    with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
+        assert here.container.size > 120_000
+        assert here.chunks == (1, 16, 16, 16)
+        requests, size = range_server.taken()
+        assert requests <= 3
+        assert size <= 64_000
+        tile = (0, slice(0, 16), slice(16, 32), slice(16, 32))
+        assert_array_equal(volume[tile], here[tile])
+        requests, size = range_server.taken()
+        assert requests == 1
+        assert size <= 16_000
+        assert_array_equal(volume[tile], here[tile])
+        assert range_server.taken() == (0, 0)
+        assert_array_equal(volume[1], here[1])
+        requests, size = range_server.taken()
+        assert requests == 1
+        assert size <= here.container.size / 2
+        assert_array_equal(volume[:], here[:])
+        assert range_server.taken()[0] <= 2
+        assert volume.verify() == here.verify()
+        volume.close()
+
+
+def test_levels_of_detail_ask_for_all_tiles_at_once(path, url, range_server) -> None:
+    with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
+        range_server.taken()
+        assert_array_equal(volume.read_lod(0, 2), here.read_lod(0, 2))
+        assert range_server.taken()[0] == 1
+        assert_array_equal(volume.tables[1][0, :8, :8, :8, 0], here.tables[1][0, :8, :8, :8, 0])
+
+
+@pytest.mark.parametrize("profile", ["paper", "compact"])
+def test_both_profiles_equal_the_file_at_hand(encoded, path, range_server, profile) -> None:
+    path = encoded[1] if profile == "paper" else path
+    url = range_server.put("run.fhz", path.read_bytes())
+    with fhash_codec.open(path) as here, fhash_codec.open(url) as volume:
+        assert range_server.taken()[0] <= 3
+        assert_array_equal(volume[:], here[:])
+        points = {"t": [0.5], "z": [2.2], "y": [7.7], "x": [9.1]}
+        assert_array_equal(volume.sample(**points), here.sample(**points))
+        assert {**volume.info, "path": ""} == {**here.info, "path": ""}
+        assert volume.describe()
+
+
+def test_a_file_that_changes_is_noticed(path, url, range_server) -> None:
+    data = path.read_bytes()
+    with fhash_codec.open(url) as volume:
+        assert np.isfinite(volume[0, 0, :4, :4]).all()
+        range_server.put("noise.fhz", data[::-1])
+        with pytest.raises(InputError, match="the file changed since it was opened; open it again"):
+            volume[1]
+
+
+def test_a_volume_of_a_url_pickles_with_its_options(path, range_server) -> None:
+    range_server.token = "Bearer 1"
+    url = range_server.put("run.fhz", path.read_bytes())
+    options = {"headers": {"Authorization": "Bearer 1"}}
+    with fhash_codec.open(url, fill=-1.0, storage_options=options) as volume:
+        assert volume.path == url
+        assert url in repr(volume)
+        data = pickle.dumps(volume)
+        with pickle.loads(data) as copy:
+            assert_array_equal(copy[0, 0], volume[0, 0])
+            assert copy.fill == -1.0
+    range_server.put("run.fhz", path.read_bytes()[:-1])
+    with pytest.raises(fhash_codec.FhashError):
+        pickle.loads(data)
+
+
+def test_a_pickled_volume_is_not_another_file(path, encoded, tmp_path) -> None:
+    place = tmp_path / "run.fhz"
+    place.write_bytes(path.read_bytes())
+    with fhash_codec.open(place) as volume:
+        data = pickle.dumps(volume)
+    place.write_bytes(encoded[1].read_bytes())
+    with pytest.raises(InputError, match="another file is there than was opened before"):
+        pickle.loads(data)
+
+
+def test_open_files(path) -> None:
+    with fhash_codec.open(path) as here, open(path, "rb") as file:
+        with fhash_codec.open(file) as volume, fhash_codec.open(io.BytesIO(path.read_bytes())) as b:
+            assert_array_equal(volume[1], here[1])
+            assert_array_equal(b[1], here[1])
+            with pytest.raises(InputError, match="open it by its path or URL"):
+                pickle.dumps(volume)
+        assert not file.closed

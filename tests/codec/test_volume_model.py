@@ -47,39 +47,6 @@ def arrays(volume: Volume) -> dict[str, Any]:
         }
 
 
-@pytest.mark.parametrize("name", PAPER)
-def test_the_paper_shows_the_arrays_of_its_file(name: str) -> None:
-    with fhash_codec.open(GOLDEN / f"{name}.fhz") as volume:
-        plain = arrays(volume)
-        assert len(volume.tables) == len(volume.container.header["model"]["levels"])
-        for table in volume.tables:
-            path = f"tables/level_{table.level}"
-            assert table.ndim == 5
-            if name == "paper-transform":
-                components = [plain[f"{path}/component_{n + 1}"] for n in range(table.shape[4])]
-                mixed = sum(
-                    values[..., None] * np.float32(attributes["mixing"])
-                    for values, attributes in components
-                )
-                np.testing.assert_allclose(table[...], mixed, rtol=1e-6, atol=1e-6)
-                continue
-            numbers, attributes = plain[path]
-            if numbers.dtype == np.uint8:
-                scale, offset = (np.float32(attributes[key]) for key in ("scale", "offset"))
-                numbers = numbers * scale + offset
-            np.testing.assert_array_equal(table[...], numbers)
-            assert table.dtype == numbers.dtype
-        for number, (weights, biases) in enumerate(volume.mlp.layers, start=1):
-            np.testing.assert_array_equal(weights, plain[f"mlp/weight_{number}"][0])
-            np.testing.assert_array_equal(biases, plain[f"mlp/bias_{number}"][0])
-        keys = volume.key_times.key_frames
-        for key, step in enumerate(keys):
-            bits = volume.occupancy_bits(step)
-            if name != "paper-transform":  # its occupancy is coded
-                grids = plain["occupancy/bits"][0][:, key]
-                np.testing.assert_array_equal(bits, np.bitwise_or.reduce(grids))
-
-
 def test_bits_are_the_mask_in_ragged_morton_order(golden: Volume) -> None:
     step = 1
     mask = golden.container.arrays and golden._model.occupied(  # without missing values
@@ -93,15 +60,6 @@ def test_bits_are_the_mask_in_ragged_morton_order(golden: Volume) -> None:
     z, y, x = np.indices(golden.box.shape)
     number = morton_index(z, y, x, golden.box.shape)
     np.testing.assert_array_equal(bits[number >> 3] >> (7 - (number & 7)) & 1, mask)
-
-
-def test_settings_are_complete(golden: Volume) -> None:
-    names = EncodeConfig().to_dict().keys()
-    assert golden.config.keys() >= names
-    assert golden.config["profile"] == golden.profile
-    stored = golden.container.header["config"]
-    assert {name: golden.config[name] for name in stored} == stored
-    assert golden.info["config"] == golden.config
 
 
 def test_points_have_the_values_of_sample(golden: Volume) -> None:
@@ -243,15 +201,3 @@ def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(named
     np.testing.assert_allclose(again, values, atol=1e-6)
     assert slopes.shape == (len(values), 4)
     assert slopes.dtype == np.float64
-
-
-def test_levels_of_detail_are_given_or_refused(named_model) -> None:
-    name, model = named_model
-    if name == "compact":
-        values = model.read_lod(1, 1, Box.of_shape((3, 3, 4)))
-        np.testing.assert_array_equal(
-            model.read_lod(1, 1, Box((1, 3), (2, 3), (0, 2))), values[1:3, 2:3, 0:2]
-        )
-    else:
-        with pytest.raises(InputError, match="no levels of detail"):
-            model.read_lod(1, 1, Box.of_shape((3, 3, 4)))

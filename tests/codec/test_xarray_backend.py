@@ -1,9 +1,11 @@
-"""A lazy array has the dimensions of the source in their order, whatever is asked for."""
+"""Containers as xarray shows them: the values, names and attributes of their source."""
 
 from __future__ import annotations
 
 import pickle
 import tomllib
+import warnings
+from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
 from itertools import product
@@ -13,17 +15,133 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import xarray
 import xarray as xr
+import zarr
 from cf_files import KINDS, Kind, smooth
 from xarray.core import indexing
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.config import EncodeConfig as EncodeConfig_odd_names
 from fhash_codec.features.selection import labelled_series
-from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide, shown_names
+from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
+from fhash_formats.series import ArraySeries, Coordinate
+
+SHAPE = (5, 4, 12, 10)
+
+
+def values() -> np.ndarray[Any, Any]:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE), indexing="ij")
+    return (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
+
+
+def series(
+    data: np.ndarray[Any, Any] | None = None,
+    name: str = "rain rate",
+    times: Sequence[float] = (0, 1, 2.5, 4, 9),
+) -> ArraySeries:
+    coords = {
+        "t": Coordinate(name="time", values=np.array(times)),
+        "z": Coordinate(name="height", values=np.array([1.0, 2.0, 4.0, 8.0])),
+        "x": Coordinate(name="lon", values=np.linspace(0, 90, SHAPE[3])),
+    }
+    return ArraySeries(values() if data is None else data, name=name, units="mm h-1", coords=coords)
+
+
+def shown(path: Path) -> xarray.Dataset:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        store = zarr.storage.ZipStore(path, mode="r")
+        return xarray.open_zarr(store, consolidated=False, chunks=None).load()
+
+
+@pytest.mark.parametrize("tile", ["whole", "2x4x6x10"])
+@pytest.mark.parametrize("effort", [1, 3])
+def test_xarray_shows_the_variable(tmp_path: Path, tile: str, effort: int) -> None:
+    path = tmp_path / "run.fhz"
+    config = EncodeConfig(effort=effort, max_error=0.01, tile=tile, timings=False)
+    fhash_codec.encode(series(), path, config)
+    dataset = shown(path)
+    assert list(dataset.data_vars) == ["rain_rate"]
+    assert dataset["rain_rate"].dims == ("time", "height", "y", "lon")
+    assert dataset["rain_rate"].attrs == {"units": "mm h-1"}
+    with fhash_codec.open(path) as volume:
+        assert volume.name == "rain rate"
+        assert volume.info["arrays"]["rain_rate"]["shape"] == list(SHAPE)
+        np.testing.assert_array_equal(dataset["rain_rate"], volume[...])
+        assert volume.verify()
+
+
+def test_of_features_it_shows_the_box_and_nan_outside(tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    config = EncodeConfig(effort=2, max_error=0.01, features=("interval:1.2:9",), dilation=0)
+    fhash_codec.encode(series(), path, config)
+    with fhash_codec.open(path) as volume:
+        box = tuple(slice(low, high) for low, high in volume.box)
+        expected = volume[(slice(None), *box)]
+    found = shown(path)["rain_rate"]
+    np.testing.assert_array_equal(found, expected)
+    assert np.isnan(expected).any()
+    assert found.dims[0] == "time"
+    for name, own, whole in zip(found.dims[1:], found.shape[1:], SHAPE[1:], strict=True):
+        assert str(name).endswith("_box") == (own != whole)
+
+
+VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1
+NAMES = {
+    "zeta ": "zeta",
+    " ": "unnamed",
+    "": "unnamed",
+    "/": "unnamed",
+    "a/b": "a_b",
+    "..": "unnamed",
+    "a\nb": "a_b",
+    "a\0b": "a_b",
+    "__x": "_x",
+    "zarr.json": "zarr_json",
+    ".zarray": "_zarray",
+    "y" * 300: "y" * 240,
+    "\u03be": "\u03be",
+    "tables": "tables",
+    "a b": "a b",
+    "\ud800": "?",
+}
+CONFIG = EncodeConfig_odd_names(max_error=0.01, effort=1)
+
+
+def zarr_2(folder: Path, names: list[str]) -> Path:
+    group = zarr.open_group(folder / "a.zarr", mode="w", zarr_format=2)
+    made = group.create_array("u", shape=VALUES.shape, dtype="f4", chunks=VALUES.shape)
+    made[...] = VALUES
+    made.attrs["_ARRAY_DIMENSIONS"] = names
+    return folder / "a.zarr"
+
+
+def labelled(folder: Path, names: list[str]) -> xr.Dataset:
+    return xr.Dataset({"u": (names, VALUES)}, {names[1]: [3.0, 5.0, 7.0]})
+
+
+@pytest.mark.parametrize(("name", "plain"), NAMES.items(), ids=map(ascii, NAMES))
+@pytest.mark.parametrize("make", [zarr_2, labelled])
+def test_a_dimension_of_any_name_comes_back(
+    tmp_path: Path, make: Any, name: str, plain: str
+) -> None:
+    names = ["time", name, "lat", "lon"]
+    path = tmp_path / "a.fhz"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fhash_codec.encode(make(tmp_path, names), path, CONFIG)
+    told = [str(each.message) for each in caught if each.category is FhashWarning]
+    assert any("were changed" in text for text in told) == (plain != name)
+    with xr.open_dataset(path, engine="fhash") as dataset:
+        assert dataset["u"].dims == ("time", plain, "lat", "lon")
+        np.testing.assert_allclose(dataset["u"], VALUES, atol=0.01)
+        if make is labelled:
+            assert dataset[plain].values.tolist() == [3, 5, 7]
+
 
 DIMENSIONS = {"lon": "x", "one": "", "time": "t", "lat": "y"}
 
@@ -79,24 +197,16 @@ def test_chunks_are_the_tiles_of_the_dimensions(run) -> None:
         assert coarse.chunks(volume)["lon"] == x // 2
 
 
-def test_a_released_array_reads_on(run) -> None:
-    path, whole = run
-    lazy = array(path)
-    lazy.release()
-    lazy.release()
-    np.testing.assert_array_equal(lazy[indexing.BasicIndexer((0, 0, 0, 0))], whole[0, 0, 0, 0])
+BOUND = EncodeConfig(max_error=0.01, effort=1, timings=False)
+FLAT = (3, 1, 5, 6)
 
 
-CONFIG = EncodeConfig(max_error=0.01, effort=1, timings=False)
-SHAPE = (3, 1, 5, 6)
-
-
-def values(seed: int, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+def noise(seed: int, shape: tuple[int, ...] = FLAT) -> np.ndarray:
     return np.random.default_rng(seed).random(shape, dtype=np.float32)
 
 
 def opened(sources: dict[str, Any], path: Path) -> xr.Dataset:
-    fhash_codec.encode_dataset(sources, path, CONFIG)
+    fhash_codec.encode_dataset(sources, path, BOUND)
     return xr.open_dataset(path, engine="fhash")
 
 
@@ -105,19 +215,19 @@ def along(**sizes: int) -> xr.Variable:
 
 
 def test_variables_of_one_name_in_their_sources_are_all_there(tmp_path: Path) -> None:
-    sources = {f"{group}/u": ArraySeries(values(n), name="u") for n, group in enumerate("gh")}
+    sources = {f"{group}/u": ArraySeries(noise(n), name="u") for n, group in enumerate("gh")}
     with opened(sources, tmp_path / "a.fhz") as dataset:
         for number, name in enumerate(sources):
-            np.testing.assert_allclose(dataset[name], values(number), atol=0.01)
+            np.testing.assert_allclose(dataset[name], noise(number), atol=0.01)
 
 
 def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
     half = {"x": Coordinate(name="x", values=np.arange(6) + 0.5)}
     sources = {
-        "u": ArraySeries(values(0), name="u"),
-        "v": ArraySeries(values(1), name="v", coords=half),
-        "w": ArraySeries(values(2, (3, 1, 5, 7)), name="w"),
-        "p": ArraySeries(values(3), name="p", coords=half),
+        "u": ArraySeries(noise(0), name="u"),
+        "v": ArraySeries(noise(1), name="v", coords=half),
+        "w": ArraySeries(noise(2, (3, 1, 5, 7)), name="w"),
+        "p": ArraySeries(noise(3), name="p", coords=half),
     }
     with opened(sources, tmp_path / "a.fhz") as dataset:
         dimensions = {name: dataset[name].dims[-1] for name in sources}
@@ -125,41 +235,6 @@ def test_a_staggered_grid_has_positions_of_its_own(tmp_path: Path) -> None:
         assert dataset["v"].dims[:3] == dataset["u"].dims[:3]
         assert dataset["x_2"].values.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5]
         assert dataset.sizes["x_3"] == 7
-
-
-def with_latitudes(number: int) -> ArraySeries:
-    series = ArraySeries(values(number), name=f"u{number}")
-    latitudes = np.full((5, 6), 10.0 * number)
-    series.metadata = SourceMetadata(
-        dimensions={"time": "t", "y": "y", "x": "x"},
-        variable_attributes={"coordinates": "lat"},
-        variables=(
-            SourceVariable(name="lat", dimensions=("y", "x"), values=latitudes, is_coordinate=True),
-        ),
-    )
-    return series
-
-
-def test_arrays_beside_of_one_name_do_not_take_the_place_of_others(tmp_path: Path) -> None:
-    sources = {"u0": with_latitudes(0), "u1": with_latitudes(1)}
-    with opened(sources, tmp_path / "a.fhz") as dataset:
-        assert set(dataset.coords) == {"lat", "lat_2"}
-        assert (dataset["lat"] == 0).all()
-        assert (dataset["lat_2"] == 10).all()
-    with xr.open_dataset(tmp_path / "a.fhz", engine="fhash", decode_coords=False) as raw:
-        assert raw["u0"].attrs["coordinates"] == "lat"
-        assert raw["u1"].attrs["coordinates"] == "lat_2"
-
-
-def test_a_coordinate_has_not_the_name_of_a_variable() -> None:
-    joined = SideBySide({"u": "x", "x": "x"})
-    assert joined.add("u", along(x=3), {"x": along(x=3)}) == {"x": "x_2"}
-    joined.add("x", along(x=3), {"x": along(x=3)})
-    assert {name: v.dims for name, v in joined.variables.items()} == {
-        "x_2": ("x_2",),
-        "u": ("x_2",),
-        "x": ("x_2",),
-    }
 
 
 def test_the_values_of_a_variable_are_not_there_again_beside_another() -> None:
@@ -178,20 +253,9 @@ def test_a_dimension_without_positions_is_shared() -> None:
     assert joined.variables["w"].dims == ("x_2",)
 
 
-def test_a_variable_alone_keeps_the_names_of_its_source() -> None:
-    joined = SideBySide({"x": "x"})
-    joined.add("x", along(x=3), {})
-    assert joined.variables["x"].dims == ("x",)
-
-
-def test_names_are_those_of_the_sources_where_these_differ() -> None:
-    assert shown_names({"a/u": "u", "b/v": "v"}) == {"a/u": "u", "b/v": "v"}
-    assert shown_names({"a": "u", "b": "u", "c": "b"}) == {"a": "a", "b": "b", "c": "c"}
-
-
 def vector_file(path: Path, kind: str) -> dict[str, np.ndarray]:
     """A vector whose components have the names of the axes; their values."""
-    arrays = {name: values(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
+    arrays = {name: noise(number, (2, 4, 5, 6)) for number, name in enumerate("xyz")}
     with h5py.File(path, "w") as file:
         for step, (name, array) in product((0, 1), arrays.items()):
             place = f"data/{step}/meshes/B/{name}" if kind == "openpmd" else f"velocity/{name}"
@@ -209,7 +273,7 @@ def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> 
     source, path = tmp_path / "run.h5", tmp_path / "run.fhz"
     arrays = vector_file(source, kind)
     word = {"openpmd": "B", "groups": "velocity", "arrays": "values"}[kind]
-    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, CONFIG)
+    fhash_codec.encode_dataset(arrays if kind == "arrays" else source, path, BOUND)
     with xr.open_dataset(path, engine="fhash") as found:
         assert set(found.data_vars) == {f"{word}_{name}" for name in "xyz"}
         assert sum(each**2 for each in found.data_vars.values()).dims == ("time", "z", "y", "x")
@@ -225,8 +289,8 @@ def test_components_called_as_axes_share_one_grid(tmp_path: Path, kind: str) -> 
 
 
 def test_a_last_part_of_several_names_is_refused(tmp_path: Path) -> None:
-    arrays = {name: values(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
-    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", CONFIG)
+    arrays = {name: noise(0, (2, 4, 4, 4)) for name in ("E/x", "B/x", "B/rho")}
+    fhash_codec.encode_dataset(arrays, tmp_path / "run.fhz", BOUND)
     with fhash_codec.open(tmp_path / "run.fhz") as dataset:
         assert [dataset[name].name for name in ("E/x", "B_x", "rho")] == ["E_x", "B_x", "B/rho"]
         with pytest.raises(KeyError, match="2 variables named 'x'"):
@@ -250,7 +314,7 @@ def made(request, tmp_path_factory) -> tuple[Kind, Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> Path:
+def plain_run(tmp_path_factory) -> Path:
     """The container of a feature of an array, of several tiles; x is cut by the feature."""
     path = tmp_path_factory.mktemp("plain") / "run.fhz"
     values = smooth(5, 12, 20, 24).astype(np.float32)
@@ -260,7 +324,7 @@ def plain(tmp_path_factory) -> Path:
     return path
 
 
-def opened_xarray_backend(path: Path, **options: Any) -> xr.Dataset:
+def opened_alone(path: Path, **options: Any) -> xr.Dataset:
     return xr.open_dataset(path, engine=FhashBackend, **options)
 
 
@@ -282,7 +346,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
     name = kind.variable
     with (
         xr.open_dataset(source, decode_coords=coords) as whole,
-        opened_xarray_backend(container, decode_coords=coords) as stored,
+        opened_alone(container, decode_coords=coords) as stored,
     ):
         wanted, found = whole.isel(kind.select), stored
         if not coords:
@@ -304,18 +368,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
             )
 
 
-def test_the_file_says_where_it_comes_from(made) -> None:
-    container = made[2]
-    with opened_xarray_backend(container) as stored:
-        *before, line = stored.attrs["history"].split("\n")
-        assert "fhash encode source.nc --psnr 45 --effort 1 --without ssim" in line
-        assert line.startswith("fhash ")  # no date without timings
-        assert before in ([], ["made by hand"])
-        assert stored.attrs["fhash_source"] == "source.nc"
-        assert len(stored.attrs["fhash_source_digest"]) == 64
-
-
-def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
+def test_values_are_read_when_they_are_asked_for(plain_run, monkeypatch) -> None:
     read = []
     original = fhash_codec.Volume.values_of_steps
     monkeypatch.setattr(
@@ -326,7 +379,7 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
             original(self, steps, *args, **kw),
         )[1],
     )
-    with opened_xarray_backend(plain) as stored:
+    with opened_alone(plain_run) as stored:
         part = stored["values"].isel(time=slice(3, None, -2), z=4)
         assert read == []
         assert part.shape == (2, 20, 24)
@@ -343,25 +396,20 @@ def test_values_are_read_when_they_are_asked_for(plain, monkeypatch) -> None:
         (-1, -2, -3, -4),
     ],
 )
-def test_indices_are_those_of_numpy(plain, key: tuple[Any, ...]) -> None:
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
+def test_indices_are_those_of_numpy(plain_run, key: tuple[Any, ...]) -> None:
+    with (
+        fhash_codec.open(plain_run) as volume,
+        opened_alone(plain_run) as stored,
+    ):
         whole = xr.Variable(volume.dims, volume[...])
         np.testing.assert_array_equal(stored["values"][key].values, whole[key].values)
 
 
-def test_points_are_picked_one_by_one(plain) -> None:
-    places = xr.DataArray([0, 3, 3], dims="point")
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain) as stored:
-        found = stored["values"].isel(time=places, x=places + 5).values
-        whole = volume[...]
-    np.testing.assert_array_equal(found, np.stack([whole[n, :, :, n + 5] for n in (0, 3, 3)]))
-
-
-def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
-    with fhash_codec.open(plain) as volume:
+def test_dask_reads_tiles_with_the_same_bits(plain_run) -> None:
+    with fhash_codec.open(plain_run) as volume:
         whole = volume[...]
         tile = volume.chunks
-    with opened_xarray_backend(plain, chunks={}) as stored:
+    with opened_alone(plain_run, chunks={}) as stored:
         lazy = stored["values"]
         assert tuple(along[0] for along in lazy.chunks) == tile
         for scheduler in ("synchronous", "threads", "processes"):
@@ -370,18 +418,10 @@ def test_dask_reads_tiles_with_the_same_bits(plain) -> None:
             assert found.tobytes() == whole.tobytes(), scheduler
 
 
-def test_a_dataset_is_pickled_by_its_path(plain) -> None:
-    with opened_xarray_backend(plain) as stored:
-        data = pickle.dumps(stored)
-        assert len(data) < 20_000
-        other = pickle.loads(data)
-        np.testing.assert_array_equal(other["values"][1], stored["values"][1])
-
-
-def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
+def test_another_file_of_the_same_name_is_refused(plain_run, tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    path.write_bytes(plain.read_bytes())
-    with opened_xarray_backend(path) as stored:
+    path.write_bytes(plain_run.read_bytes())
+    with opened_alone(path) as stored:
         data = pickle.dumps(stored)
     path.unlink()
     fhash_codec.encode(smooth(5, 12, 20, 24), path, QUICK)
@@ -389,15 +429,11 @@ def test_another_file_of_the_same_name_is_refused(plain, tmp_path) -> None:
         pickle.loads(data)["values"].values  # noqa: B018 - reads them
 
 
-def test_a_closed_dataset_opens_its_file_again(plain) -> None:
-    stored = opened_xarray_backend(plain)
-    before = stored["values"][0].values
-    stored.close()
-    np.testing.assert_array_equal(stored["values"][0].values, before)
-
-
-def test_levels_of_detail_have_every_other_vertex(plain) -> None:
-    with fhash_codec.open(plain) as volume, opened_xarray_backend(plain, lod=1) as stored:
+def test_levels_of_detail_have_every_other_vertex(plain_run) -> None:
+    with (
+        fhash_codec.open(plain_run) as volume,
+        opened_alone(plain_run, lod=1) as stored,
+    ):
         z, y, x = volume.lod_vertices(1)
         assert stored["values"].shape == (5, len(z), len(y), len(x))
         np.testing.assert_array_equal(stored["x"], list(x))
@@ -407,27 +443,16 @@ def test_levels_of_detail_have_every_other_vertex(plain) -> None:
         np.testing.assert_array_equal(part, volume.read_lod(3, 1)[1:4, ::-2, 5])
 
 
-def test_the_background_stands_outside(plain) -> None:
-    with (
-        fhash_codec.open(plain) as volume,
-        opened_xarray_backend(plain, outside="background") as stored,
-    ):
-        assert np.isnan(volume[0]).any()
-        np.testing.assert_array_equal(
-            stored["values"][0].values, volume.read(0, outside="background")
-        )
-
-
 @pytest.mark.parametrize(
     "options", [{"outside": "zero"}, {"lod": 1, "outside": "background"}, {"variable": "u"}]
 )
-def test_other_options_are_refused(plain, options: dict[str, Any]) -> None:
+def test_other_options_are_refused(plain_run, options: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        opened_xarray_backend(plain, **options)
+        opened_alone(plain_run, **options)
 
 
-def test_a_container_is_known_by_its_end(plain, tmp_path) -> None:
-    (tmp_path / "run").write_bytes(plain.read_bytes())
+def test_a_container_is_known_by_its_end(plain_run, tmp_path) -> None:
+    (tmp_path / "run").write_bytes(plain_run.read_bytes())
     (tmp_path / "other").write_bytes(b"nothing")
     backend = FhashBackend()
     assert backend.guess_can_open("s3://bucket/run.fhz")
@@ -446,7 +471,7 @@ def test_a_dataset_is_encoded_by_its_accessor(tmp_path) -> None:
     kind = KINDS["rotated"]()
     source = xr.decode_cf(kind.dataset, decode_coords="all")
     source.fhash.encode(tmp_path / "run.fhz", effort=1, psnr=45.0)
-    with opened_xarray_backend(tmp_path / "run.fhz", decode_coords="all") as stored:
+    with opened_alone(tmp_path / "run.fhz", decode_coords="all") as stored:
         same = stored.assign(tas=stored["tas"].copy(data=source["tas"].values))
         xr.testing.assert_identical(without_own(source), without_own(same))
     with pytest.raises(InputError, match="unknown setting"):
@@ -466,7 +491,7 @@ def test_several_variables_of_a_file_open_as_their_source_does(tmp_path) -> None
     fhash_codec.encode_dataset(tmp_path / "two.nc", tmp_path / "run.fhz", QUICK)
     with (
         xr.open_dataset(tmp_path / "two.nc") as whole,
-        opened_xarray_backend(tmp_path / "run.fhz") as found,
+        opened_alone(tmp_path / "run.fhz") as found,
     ):
         same = found
         for name in ("tas", "pr"):
@@ -519,7 +544,7 @@ def test_a_packing_that_the_values_do_not_fit_is_not_handed_on(tmp_path, way: st
             fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
     else:
         fhash_codec.encode(source, tmp_path / "run.fhz", QUICK)
-    with opened_xarray_backend(tmp_path / "run.fhz") as stored:
+    with opened_alone(tmp_path / "run.fhz") as stored:
         error = stored["t2m"].attrs["fhash_max_error"]
         assert "valid_min" not in stored["t2m"].attrs
         stored.to_netcdf(tmp_path / "again.nc", engine="h5netcdf")
@@ -541,18 +566,13 @@ def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: s
     with open_series(source, var=made.variable) as series:
         fhash_codec.encode(series, tmp_path / "path.fhz", QUICK)
     numbers = {"decode_times": False}
-    for name, options in (("plain", numbers), ("all", {"decode_coords": "all"}), ("dates", {})):
+    for name, options in (
+        ("plain", numbers),
+        ("all", {"decode_coords": "all"}),
+        ("dates", {}),
+    ):
         with read(**options) as data:
             series = labelled_series(data, made.variable)
             fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)
         same = (tmp_path / f"{name}.fhz").read_bytes() == (tmp_path / "path.fhz").read_bytes()
         assert same, name
-
-
-def test_data_in_memory_or_computed_name_no_file(tmp_path) -> None:
-    source = KINDS["packed"]().write(tmp_path / "source.nc")
-    with xr.open_dataset(source, chunks={}) as lazy:
-        assert labelled_series(lazy).metadata.file == "source.nc"
-        for data in (xr.load_dataset(source), lazy.assign(sst=lazy["sst"] * 2)):
-            metadata = labelled_series(data, "sst").metadata
-            assert (metadata.file, metadata.digest) == (None, None)

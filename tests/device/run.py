@@ -278,7 +278,7 @@ def curve(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str
     import torch
 
     from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.train import TrainingProgress, plan_training, train
+    from fhash_codec.paper.train import Breaks, TrainingProgress, plan_training, train
     from fhash_codec.simulation.simulate import simulate
 
     series, results = simulate("front", sizes.shape), []
@@ -293,7 +293,7 @@ def curve(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str
                 name, architecture, coreset, plan.rates, seed=0, device=torch.device(device)
             )
             ready, reached = time.perf_counter() - begun, TrainingProgress()
-            train(engine, plan, coreset, reached, budget_seconds=sizes.curve_seconds)
+            train(engine, plan, coreset, reached, Breaks(budget_seconds=sizes.curve_seconds))
             results.append(
                 {
                     "engine": name,

@@ -14,7 +14,7 @@ from fhash_codec.boxes import Sizes, bounding_box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Feature, Mask
+from fhash_codec.features.features import Everything, Feature, FeatureChoice, Mask
 from fhash_codec.features.scan import Scan
 from fhash_codec.features.selection import resolve_selection
 from fhash_codec.progress import Progress, silent
@@ -112,7 +112,11 @@ class Data:
     def _single(self, features: tuple[Feature, ...], dilation: int) -> Coreset:
         """Samples in bricks of one vertex, so that batches are of shuffled vertices."""
         return build_coreset(
-            self.series, self.scanned, self.key_frames, features, dilation, silent, brick=(1, 1, 1)
+            self.series,
+            self.scanned,
+            FeatureChoice(self.key_frames, features, dilation),
+            silent,
+            brick=(1, 1, 1),
         )
 
     @cached_property
@@ -168,7 +172,8 @@ def gather_data(
         profile="paper", features=(feature_text(name, kind),), key_frames=key_frames
     )
     scanned, keys, features = resolve_selection(series, config, progress, None)
-    coreset = build_coreset(series, scanned, keys, features, DILATION, progress, fringe=True)
+    choice = FeatureChoice(keys, features, DILATION)
+    coreset = build_coreset(series, scanned, choice, progress, fringe=True)
     frames = tuple(scanned.value_range.to_unit(series.read(step)) for step in keys)
     return Data(
         name=name,

@@ -15,11 +15,8 @@ if TYPE_CHECKING:
     import torch
 
     from fhash_codec.features.bricks import Coreset
-    from fhash_codec.paper.engines.parameters import Parameters
+    from fhash_codec.paper.engines.parameters import Chosen, Parameters
     from fhash_codec.paper.network import Architecture
-
-Chosen = npt.NDArray[np.int64]
-"""Numbers (n,) of some bricks of the coreset, without repetition."""
 
 
 class Engine(Protocol):

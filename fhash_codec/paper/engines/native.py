@@ -23,10 +23,10 @@ from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.native.network import PATHS, library, machine_paths
-from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.parameters import (
     BETA1,
     BETA2,
+    Chosen,
     Parameters,
     Upsampling,
     axis_matrices,

@@ -28,6 +28,8 @@ WINDOW = 200
 """
 
 Column = npt.NDArray[np.float32]
+Chosen = npt.NDArray[np.int64]
+"""Numbers (n,) of some bricks of the coreset, without repetition."""
 
 
 class CatchUp(NamedTuple):

@@ -27,9 +27,9 @@ from torch import Tensor
 
 from fhash_codec.devices import first_line
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.parameters import (
     CatchUp,
+    Chosen,
     Lattices,
     Parameters,
     Upsampling,

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray
-import zarr
 
 import fhash_codec
 from fhash_codec import ClusterError, EncodeConfig, InputError
@@ -128,28 +126,6 @@ def test_a_persisted_array_stays_on_the_workers(tmp_path, client) -> None:
     require_same(tmp_path, source.to_dataset(), client, settings())
 
 
-def test_an_array_without_labels_and_with_gaps(tmp_path, client) -> None:
-    dask = pytest.importorskip("dask.array")
-    gaps = values()
-    gaps[3:5, 1:3] = np.nan
-    require_same(tmp_path, dask.from_array(gaps, chunks=(3, 6, 4, 10)), client, settings())
-
-
-def test_workers_read_what_this_process_reads(tmp_path, client) -> None:
-    """dask takes the client by default: for the engine, the file as Zarr, and its view."""
-    path = tmp_path / "run.fhz"
-    fhash_codec.encode(values(), path, settings())
-    with fhash_codec.open(path) as volume:
-        expected = volume[...]
-    store = zarr.storage.ZipStore(path, mode="r")
-    for dataset in (
-        xarray.open_dataset(path, chunks={}),
-        xarray.open_zarr(store, consolidated=False),
-        xarray.open_zarr(fhash_codec.zarr_store(path)),
-    ):
-        np.testing.assert_array_equal(dataset["values"], expected)
-
-
 def test_a_failure_of_a_worker_is_one_line(tmp_path, client) -> None:
     path = saved(tmp_path, values())
     hidden = path.with_name("hidden.npy")
@@ -162,20 +138,6 @@ def test_a_failure_of_a_worker_is_one_line(tmp_path, client) -> None:
         fhash_codec.encode(path, tmp_path / "a.fhz", settings(), client=client, progress=hide)
     assert "\n" not in str(error.value)
     assert os.listdir(tmp_path) == ["hidden.npy"]
-
-
-def test_a_worker_that_dies_is_one_line(tmp_path, client, monkeypatch) -> None:
-    monkeypatch.setattr(
-        rooms._FileJobs, "submit", lambda self, *rest, **options: client.submit(os._exit, 1)
-    )
-    path = saved(tmp_path, values())
-    dask = pytest.importorskip("dask")
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        pytest.raises(ClusterError, match="part 1/5 failed on the cluster: KilledWorker"),
-    ):
-        fhash_codec.encode(path, tmp_path / "a.fhz", settings(), client=client)
-    assert os.listdir(tmp_path) == ["data.npy"]
 
 
 @pytest.mark.parametrize("older", [False, True])
@@ -195,22 +157,6 @@ def test_an_interruption_cancels_the_rest_and_leaves_no_file(tmp_path, threads, 
     assert all(future.done() or future.running() for future in threads.futures)
     assert sorted(os.listdir(tmp_path)) == (["a.fhz"] if older else []) + ["data.npy"]
     assert not older or output.read_bytes() == b"older"
-
-
-def test_few_parts_are_under_way_at_a_time(tmp_path, threads) -> None:
-    pytest.importorskip("dask")
-    most, done = 0, 0
-
-    def watch(stage: str, count: int, total: int, note: str) -> None:
-        nonlocal most, done
-        if stage == "coding" and note == "parts":
-            most, done = max(most, len(threads.futures) - done), count
-
-    source = labelled(np.repeat(values(), 3, axis=0)[: SHAPE[0]], {"time": 1})
-    config = settings(tile="1x6x8x5")
-    fhash_codec.encode(source, tmp_path / "a.fhz", config, client=threads, progress=watch)
-    assert done == 8  # 4 for each of 2 threads
-    assert most <= rooms.AHEAD * 2 + 1
 
 
 def test_what_other_machines_cannot_read_is_refused(tmp_path, threads) -> None:

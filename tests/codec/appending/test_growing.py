@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ import fhash_codec
 from fhash_codec import (
     DamagedFileError,
     EncodeConfig,
-    MissingInputError,
 )
 from fhash_codec import (
     InputError as InputError_growing,
@@ -30,7 +27,6 @@ from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.errors import InputError
 from fhash_formats.series import index_coordinate
-from fhash_formats.transform.decoding import decode_tile
 
 WRITER = ContainerWriter("unused.fhz")
 """A writer that gets nothing: few steps have their figures in the header."""
@@ -42,16 +38,6 @@ def measured(count: int = 3) -> tuple[Figures, np.ndarray]:
     for error in errors:
         figures.steps.append(figures.measure(np.zeros(error.shape), error))
     return figures, errors
-
-
-def test_figures_are_those_of_the_errors_rounded_to_the_worse_side() -> None:
-    figures, errors = measured()
-    quality = figures.header(WRITER, 5.0)
-    rmse = np.sqrt(np.mean(errors**2))
-    assert rmse <= quality["rmse"] <= rmse * (1 + 1e-5)
-    assert np.abs(errors).max() <= quality["max_abs_error"] <= np.abs(errors).max() * (1 + 1e-5)
-    assert quality["psnr"] == pytest.approx(20 * np.log10(5.0 / rmse), abs=1e-3)
-    assert len(quality["steps"]["rmse"]) == 4
 
 
 def test_what_a_header_tells_is_taken_up_again() -> None:
@@ -76,11 +62,6 @@ def test_what_a_header_tells_is_taken_up_again() -> None:
             Figures.of_header({**header, "quality": {"per_step": wrong}}, 1.0)
 
 
-def test_a_range_of_one_value_has_a_scale() -> None:
-    for value in (0.0, 3.0, -1e-300):
-        assert Figures.scale_of(ValueRange(value, value)) > 0
-
-
 SHAPE = (3, 4, 5)
 
 
@@ -102,33 +83,6 @@ def add(file: GrowingFile, frames: np.ndarray, first: int, **options) -> None:
     with ThreadPoolExecutor(1) as workers:
         layer = file.coder.code(list(frames[first : first + 2]), file.figures, workers)
     file.add(layer, [float(first), first + 1.0], **options)
-
-
-def test_the_header_follows_the_layers(begun) -> None:
-    file, frames = begun
-    with file:
-        for first in (0, 2, 4):
-            add(file, frames, first)
-            with fhash_codec.open(file.path) as volume:
-                so_far = frames[: first + 2]
-                assert volume.shape == so_far.shape
-                assert volume.info["value_range"] == [so_far.min(), so_far.max()]
-                assert len(volume.info["quality"]["per_step"]) == first + 2
-                parameters = volume.info["model"]["parameters"]
-    assert parameters > 0
-    assert (file.steps, file.times, file.shape) == (6, (0, 1, 2, 3, 4, 5), SHAPE)
-
-
-def test_layers_may_be_published_together(begun) -> None:
-    file, frames = begun
-    with file:
-        add(file, frames, 0, publish=False)
-        add(file, frames, 2, publish=False)
-        assert not file.path.exists()
-        file.publish()
-    with fhash_codec.open(file.path) as volume:
-        assert np.abs(volume[:] - frames[:4]).max() <= 0.05
-    assert os.listdir(file.path.parent) == ["a.fhz"]
 
 
 def test_there_is_a_limit_of_steps(begun, monkeypatch) -> None:
@@ -161,43 +115,6 @@ def coded(coder: LayerCoder, frames_layers: np.ndarray):
     figures = Figures(1.0)
     with ThreadPoolExecutor(2) as workers:
         return coder.code(list(frames_layers), figures, workers)
-
-
-def decoded(coder: LayerCoder, streams: list[bytes], shape: tuple[int, ...]) -> np.ndarray:
-    t, z, y, x = coder.tile
-    result = np.empty((t, z, 2 * y, 2 * x), np.float32)
-    for number, stream in enumerate(streams):
-        j, i = divmod(number, 2)
-        part = decode_tile(stream, coder.tile, np.float32, coder.settings)
-        result[:, :, j * y : (j + 1) * y, i * x : (i + 1) * x] = part
-    return result[tuple(slice(0, n) for n in shape)]
-
-
-@pytest.mark.parametrize("steps", [1, 4])
-def test_the_streams_decode_within_the_bound_that_is_told(frames_layers, coder, steps) -> None:
-    layer = coded(coder, frames_layers[:steps])
-    errors = np.abs(
-        decoded(coder, layer.streams, (steps, *frames_layers.shape[1:])) - frames_layers[:steps]
-    )
-    assert errors.max() <= BOUND
-    assert len(layer.errors) == steps
-    for error, told in zip(errors.astype(float), layer.errors, strict=True):
-        assert told.largest == pytest.approx(error.max(), rel=1e-4)
-        assert told.squares == pytest.approx((error**2).sum(), rel=1e-3)
-    assert (layer.value_range.low, layer.value_range.high) == (
-        frames_layers[:steps].min(),
-        frames_layers[:steps].max(),
-    )
-
-
-def test_values_beyond_the_range_take_settings_of_their_own_where_that_is_smaller(
-    frames_layers, coder
-) -> None:
-    far = 3 * frames_layers + 10
-    layer = coded(coder, far)
-    assert np.abs(decoded(coder, layer.streams, far.shape) - far).max() <= BOUND
-    shared = coded(replace(coder, settings=replace(coder.settings, low=-50.0, high=50.0)), far)
-    assert sum(map(len, layer.streams)) < 2 * sum(map(len, shared.streams))
 
 
 def test_a_tile_that_decodes_otherwise_is_told(frames_layers, coder, monkeypatch) -> None:
@@ -237,16 +154,6 @@ def with_array(run, path, name, values, dimension_names):
     return path
 
 
-def test_the_state_is_that_of_the_file(run) -> None:
-    with continued(run) as growing:
-        assert (growing.steps, growing.shape) == (4, (4, 6, 8))
-        assert growing.coder.tile == (2, 4, 6, 4)
-        assert growing.coder.coding.error == BOUND_RESUMING
-        assert len(growing.figures.steps) == 4
-    with continued(run, 2) as growing:
-        assert growing.steps == len(growing.figures.steps) == 2
-
-
 def test_arrays_and_keys_that_do_not_depend_on_time_are_carried(run, tmp_path) -> None:
     path = with_array(run, tmp_path / "a.fhz", "auxiliary/area", np.arange(6.0), ["y"])
     with continued(path) as growing:
@@ -261,35 +168,6 @@ def test_arrays_and_keys_that_do_not_depend_on_time_are_carried(run, tmp_path) -
         path = with_array(run, other, "auxiliary/pressure", np.arange(4.0), names)
         with pytest.raises(InputError_resuming, match="has a value for each step"), continued(path):
             pass
-
-
-@pytest.mark.parametrize("steps", [0, 1, 3, 5])
-def test_only_whole_layers_are_kept(run, steps) -> None:
-    with (
-        pytest.raises(InputError_resuming, match=r"within a layer|are to be kept"),
-        continued(run, steps),
-    ):
-        pass
-
-
-def test_files_that_cannot_grow(tmp_path, field) -> None:
-    values = field((4, 4, 6, 8))
-    gaps = values.copy()
-    gaps[1, 2, 3, 4] = np.nan
-    cases = {
-        "does not promise a bound": (values, {"psnr": 40.0}),
-        "keeps features or has missing values": (gaps, {"max_error": BOUND_RESUMING}),
-    }
-    for number, (message, (source, promise)) in enumerate(cases.items()):
-        path = tmp_path / f"{number}.fhz"
-        fhash_codec.encode(source, path, EncodeConfig(effort=1, tile="2x4x6x4", **promise))
-        with pytest.raises(InputError_resuming, match=message), continued(path):
-            pass
-    with pytest.raises(MissingInputError), continued(tmp_path / "none.fhz"):
-        pass
-    (tmp_path / "bad.fhz").write_bytes(b"no container")
-    with pytest.raises(DamagedFileError), continued(tmp_path / "bad.fhz"):
-        pass
 
 
 def test_a_damaged_tile_is_found_before_anything_is_written(run) -> None:

@@ -13,14 +13,14 @@ import pytest
 
 import fhash_codec
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
-from fhash_codec.appending.parts import COLUMNS, Part, comparisons_of, encode_part, merge
+from fhash_codec.appending.parts import Part, encode_part, merge
 from fhash_codec.appending.series_plan import SeriesPlan, plan_parts
 from fhash_codec.appending.writer import append
 from fhash_formats import open_series
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.errors import OutputExistsError
-from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.series import ArraySeries
 
 SHAPE = (7, 4, 6, 8)
 TILE = "2x4x6x4"
@@ -71,27 +71,6 @@ def test_merged_parts_are_the_whole_byte_for_byte(tmp_path, case) -> None:
     assert (report["parts"], report["steps"], report["tiles"]) == (3, 7, 8)
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         assert volume.verify()
-
-
-def test_a_part_is_a_sound_file_of_its_steps(tmp_path) -> None:
-    times = {"t": Coordinate(name="time", values=np.array([0, 1, 2.5, 4, 7, 8, 9]))}
-    source = ArraySeries(values(), coords=times, name="u", units="m")
-    parts = parts_of(source, tmp_path, settings())
-    with fhash_codec.open(parts[1]) as volume:
-        assert volume.verify()
-        assert volume.shape == (2, *SHAPE[1:])
-        assert np.abs(volume[:] - values()[2:4]).max() <= 0.02
-        np.testing.assert_array_equal(volume.coords["t"].values, [2.5, 4])
-    merge(parts, tmp_path / "run.fhz")
-    with fhash_codec.open(tmp_path / "run.fhz") as volume:
-        np.testing.assert_array_equal(volume.coords["t"].values, times["t"].values)
-        assert (volume.name, volume.units) == ("u", "m")
-
-
-def test_the_whole_as_one_part(tmp_path) -> None:
-    fhash_codec.encode(values(), tmp_path / "whole.fhz", settings())
-    merge(parts_of(values(), tmp_path, settings(), 1), tmp_path / "run.fhz")
-    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
 
 
 def test_gaps_overlaps_and_strangers_are_refused(tmp_path) -> None:
@@ -252,27 +231,6 @@ def test_other_texts_name_no_part(text) -> None:
     with pytest.raises(InputError, match=r"allowed: |part"):
         Part.parse(text)
     assert Part.parse("3/16") == Part(number=3, of=16)
-
-
-@pytest.mark.parametrize("config", [{"psnr": 40}, {"ratio": 9}, {}, {"profile": "paper"}])
-def test_only_a_bound_is_kept_by_parts(tmp_path, config) -> None:
-    with pytest.raises(InputError, match="give max_error or max_error_rel"):
-        encode_part(
-            np.zeros((3, 2, 2, 2), np.float32),
-            tmp_path / "a.fhz",
-            EncodeConfig(**config),
-            Part(number=1, of=1),
-        )
-    assert not list(tmp_path.iterdir())
-
-
-def test_errors_come_back_as_they_were_stored() -> None:
-    rows = np.arange(2.0 * COLUMNS).reshape(2, COLUMNS)
-    first, second = comparisons_of(rows, 5)
-    assert (first.step, second.step) == (5, 6)
-    assert first.coreset == (0, 1.0, 2.0, 3, 4.0)
-    assert second.domain[:3] == (15, 16.0, 17.0)
-    assert second.similarity == (18.0, 19)
 
 
 SHAPE_PARTS = (6, 4, 6, 8)

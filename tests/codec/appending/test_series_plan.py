@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,25 @@ import pytest
 
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, UnsupportedFileError
 from fhash_codec.appending import series_plan
-from fhash_codec.appending.series_plan import SeriesPlan, bounded, plan_parts
+from fhash_codec.appending.series_plan import (
+    Filling,
+    Recipe,
+    SeriesPlan,
+    bounded,
+    code_layers,
+    plan_parts,
+)
+from fhash_codec.boxes import Box
+from fhash_codec.compact.tiles import Blocks, Coding, code
+from fhash_codec.compact.transform import usual_transform
+from fhash_codec.features.features import Extent
+from fhash_codec.progress import silent
 from fhash_formats.container import record as strict_json
-from fhash_formats.errors import FhashError, MissingInputError, OutputExistsError
+from fhash_formats.container.record import Record
+from fhash_formats.errors import FhashError, MissingInputError
 from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (6, 4, 6, 8)
 CONFIG = EncodeConfig(max_error=0.02, effort=2, tile="2x4x6x4", features=("interval:0.3:9",))
@@ -46,43 +62,11 @@ def test_a_plan_comes_back_from_its_file(plan) -> None:
     read.require(series())
 
 
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        ({"name": "v"}, "they differ in name: u, not v"),
-        ({"units": "km"}, "they differ in units: m, not km"),
-        ({"values": np.zeros((6, 4, 6, 9), np.float32)}, "they differ in shape"),
-        ({"values": np.zeros(SHAPE)}, "they differ in dtype: float32, not float64"),
-        ({"coords": times([0, 1, 2, 3, 4, 5])}, "they differ in coordinates; give the same data"),
-    ],
-)
-def test_a_plan_of_other_data_is_refused(plan, labels, message) -> None:
-    with pytest.raises(InputError, match=message):
-        SeriesPlan.read(plan).require(series(**labels))
-
-
-def test_other_settings_are_refused(plan) -> None:
-    known = SeriesPlan.read(plan)
-    known.require_settings({"max_error": 0.02, "effort": 2, "timings": True})
-    with pytest.raises(InputError, match=r"effort is 3, and 2 in the plan; leave it out"):
-        known.require_settings({"effort": 3})
-
-
 @pytest.mark.parametrize("promise", [{"psnr": 40}, {"ratio": 9}, {}, {"profile": "paper"}])
 def test_only_a_bound_is_planned(tmp_path, promise) -> None:
     with pytest.raises(InputError, match="give max_error or max_error_rel"):
         plan_parts(series(), tmp_path / "a.plan", EncodeConfig(**promise))
     assert not list(tmp_path.iterdir())
-
-
-def test_an_older_plan_is_kept_without_force(tmp_path) -> None:
-    path = tmp_path / "a.plan"
-    path.write_text("older")
-    with pytest.raises(OutputExistsError):
-        plan_parts(series(), path, CONFIG)
-    assert path.read_text() == "older"
-    plan_parts(series(), path, CONFIG, force=True)
-    assert SeriesPlan.read(path).layers == 3
 
 
 def test_what_is_no_plan_is_refused(tmp_path) -> None:
@@ -156,3 +140,39 @@ HOSTILE = {
 def test_a_hostile_plan_is_refused(plan, case) -> None:
     with pytest.raises(DamagedFileError, match="the plan is damaged: "):
         SeriesPlan.from_bytes(changed(plan, HOSTILE[case]))
+
+
+TILE = (2, 4, 4, 4)
+SETTINGS = TileSettings(transform=usual_transform(TILE), step=0.1, center=0.5, low=0.0, high=1.0)
+RECIPE = Recipe(tile=TILE, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=4))
+FILLED = replace(RECIPE, filling=Filling(settings=replace(SETTINGS, step=0.2), density=2))
+
+
+def read(values) -> Recipe:
+    return Recipe.from_dict(Record(values, "recipe."))
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, FILLED])
+@pytest.mark.parametrize("layers", [range(0, 1), range(1, 3)])
+def test_some_layers_have_the_bytes_of_the_whole(recipe, layers) -> None:
+    values = np.random.default_rng(0).random((5, 4, 6, 8), dtype=np.float32)
+    packed = [np.packbits(frame < 0.8) for frame in values]
+    extent = Extent(
+        box=Box.of_shape(values.shape[1:]),
+        key_frames=tuple(range(5)),
+        packed=packed,
+        domain=values.shape[1:],
+        samples=int((values < 0.8).sum()),
+        background=0.0,
+    )
+    blocks = Blocks(ArraySeries(values), extent, TILE)
+    with thread_pool() as workers:
+        whole = code_layers(blocks, recipe, range(3), workers, silent)
+        some = code_layers(blocks.by_layers(), recipe, layers, workers, silent)
+    per_layer = len(whole.streams) // 3
+    assert some.streams == whole.streams[layers.start * per_layer : layers.stop * per_layer]
+    assert some.outcome.size == sum(map(len, some.streams))
+    assert whole.outcome.max_error <= 0.05
+    if recipe is RECIPE:
+        tile = blocks.read((0, 0, 0, 0))
+        assert code(tile, SETTINGS, RECIPE.coding)[0].data == whole.streams[0]

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,9 @@ from kill_writer import BOUND, SHAPE, TILE, frame
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, Writer
 from fhash_codec.appending.growing import GrowingFile
-from fhash_codec.appending.writer import append, bound_of, plan_layers
+from fhash_codec.appending.writer import append, bound_of
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.errors import OutputError, OutputExistsError
+from fhash_formats.errors import OutputError
 from fhash_formats.series import ArraySeries, Coordinate
 
 CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, timings=False)
@@ -62,12 +61,6 @@ def test_steps_follow_and_the_older_ones_keep_every_bit(run) -> None:
     assert report["psnr"] == pytest.approx(found["psnr"], abs=0.02)
     assert report["psnr"] <= found["psnr"]
     assert report["rmse"] >= found["rmse"]
-
-
-def test_steps_that_are_not_kept_are_replaced(run) -> None:
-    assert append(series(3, 9), run, keep=3)["steps"] == 9
-    with fhash_codec.open(run) as volume:
-        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND
 
 
 def test_times_follow_those_of_the_file(tmp_path) -> None:
@@ -124,15 +117,6 @@ def test_a_failure_while_steps_are_coded_changes_nothing(run) -> None:
     assert os.listdir(run.parent) == ["run.fhz"]
 
 
-def test_a_file_with_a_single_tile(tmp_path) -> None:
-    path = tmp_path / "run.fhz"
-    fhash_codec.encode(frames(0, 4), path, EncodeConfig(max_error=BOUND, effort=1, tile="whole"))
-    append(frames(4, 9), path)
-    with fhash_codec.open(path) as volume:
-        assert volume.chunks[0] == 4
-        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND
-
-
 RANGE = ValueRange(-1.0, 3.0)
 
 
@@ -144,23 +128,6 @@ def test_the_bound_is_absolute_or_of_a_known_range() -> None:
     for other in ({}, {"psnr": 50}, {"ratio": 5}):
         with pytest.raises(InputError, match="promises a bound"):
             bound_of(EncodeConfig(**other), RANGE)
-
-
-def test_the_plan_covers_the_expected_range_and_the_frames() -> None:
-    frames = list(np.linspace(0, 2, 3 * 4 * 5 * 6, dtype=np.float32).reshape(3, 4, 5, 6))
-    found = plan_layers(frames, EncodeConfig(max_error=0.1, effort=1), 0.1, ValueRange(-7.0, 1.0))
-    assert found.coder.settings.low <= -7
-    assert found.coder.settings.high >= 2
-    assert found.coder.coding.error == 0.1
-    assert found.coder.tile[0] <= 3
-    assert found.header["config"]["max_error"] == 0.1
-    assert found.header["feature_bounding_box"] == [[0, 4], [0, 5], [0, 6]]
-
-
-def test_integers_have_a_bound_of_whole_numbers() -> None:
-    frames = list(np.arange(2 * 3 * 4 * 5).reshape(2, 3, 4, 5))
-    found = plan_layers(frames, EncodeConfig(max_error=1.7, effort=1), 1.7, None)
-    assert found.coder.coding.error == 1.5
 
 
 CONFIG_WRITER = EncodeConfig(max_error=BOUND, effort=1, tile=TILE)
@@ -234,15 +201,6 @@ def test_resumed_it_goes_on_as_if_it_had_not_stopped(tmp_path) -> None:
             np.testing.assert_array_equal(volume.coords["t"].values, np.arange(11))
 
 
-def test_resumed_without_a_frame_the_file_is_as_it_was(tmp_path) -> None:
-    path = written(tmp_path / "run.fhz", 6)
-    before = path.read_bytes()
-    with Writer.resume(path):
-        pass
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["run.fhz"]
-
-
 def test_a_short_last_layer_is_not_extended_but_may_be_dropped(tmp_path) -> None:
     path = written(tmp_path / "run.fhz", 7)
     with pytest.raises(InputError, match=r"within a layer of 3 steps.*keep 6 steps"):
@@ -277,35 +235,6 @@ def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
         Writer.resume(tmp_path / "feature.fhz")
 
 
-def test_a_trained_head_is_shared_and_values_beyond_the_range_keep_the_bound(tmp_path) -> None:
-    path = tmp_path / "run.fhz"
-    config = EncodeConfig(max_error=BOUND, effort=5, tile=TILE)
-    values = (
-        frames_writer(9) * np.array([1, 1, 1, 1, 1, 1, 40, 40, 40], np.float32)[:, None, None, None]
-    )
-    with Writer(path, shape=SHAPE, config=config) as writer:
-        for values_of_step in values:
-            writer.append(values_of_step)
-    with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:].astype(float) - values).max() <= BOUND
-        assert volume.value_range.high == values.max()
-        assert volume.verify()
-        assert volume.info["quality"]["max_abs_error"] <= BOUND
-
-
-@pytest.mark.parametrize("dtype", ["uint8", "int64", "float64", "float16"])
-def test_other_number_types(tmp_path, dtype) -> None:
-    path = tmp_path / "run.fhz"
-    values = (100 + 20 * frames_writer(5)).astype(dtype)
-    with Writer(path, shape=SHAPE, max_error=0.0 if dtype == "int64" else 2.0) as writer:
-        for values_of_step in values:
-            writer.append(values_of_step)
-    with fhash_codec.open(path) as volume:
-        assert volume.dtype.kind == np.dtype(dtype).kind
-        error = np.abs(volume[:].astype(float) - values).max()
-        assert error <= (0 if dtype == "int64" else 2)
-
-
 def test_coordinates_and_labels(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
@@ -324,18 +253,6 @@ def test_coordinates_and_labels(tmp_path) -> None:
         Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"x": np.arange(3)})
     with pytest.raises(InputError, match="coords names 'w'"):
         Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"w": np.arange(3)})
-
-
-def test_many_irregular_times_have_an_array(tmp_path) -> None:
-    path, shape = tmp_path / "run.fhz", (1, 2, 3)
-    times = np.cumsum(np.random.default_rng(0).random(1200))
-    config = EncodeConfig(max_error=BOUND, effort=1, tile="400x1x2x3")
-    with Writer(path, shape=shape, config=config) as writer:
-        for now in times:
-            writer.append(np.full(shape, now, np.float32), time=now)
-    with fhash_codec.open(path) as volume:
-        np.testing.assert_array_equal(volume.coords["t"].values, times)
-        assert volume.verify()
 
 
 def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> None:
@@ -393,37 +310,6 @@ def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
         assert np.abs(volume[:] - frames_writer(4)).max() <= 0.004
 
 
-def test_an_existing_file_needs_force(tmp_path) -> None:
-    path = written(tmp_path / "run.fhz", 3)
-    with pytest.raises(OutputExistsError):
-        Writer(path, shape=SHAPE, config=CONFIG_WRITER)
-    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, force=True) as writer:
-        writer.append(frame(0))
-    with fhash_codec.open(path) as volume:
-        assert volume.shape[0] == 1
-
-
-def test_a_failing_simulation_keeps_what_it_appended(tmp_path) -> None:
-    path = tmp_path / "run.fhz"
-
-    def simulate() -> None:
-        with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
-            for step in range(4):
-                writer.append(frame(step))
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        simulate()
-    with fhash_codec.open(path) as volume:
-        assert volume.shape[0] == 4
-
-
-def test_without_a_frame_there_is_no_file(tmp_path) -> None:
-    with Writer(tmp_path / "run.fhz", shape=SHAPE, config=CONFIG_WRITER):
-        pass
-    assert os.listdir(tmp_path) == []
-
-
 def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     tmp_path, monkeypatch
 ) -> None:
@@ -444,22 +330,6 @@ def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     assert os.listdir(tmp_path) == ["run.fhz"]
     with fhash_codec.open(path) as volume:
         assert volume.shape[0] == LAYER
-
-
-def test_memory_does_not_grow_with_the_steps(tmp_path) -> None:
-    shape = (8, 40, 40)
-    noise = np.random.default_rng(0).random(shape).astype(np.float32)
-    config = EncodeConfig(max_error=0.1, effort=1, tile="3x8x40x40")
-    path, peaks = tmp_path / "run.fhz", []
-    with Writer(path, shape=shape, config=config) as writer:
-        for step in range(45):
-            if step == LAYER:
-                tracemalloc.start()  # after the plan
-            writer.append(noise + step)
-            if step in (14, 44):
-                peaks.append(tracemalloc.get_traced_memory()[1])
-    tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 10 * noise.nbytes  # of 30 more frames
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")

@@ -11,7 +11,7 @@ import pytest
 from fhash_codec.bench import decode
 from fhash_codec.bench.decode import TURNS, bench_decode
 from fhash_codec.features.bricks import build_coreset
-from fhash_codec.features.features import Interval
+from fhash_codec.features.features import FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.network import Architecture
@@ -28,7 +28,7 @@ def test_both_ways_decode_the_same_key_frames(
     values[:, 7, 39, 69] = 1.0
     series = ArraySeries(values)
     features = [Interval(0.5, 2.0)]
-    coreset = build_coreset(series, scan(series, silent), range(7), features, 0, silent)
+    coreset = build_coreset(series, scan(series, silent), FeatureChoice(range(7), features), silent)
     box = coreset.box.shape
     architecture = Architecture.for_box(box, 7, width=4)
     layers = [

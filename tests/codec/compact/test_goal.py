@@ -1,18 +1,18 @@
-"""Searches for a step: secants, brackets, exchange rates and the cheapest number."""
+"""Promises, and the searches for the step that keeps one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.goal import (
     DECIDED,
-    DEFAULT_PSNR,
     FAR_BELOW,
-    SLOPE,
     Bracket,
     Goal,
     PsnrSearch,
@@ -26,16 +26,17 @@ from fhash_codec.compact.goal import (
     promise,
     remarks,
     secant,
-    step_after_gain,
 )
+from fhash_codec.compact.step import is_smaller, off_trellis, on_trellis, plain_step, with_step
 from fhash_codec.compact.tiles import Coding, Outcome
+from fhash_codec.compact.transform import usual_transform
 from fhash_codec.measure.errors import MIN_SHARE
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
-
-
-def test_a_single_point_takes_the_usual_slope() -> None:
-    assert secant([(1.0, 40.0)], 42.0, 5.0) == pytest.approx(1.0 - 2.0 / 5.0)
+from fhash_formats.transform.encoding import OFFSETS, encode_tile
+from fhash_formats.transform.encoding import Coding as Coding_step
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile_format import TileSettings
 
 
 def test_two_points_take_their_own_slope_within_reason() -> None:
@@ -56,14 +57,6 @@ def test_a_psnr_of_uniform_rounding_is_found_in_a_few_steps() -> None:
     assert search.step_for(60.0) == pytest.approx(1e-9)
 
 
-def test_a_gain_moves_the_step_by_the_usual_slope() -> None:
-    assert step_after_gain(0.5, 0.0) == 0.5
-    assert step_after_gain(0.5, SLOPE) == pytest.approx(0.5 * math.e)
-    assert secant([(math.log(0.5), 40.0)], 40.0 - 2.0, SLOPE) == pytest.approx(
-        math.log(step_after_gain(0.5, 2.0))
-    )
-
-
 @pytest.mark.parametrize("mean", [arithmetic_mean, geometric_mean])
 @pytest.mark.parametrize("target", [1.5, 40.0, 99.0])
 def test_bisection_in_a_bracket_converges(
@@ -75,14 +68,6 @@ def test_bisection_in_a_bracket_converges(
         bracket = bracket.narrowed(number, too_low=number < target)
     assert bracket.low == pytest.approx(target, rel=1e-9)
     assert bracket.high == pytest.approx(target, rel=1e-9)
-
-
-def test_a_prediction_inside_a_bracket_is_taken() -> None:
-    bracket = Bracket(1.0, math.inf, middle=geometric_mean)
-    assert bracket.inside(7.0) == 7.0
-    assert bracket.narrowed(4.0, too_low=False).inside(7.0) == 2.0
-    # A trial outside the bracket does not widen it.
-    assert bracket.narrowed(0.5, too_low=True).low == 1.0
 
 
 def test_an_exchange_rate_is_that_of_the_last_points_some_way_apart() -> None:
@@ -105,35 +90,6 @@ def test_the_cheapest_is_found_from_everywhere(start: int, lowest: int) -> None:
     assert cheapest(run, start, 12, strides=(2, 1)) == f"at {lowest}"
     assert len(asked) == len(set(asked))
     assert all(0 <= number <= 12 for number in asked)
-
-
-def test_numbers_that_cannot_be_run_are_avoided() -> None:
-    def run(numbers: Sequence[int]) -> list[tuple[float, int] | None]:
-        return [(float(number), number) if number > 2 else None for number in numbers]
-
-    assert cheapest(run, 7, 12, strides=(2, 1)) == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "name", "expected"),
-    [
-        ({}, "psnr", DEFAULT_PSNR),
-        ({"psnr": 40.0}, "psnr", 40.0),
-        ({"max_error": 0.25}, "error", 0.25),
-        ({"max_error_rel": 0.01}, "error", 0.04),
-        ({"ratio": 8.0}, "size", 125.0),
-    ],
-    ids=str,
-)
-def test_a_goal_is_one_promise_in_units_of_the_data(
-    options: dict[str, float], name: str, expected: float
-) -> None:
-    config = EncodeConfig(**options)
-    goal = goal_of(config, ValueRange(low=-1.0, high=3.0), 1000, 50)
-    assert goal.data_range == 4.0
-    goals = {"psnr": goal.psnr, "error": goal.error, "size": goal.size}
-    assert {key: value for key, value in goals.items() if value is not None} == {name: expected}
-    assert promise(config) == (options or {"psnr": DEFAULT_PSNR})
 
 
 RANGE = ValueRange(low=0.0, high=100.0)
@@ -177,23 +133,6 @@ def test_both_promises_are_kept_where_the_psnr_of_an_outcome_is(
     assert goal.psnr == 50.0
     assert (outcome.psnr(100.0) >= 50.0) == (rmse < 0.316 and bulk_rmse < 0.1)
     assert goal.expected_error == pytest.approx(0.1)
-
-
-def test_a_bulk_alone_stands_for_all() -> None:
-    goal = goal_of(EncodeConfig(psnr_bulk=40.0), RANGE, 1000, 0, ValueRange(20.0, 30.0))
-    assert goal.psnr == goal.even_psnr == pytest.approx(60.0)
-    assert goal.bulk is not None
-    assert goal.bulk.alone
-
-
-def test_only_a_bound_changes_the_coding() -> None:
-    coding = Coding(rounds=2)
-    assert Goal(psnr=50.0, data_range=1.0).bounded(coding) is coding
-    assert Goal(error=0.5, data_range=1.0).bounded(coding) == Coding(rounds=2, error=0.5)
-
-
-def test_the_expected_error_of_a_psnr_is_that_of_its_definition() -> None:
-    assert Goal(psnr=40.0, data_range=5.0).expected_error == pytest.approx(0.05)
 
 
 def figures(**others):
@@ -288,3 +227,74 @@ def test_a_bulk_that_decided_says_what_it_took(config, psnr, psnr_bulk, decided)
         assert f"--psnr {asked:g} alone leaves it out" in line
         assert "about 50 % of the file" in line.replace("50%", "50 %")
         assert "from 1 to 2" in line
+
+
+def outcome(size: int, psnr: float) -> Outcome:
+    return Outcome(size=size, squares=10 ** (-psnr / 10) * 100, count=100, max_error=1.0)
+
+
+NONE = AxisTransform(kind="none")
+SETTINGS = TileSettings(
+    transform=TransformSpec(axes=(NONE,) * 4),
+    step=0.1,
+    center=0.0,
+    low=0.0,
+    high=1.0,
+    offsets=OFFSETS,
+)
+GOAL = Goal(psnr=40.0, data_range=1.0)
+
+
+def test_the_way_to_the_trellis_and_back() -> None:
+    settings, coding = on_trellis(SETTINGS, Coding())
+    assert settings.trellis
+    assert settings.step < SETTINGS.step
+    assert plain_step(settings) == pytest.approx(plain_step(SETTINGS))
+    back, plain = off_trellis(settings, coding)
+    assert replace(back, step=0.1) == SETTINGS
+    assert plain == Coding()
+
+
+def test_bytes_are_compared_at_the_same_quality() -> None:
+    # One dB is worth a tenth of the bytes, by what was tried.
+    tried = [outcome(1000, 40.0), outcome(1100, 41.0)]
+    assert is_smaller(outcome(1000, 40.0), outcome(1010, 40.0), tried, GOAL)
+    assert not is_smaller(outcome(1000, 40.0), outcome(990, 40.0), tried, GOAL)
+    assert not is_smaller(outcome(1000, 40.0), outcome(1050, 41.0), tried, GOAL)
+    assert is_smaller(outcome(1000, 40.0), outcome(1150, 41.0), tried, GOAL)
+    bound = Goal(error=0.1, data_range=1.0)
+    assert is_smaller(outcome(1000, 40.0), outcome(1050, 41.0), tried, bound)
+
+
+SHAPE = (2, 16, 32, 32)
+
+
+@pytest.mark.parametrize(("rounding", "exact"), [(2.0**-24, False), (0.0, True)])
+def test_rounding_to_the_type_of_the_source_stores_no_tile_exactly(
+    rounding: float, exact: bool
+) -> None:
+    """A float32 near 1000 is 3e-5 off at most: a residual must leave room for that."""
+    source = (1000 + np.random.default_rng(0).normal(size=SHAPE).cumsum(axis=3)).astype(np.float32)
+    low, high, error = float(source.min()), float(source.max()), 0.002
+    begun = TileSettings(
+        transform=usual_transform(SHAPE), step=1.0, center=1000.0, low=low, high=high
+    )
+    coded = encode_tile(
+        source,
+        with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding),
+        Coding_step(error=error),
+    )
+    assert np.abs(coded.decoded.astype(np.float64) - source).max() <= error
+    assert np.array_equal(coded.decoded, source) == exact
+
+
+@pytest.mark.parametrize(("step", "double"), [(1e-3, False), (1e-7, True), (0.0, True)])
+def test_a_fine_step_is_computed_in_float64_and_never_too_fine(step: float, double: bool) -> None:
+    settings = TileSettings(
+        transform=usual_transform(SHAPE), step=1.0, center=0.0, low=-1.0, high=1.0
+    )
+    chosen = with_step(settings, step, Goal(psnr=50.0, data_range=2.0))
+    assert chosen.double == double
+    assert chosen.quantum == 0.0
+    assert chosen.step >= step
+    assert 2.0 / chosen.step < 2.0**30

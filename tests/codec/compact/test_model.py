@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -17,18 +16,10 @@ import fhash_codec
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, RegionError
 from fhash_codec.boxes import Box
 from fhash_codec.compact.model import (
-    MAX_LEVELS,
     CompactModel,
     PlainArray,
-    corrected,
-    correction_of,
-    correction_type,
-    head_mlp,
     head_of,
-    level_count,
-    predicted,
 )
-from fhash_codec.paper.network import level_resolutions
 from fhash_formats.container import Container
 from fhash_formats.errors import DamagedFileError as DamagedFileError_plain
 
@@ -78,18 +69,6 @@ def test_a_region_is_that_slice_of_the_series_bit_for_bit(feature: Feature, inde
         series = volume[...]
     with fhash_codec.open(feature[1]) as volume:
         np.testing.assert_array_equal(volume[index], series[index])
-
-
-def test_a_small_region_decodes_the_tiles_that_it_touches(
-    feature: Feature, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with fhash_codec.open(feature[1]) as volume:
-        table = volume.container.arrays["tables/level_1"]
-        indices = record_decoded_tiles(monkeypatch, table)
-        volume.read(2, tuple((low, low + 3) for low, _ in volume.box))
-        assert indices == [(1, 0, 0, 0)]
-        volume.read(2)
-        assert len(set(indices)) == math.prod(table.grid[1:])
 
 
 def test_samples_at_vertices_are_what_is_read(feature: Feature) -> None:
@@ -197,14 +176,6 @@ def test_a_region_of_a_level_of_detail_decodes_the_tiles_that_it_touches(
             volume.lod_vertices(1, ((0, 10), (0, 1), (0, 1)))
 
 
-def test_a_paper_file_has_no_levels_of_detail(encoded: tuple[Series, Path]) -> None:
-    with (
-        fhash_codec.open(encoded[1]) as volume,
-        pytest.raises(InputError, match="paper has no levels of detail"),
-    ):
-        volume.read_lod(0, 1)
-
-
 HEADER = {"required_features": ["transform"]}
 """The part of a header, of a file that is not plain, that a model needs."""
 
@@ -276,20 +247,6 @@ def test_coarse_levels_of_labels_have_every_vertex_of_the_coreset(tmp_path: Path
             np.testing.assert_array_equal(np.isfinite(coarse), occupied)
 
 
-@pytest.mark.parametrize("box", [(1, 1, 1), (2, 2, 2), (3, 1, 1), (25, 125, 125), (64, 64, 128)])
-def test_there_are_as_many_levels_as_in_the_paper(box: tuple[int, int, int]) -> None:
-    assert level_count(box) == len(level_resolutions(box, 1, 2))
-
-
-def test_there_are_no_more_levels_than_the_coder_has() -> None:
-    assert level_count((1, 1, 2048)) == MAX_LEVELS
-    assert level_count((1, 1, 1 << 20)) == MAX_LEVELS
-
-
-def test_no_head_is_an_mlp_without_layers() -> None:
-    assert head_mlp(None).layers == ()
-
-
 def test_parts_of_tables_are_parts_of_the_whole_and_integers_are_not_rounded(
     tmp_path: Path,
 ) -> None:
@@ -306,26 +263,6 @@ def test_parts_of_tables_are_parts_of_the_whole_and_integers_are_not_rounded(
         lattice = volume.tables[0][..., 0]
         assert not np.array_equal(lattice, np.rint(lattice))
         np.testing.assert_array_equal(np.rint(lattice), volume[...])
-
-
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint32", "int64", "uint64"])
-def test_integers_come_back_exactly(dtype: str) -> None:
-    limits = np.iinfo(dtype)
-    values = np.array([limits.min, limits.max, limits.max - 1, 7], dtype)
-    base = predicted(values.astype(np.float64).reshape(1, 1, 1, 4), None, values.dtype)
-    corrections = correction_of(values, base.ravel())
-    assert corrections.dtype == correction_type(values.dtype)
-    np.testing.assert_array_equal(corrected(base.ravel(), corrections), values)
-
-
-@pytest.mark.parametrize(("dtype", "kind"), [("float16", "f4"), ("float32", "f4"), ("f8", "f8")])
-def test_floats_come_back_and_what_is_not_finite_has_no_correction(dtype: str, kind: str) -> None:
-    values = np.array([1.5, -3.25, np.nan, np.inf], dtype)
-    base = np.array([1.25, -3.25, 1, 1], dtype)
-    corrections = correction_of(values, base)
-    np.testing.assert_array_equal(corrections, [0.25, 0, 0, 0])
-    assert corrections.dtype == np.dtype(kind)
-    np.testing.assert_array_equal(corrected(base, corrections)[:2], values[:2])
 
 
 def test_a_head_that_is_no_head_is_damage() -> None:
@@ -366,26 +303,8 @@ def plain_array(corrections: object, dtype: str, *, tile: int = 2) -> PlainArray
 ALL = (*[slice(0, 1)] * 3, slice(0, 4))
 
 
-@pytest.mark.parametrize("dtype", ["int16", "int64", "float32", "float64"])
-def test_without_a_head_any_region_is_read_at_once(dtype: str) -> None:
-    for tile in (1, 3, 1 << 40):
-        array = plain_array([5, 0, -1, 0], dtype, tile=tile)
-        np.testing.assert_array_equal(array.read(ALL).ravel(), [5, 1, 1, 3])
-        assert array.read((*ALL[:3], slice(2, 3))).item() == 1
-        assert array.read(ALL).dtype == dtype
-
-
 @pytest.mark.parametrize("dtype", ["int16", "float64"])
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
 def test_corrections_that_are_not_finite_are_damage(dtype: str, wrong: float) -> None:
     with pytest.raises(DamagedFileError_plain, match="corrections has numbers beyond"):
         plain_array([0, wrong, 0, 0], dtype).read(ALL)
-
-
-def test_corrections_of_integers_are_within_64_bits() -> None:
-    most = 2.0**63
-    array = plain_array([0, -most, 0, 0], "int64")
-    np.testing.assert_array_equal(array.read(ALL).ravel(), [0, 1 - 2**63, 2, 3])
-    with pytest.raises(DamagedFileError_plain, match="corrections has numbers beyond"):
-        plain_array([0, np.nextafter(most, np.inf), 0, 0], "int64").read(ALL)
-    assert plain_array([0, 2.0**70, 0, 0], "float64").read(ALL)[0, 0, 0, 1] == 2.0**70

@@ -1,31 +1,49 @@
-"""Tiles of a series: together they are the box, whether it is in memory or read by layers."""
+"""Tiles: their values and masks, their coding, samples of them, and the price of their shapes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from untrained_heads import some_head
 
+from fhash_codec.compact import sample as sample_module
 from fhash_codec.compact import tiles as module
+from fhash_codec.compact.attempt import (
+    FAST_ENOUGH,
+    MAX_WHOLE_VERTICES,
+    PRICES,
+    cheap_tiling,
+    even_tile,
+    parse_tile,
+    region_vertices,
+    tiles_to_try,
+)
+from fhash_codec.compact.sample import Sample, fill, strata
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
     Coding,
+    Index,
     Known,
     Outcome,
     Run,
     Tile,
     TileRun,
     code,
-    total,
 )
 from fhash_codec.compact.transform import usual_transform
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import ACCESSES, EncodeConfig
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
+from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, StepsSeries
 from fhash_formats.transform.encoding import OFFSETS
 from fhash_formats.transform.tile_format import TileSettings
@@ -60,20 +78,6 @@ def test_tiles_make_up_the_box_and_repeat_its_border(
         else:
             np.testing.assert_array_equal(tile.counted, inside[span])
         assert tile.counted_vertices == np.count_nonzero(inside[span])
-
-
-def test_vertices_outside_the_coreset_do_not_count() -> None:
-    blocks = blocks_of(SHAPE, ("interval:0:10",))
-    tile = blocks.read((0, 0, 0, 0))
-    assert not blocks.complete
-    np.testing.assert_array_equal(tile.counted, tile.values >= 0)
-    other = blocks.retile((1, 6, 7, 8))
-    np.testing.assert_array_equal(other.read((3, 0, 0, 0)).counted, tile.counted[3:4])
-
-
-def test_a_tile_is_empty_where_no_vertex_counts() -> None:
-    assert Tile(VALUES, np.zeros(SHAPE, bool)).is_empty
-    assert not Tile(VALUES, None).is_empty
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
@@ -128,25 +132,6 @@ def test_a_window_is_the_part_where_values_vary_most(
     np.testing.assert_array_equal(half.read((0, 0, 0, 1)).values, VALUES[1:4, :, :, 6:])
 
 
-def test_by_layers_only_the_layer_that_is_asked_for_is_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    blocks = blocks_of((2, 4, 7, 5))
-    read: list[int] = []
-    usual = StepsSeries.read
-    monkeypatch.setattr(
-        StepsSeries, "read", lambda self, step: read.append(step) or usual(self, step)
-    )
-    layers = blocks.by_layers()
-    assert not layers.in_memory
-    for index in [(1, 0, 0, 0), (1, 1, 0, 1)]:
-        tile = layers.read(index)
-        assert read == [2, 3]
-        assert blocks.in_memory
-        first = VALUES[2:4, 4 * index[1], 0, 5 * index[3]]
-        np.testing.assert_array_equal(tile.values[:, 0, 0, 0], first)
-
-
 @pytest.mark.parametrize("features", [("all",), ("interval:0:1",)])
 def test_an_array_in_memory_is_neither_copied_nor_written(features: tuple[str, ...]) -> None:
     array = VALUES.copy()
@@ -166,57 +151,28 @@ def test_an_array_in_memory_is_neither_copied_nor_written(features: tuple[str, .
     assert array.flags.writeable
 
 
-SHAPE_CODING = (2, 8, 12, 16)
-VALUES_CODING = np.random.default_rng(0).normal(size=SHAPE_CODING).cumsum(axis=3).astype(np.float32)
+NOISE_SHAPE = (2, 8, 12, 16)
+NOISE = np.random.default_rng(0).normal(size=NOISE_SHAPE).cumsum(axis=3).astype(np.float32)
 SETTINGS = TileSettings(
-    transform=usual_transform(SHAPE_CODING),
+    transform=usual_transform(NOISE_SHAPE),
     step=0.5,
     center=0.0,
-    low=float(VALUES_CODING.min()),
-    high=float(VALUES_CODING.max()),
+    low=float(NOISE.min()),
+    high=float(NOISE.max()),
     offsets=OFFSETS,
 )
 
 
 def test_the_outcome_is_that_of_the_decoded_values() -> None:
-    counted = np.random.default_rng(1).random(SHAPE_CODING) < 0.7
-    coded, outcome = code(Tile(VALUES_CODING, counted), SETTINGS, Coding())
-    errors = (coded.decoded.astype(np.float64) - VALUES_CODING)[counted]
+    counted = np.random.default_rng(1).random(NOISE_SHAPE) < 0.7
+    coded, outcome = code(Tile(NOISE, counted), SETTINGS, Coding())
+    errors = (coded.decoded.astype(np.float64) - NOISE)[counted]
     assert outcome.size == len(coded.data)
     assert outcome.count == errors.size
     assert outcome.squares == pytest.approx((errors**2).sum())
     assert outcome.max_error == pytest.approx(np.abs(errors).max())
     expected = 10 * math.log10(9.0 / (errors**2).mean())
     assert outcome.psnr(3.0) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("high", [1e-200, 1e-310])
-def test_a_range_whose_scale_has_no_square_is_measured(high: float) -> None:
-    """Settings of a file that grows may be of any range."""
-    settings = replace(SETTINGS, low=0.0, high=high)
-    coded, outcome = code(Tile(VALUES_CODING, None), settings, Coding())
-    assert coded.decoded.max() == pytest.approx(high, abs=1e-38)
-    assert outcome.max_error == pytest.approx(np.abs(VALUES_CODING).max())
-    assert outcome.squares > 1
-
-
-def test_an_exact_tile_has_no_error() -> None:
-    coded, outcome = code(
-        Tile(VALUES_CODING, None), replace(SETTINGS, double=True), Coding(exact=True)
-    )
-    np.testing.assert_array_equal(coded.decoded, VALUES_CODING)
-    assert (outcome.squares, outcome.max_error, outcome.count) == (0.0, 0.0, VALUES_CODING.size)
-    assert outcome.psnr(1.0) == math.inf
-
-
-def test_outcomes_add_up_by_their_weights() -> None:
-    first = Outcome(size=3, squares=1.0, count=10, max_error=0.5, nonzero=2)
-    second = Outcome(size=5, squares=2.0, count=20, max_error=0.1, nonzero=1)
-    assert total([first, second], [2, 3]) == Outcome(
-        size=21, squares=8.0, count=80, max_error=0.5, nonzero=7
-    )
-    assert total([first]) == first
-    assert total([]).size == 0
 
 
 def lattice_values(kind: str) -> np.ndarray:
@@ -263,7 +219,7 @@ def test_finer_steps_give_a_higher_psnr_to_the_finest(kind: str, dtype: type[np.
     assert math.isinf(before)
 
 
-SETTINGS_KNOWN = TileSettings(
+KNOWN_SETTINGS = TileSettings(
     transform=usual_transform((2, 4, 8, 8)), step=1.0, center=0.0, low=0.0, high=16.0
 )
 OUTCOME = Outcome(size=3, squares=1.0, count=10, max_error=0.5)
@@ -273,30 +229,203 @@ def run(settings: TileSettings, coding: Coding, stream: bytes = b"abc") -> Run:
     return Run(settings, coding, [TileRun(stream, OUTCOME)])
 
 
-def test_equal_settings_are_known_and_others_are_not() -> None:
-    runs = Known()
-    first = run(SETTINGS_KNOWN, Coding())
-    runs.keep(first)
-    assert runs.run(replace(SETTINGS_KNOWN), Coding()) is first
-    assert runs.run(replace(SETTINGS_KNOWN, step=1.5), Coding()) is None
-    assert runs.run(SETTINGS_KNOWN, Coding(passes=2)) is None
-
-
 def test_a_head_changes_no_stream_but_under_a_bound() -> None:
-    headed = replace(SETTINGS_KNOWN, head=some_head())
+    headed = replace(KNOWN_SETTINGS, head=some_head())
     for coding, same in ((Coding(), True), (Coding(error=0.5), False)):
         runs = Known()
-        first = run(SETTINGS_KNOWN, coding)
+        first = run(KNOWN_SETTINGS, coding)
         runs.keep(first)
         assert runs.run(headed, coding) is None
         assert (runs.same_streams(headed, coding) is first) == same
-        assert runs.same_streams(SETTINGS_KNOWN, coding) is first
+        assert runs.same_streams(KNOWN_SETTINGS, coding) is first
 
 
 def test_the_oldest_runs_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_BYTES", 10)
     runs, steps = Known(), (1.0, 2.0, 3.0, 4.0)
     for step in steps:
-        runs.keep(run(replace(SETTINGS_KNOWN, step=step), Coding(), b"abcd"))
-    found = [runs.run(replace(SETTINGS_KNOWN, step=step), Coding()) is not None for step in steps]
+        runs.keep(run(replace(KNOWN_SETTINGS, step=step), Coding(), b"abcd"))
+    found = [runs.run(replace(KNOWN_SETTINGS, step=step), Coding()) is not None for step in steps]
     assert found == [False, False, True, True]
+
+
+WAVE_SHAPE = (4, 12, 20, 24)
+WAVE_SETTINGS = TileSettings(
+    transform=usual_transform(WAVE_SHAPE),
+    step=0.05,
+    center=0.5,
+    low=0.0,
+    high=1.0,
+    offsets=OFFSETS,
+)
+IN_CORESET = np.indices(WAVE_SHAPE)[1] <= 6
+
+
+def wave() -> npt.NDArray[Any]:
+    """Return a wave that is noisy where z > 6, values from 0 to 1."""
+    t, z, y, x = np.indices(WAVE_SHAPE)
+    noise = np.random.default_rng(3).normal(size=WAVE_SHAPE)
+    return (0.5 + 0.3 * np.sin(0.3 * x + 0.2 * t) * np.cos(0.2 * y) + 0.15 * noise * (z > 6)).clip(
+        0, 1
+    )
+
+
+@pytest.mark.parametrize("density", [0, 1, 2])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
+def test_vertices_that_count_stay_and_all_others_have_a_value(dtype: Any, density: int) -> None:
+    values = (wave() * (200 if dtype == np.uint8 else 1)).astype(dtype)
+    settings = WAVE_SETTINGS
+    if dtype == np.uint8:
+        settings = replace(WAVE_SETTINGS, high=200.0, center=100.0, step=10.0)
+    else:
+        values[:, 9, 3:6] = np.nan
+        values[:, 2, 2, 2] = np.inf
+    filled, counted = fill(Tile(values, IN_CORESET), settings, density)
+    assert filled.dtype == values.dtype
+    assert np.isfinite(filled).all()
+    np.testing.assert_array_equal(counted, IN_CORESET & np.isfinite(values))
+    np.testing.assert_array_equal(filled[counted], values[counted])
+
+
+@pytest.mark.parametrize("counted", [None, np.ones(WAVE_SHAPE, bool), np.zeros(WAVE_SHAPE, bool)])
+def test_a_tile_of_which_all_or_nothing_counts_stays(counted: npt.NDArray[np.bool_] | None) -> None:
+    tile = Tile(wave(), counted)
+    assert fill(tile, WAVE_SETTINGS, 2) is tile
+
+
+class Row:
+    """A row of tiles; all values of a tile are its number."""
+
+    complete, in_memory, tile = True, True, (1, 1, 10, 100)
+
+    def __init__(self, tiles: int) -> None:
+        self.tiles = tiles
+        self.shape = (1, 1, 10 * tiles, 100)
+
+    def indices(self) -> Iterator[Index]:
+        return iter([(0, 0, number, 0) for number in range(self.tiles)])
+
+    def weight(self, index: Index) -> int:
+        return 1
+
+    def read(self, index: Index) -> Tile:
+        return Tile(np.full(self.tile, index[2], np.float32), None)
+
+
+ROW_SETTINGS = TileSettings(
+    transform=usual_transform(Row.tile), step=1.0, center=0.0, low=0.0, high=16.0
+)
+
+
+def test_an_expensive_tile_stands_for_itself_and_a_cheap_one_for_many() -> None:
+    """The sample must have the one tile in which everything happens, and count it once."""
+    costs = [1.0] * 16
+    costs[11] = 400.0
+    with ThreadPoolExecutor(1) as workers:
+        sample = Sample(Row(16), 4_000, workers, costs)
+        numbers = [int(tile.values[0, 0, 0, 0]) for tile in sample.tiles]
+        assert dict(zip(numbers, sample.weights, strict=True))[11] == 1
+        assert sum(sample.weights) == 16
+        assert sample.counted == 16_000
+        assert sample.run(ROW_SETTINGS, Coding()).count == 16_000
+
+
+@pytest.mark.parametrize("max_tiles", [1, 3, 7, 40])
+def test_strata_cover_all_tiles(max_tiles: int) -> None:
+    costs = np.random.default_rng(max_tiles).gamma(0.3, 100.0, 40).tolist()
+    chosen = strata(costs, max_tiles)
+    assert len(chosen) <= max_tiles
+    assert sum(weight for _, weight in chosen) == 40
+    assert [tile for tile, _ in chosen] == sorted({tile for tile, _ in chosen})
+    estimate = sum(costs[tile] * weight for tile, weight in chosen)
+    assert max_tiles < 7 or abs(estimate / sum(costs) - 1) < 0.25
+    assert [weight for _, weight in strata([0.0] * 40, 4)] == [10] * 4
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_all_tiles_of_the_series_come_in_order(in_memory: bool) -> None:
+    row = Row(40)
+    row.in_memory = in_memory
+    with ThreadPoolExecutor(3) as workers:
+        sample = Sample(row, 4_000, workers)
+        firsts = list(sample.map_all(lambda tile: int(tile.values.flat[0])))
+    assert firsts == list(range(40))
+
+
+def test_what_was_coded_before_is_not_coded_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams are taken as they are, and a head that joins is measured on them."""
+    coded: list[TileSettings] = []
+    original = sample_module.code
+
+    def counted(tile: Tile, settings: TileSettings, coding: Coding) -> Any:
+        coded.append(settings)
+        return original(tile, settings, coding)
+
+    monkeypatch.setattr(sample_module, "code", counted)
+    settings = replace(ROW_SETTINGS, high=4.0)
+    headed = replace(settings, head=some_head())
+    with ThreadPoolExecutor(1) as workers:
+        sample, fresh = (Sample(Row(4), 4_000, workers) for _ in range(2))
+        first = sample.run(settings, Coding())
+        assert len(coded) == 4
+        assert sample.run(replace(settings), Coding()) == first
+        values = sample.decoded(settings, Coding())
+        with_head = sample.run(headed, Coding())
+        assert len(coded) == 4
+        assert set(sample.coded(settings, Coding())) == set(sample.indices)
+        assert sample.coded(replace(settings, step=2.0), Coding()) == {}
+        assert fresh.run(headed, Coding()) == with_head
+        for known, new in zip(values, fresh.decoded(settings, Coding()), strict=True):
+            np.testing.assert_array_equal(known, new)
+
+
+Shape = tuple[int, int, int, int]
+SHAPES = [(12, 25, 125, 125), (600, 12, 14, 16), (2, 128, 160, 160), (40, 3, 160, 200)]
+LONG = [(64, 128, 256, 256), (1, 512, 512, 512), (500, 3, 100, 400)]
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, *LONG, (1, 1, 1, 1), (3, 5, 7, 1)])
+def test_tiles_are_tried_from_the_fastest_region_to_the_whole(shape: Shape) -> None:
+    tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES)
+    works = [region_vertices(shape, tile) for tile in tiles]
+    assert works == sorted(works)
+    assert len(set(tiles)) == len(tiles)
+    assert sum(work <= FAST_ENOUGH for work in works) <= 1
+    assert (shape in tiles) == (prod(shape) <= MAX_WHOLE_VERTICES)
+    assert all(1 <= n <= length for tile in tiles for n, length in zip(tile, shape, strict=True))
+    few = [tile for tile in tiles if prod(tile) > 1 << 14]
+    for tile in few:  # and few of their vertices lie beyond the border
+        covered = prod(-(-length // n) * n for n, length in zip(tile, shape, strict=True))
+        assert covered <= 1.7 * prod(shape)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("size", [1e3, 1e5, 1e7])
+def test_a_wish_for_access_is_never_answered_by_slower_tiles(shape: Shape, size: float) -> None:
+    works = []
+    for access in ACCESSES:
+        tiling = cheap_tiling(shape, size, access)
+        assert tiling.price is not None
+        assert 1 <= tiling.price <= PRICES[access]
+        works.append(region_vertices(shape, tiling.tile))
+    assert works == sorted(works)
+    assert cheap_tiling(shape, size, "small").tile == shape
+
+
+def test_every_wish_has_a_price() -> None:
+    assert tuple(PRICES) == ACCESSES
+    assert list(PRICES.values()) == sorted(PRICES.values(), reverse=True)
+
+
+@pytest.mark.parametrize("shape", [(10, 64, 64, 64), (12, 25, 125, 125), (33, 64, 64, 64)])
+def test_few_vertices_of_tiles_lie_beyond_the_border(shape: Shape) -> None:
+    tile = even_tile(shape, 27, -(-shape[0] // 3))
+    covered = np.prod([-(-n // length) * length for n, length in zip(shape, tile, strict=True)])
+    assert covered <= 1.04 * np.prod(shape)
+
+
+@pytest.mark.parametrize("text", ["whole", "200x1000x1000x1"])
+def test_a_tile_that_no_reader_would_take_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"at most 134,217,728 are decoded together"):
+        parse_tile(text, (200, 1000, 1000, 2))
+    assert parse_tile("1x1000x1000x9", (200, 1000, 1000, 2)) == (1, 1000, 1000, 2)

@@ -1,4 +1,4 @@
-"""The coreset against a direct crop of the data."""
+"""The coreset against a direct crop of the data, and packed occupancy."""
 
 from __future__ import annotations
 
@@ -8,15 +8,73 @@ import numpy as np
 import pytest
 
 from fhash_codec.features.bricks import brick_shape, build_coreset, parse_brick
-from fhash_codec.features.features import Everything, Interval, Isosurface, Segmentation, dilate
-from fhash_codec.features.occupancy import unpack
+from fhash_codec.features.features import (
+    Everything,
+    FeatureChoice,
+    Interval,
+    Isosurface,
+    Segmentation,
+    dilate,
+)
+from fhash_codec.features.occupancy import morton_index, pack, packed_bytes, unpack
 from fhash_codec.features.scan import scan
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import ArraySeries
 
+SHAPES = [
+    (1, 1, 1), (1, 1, 2), (2, 1, 1), (1, 2, 1), (1, 1, 3), (1, 1, 9), (9, 1, 1), (1, 9, 1),
+    (2, 2, 2), (1, 2, 5), (3, 1, 2), (2, 3, 5), (7, 11, 13), (1, 17, 4), (17, 1, 3), (5, 64, 2),
+    (8, 8, 16), (1, 1, 100), (31, 2, 1), (4, 33, 16),
+]  # fmt: skip
+
+
+def brute_force_index(z, y, x, shape):
+    """Take bits from x, y, z in turn while the axis has any."""
+    axes = [
+        [x, (shape[2] - 1).bit_length()],
+        [y, (shape[1] - 1).bit_length()],
+        [z, (shape[0] - 1).bit_length()],
+    ]
+    index = place = 0
+    while any(left for _, left in axes):
+        for axis in axes:
+            if axis[1]:
+                index |= (axis[0] & 1) << place
+                axis[0] >>= 1
+                axis[1] -= 1
+                place += 1
+    return index
+
+
+def random_mask(shape, seed=0):
+    return np.random.default_rng(seed).random(shape) < 0.4
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_bits_lie_where_the_definition_says(shape) -> None:
+    mask, vertices = random_mask(shape), np.indices(shape)
+    index = morton_index(*vertices, shape)
+    assert index.ravel().tolist() == [
+        brute_force_index(*(int(v) for v in vertex), shape) for vertex in vertices.reshape(3, -1).T
+    ]
+    expected = np.zeros(8 * packed_bytes(shape), dtype=bool)
+    expected[index] = mask
+    np.testing.assert_array_equal(pack(mask), np.packbits(expected))
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (25, 125, 125)])
+def test_unpack_inverts_pack_and_the_index_is_injective(shape) -> None:
+    mask = random_mask(shape, 1)
+    bits = pack(mask)
+    assert (bits.dtype, bits.shape) == (np.uint8, (packed_bytes(shape),))
+    np.testing.assert_array_equal(unpack(bits, shape), mask)
+    assert np.unique(morton_index(*np.indices(shape), shape)).size == mask.size
+    assert np.unpackbits(bits).sum() == mask.sum()
+
+
 EVERYTHING = (Everything(),)
-SHAPES = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70, 5)]
+SHAPES_BRICKS = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70, 5)]
 
 
 def unpack_frame(coreset, key):
@@ -50,7 +108,8 @@ def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
     series = ArraySeries(array)
     seen = scan(series, silent)
     keys = tuple(range(series.shape[0])) if keys is None else keys
-    return build_coreset(series, seen, keys, features, dilation, silent, **kwargs), seen
+    choice = FeatureChoice(keys, features, dilation)
+    return build_coreset(series, seen, choice, silent, **kwargs), seen
 
 
 def check_against_direct_crop(array, features, keys, dilation, **kwargs) -> None:
@@ -107,7 +166,7 @@ def check_structure(coreset) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:feature .* selects nothing")
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", SHAPES_BRICKS)
 @pytest.mark.parametrize(
     "features",
     [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))],
@@ -117,29 +176,6 @@ def check_structure(coreset) -> None:
 def test_bricks_hold_the_direct_crop(shape, features, dilation) -> None:
     array = smooth(4, shape)
     check_against_direct_crop(array, features, (0, 2, 3), dilation)
-
-
-@pytest.mark.parametrize("brick", [(1, 1, 1), (4, 2, 8), (16, 16, 16), (3, 5, 7)])
-def test_any_brick_shape_holds_the_same(brick) -> None:
-    coreset = check_against_direct_crop(
-        smooth(2, (11, 13, 19)), (Interval(0.3, 0.8),), (0, 1), 1, brick=brick
-    )
-    assert coreset.brick_shape == brick
-
-
-@pytest.mark.parametrize(
-    ("dtype", "low", "span"),
-    [
-        (np.uint8, 0, 200),
-        (np.int16, -300, 500),
-        (np.float64, 1e8, 1e-3),
-        (np.float64, -1.7e308, 1.7e308),
-    ],
-)
-def test_number_types_and_narrow_ranges(dtype, low, span) -> None:
-    array = smooth(2, (5, 6, 7), dtype, low, span)
-    feature = Segmentation(float(low) + 0.5 * span)
-    check_against_direct_crop(array, (feature,), (0, 1), 1)
 
 
 def test_missing_values_are_neither_samples_nor_background() -> None:
@@ -164,32 +200,6 @@ def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not() -> Non
         build(array, (Interval(2.0, 3.0), Isosurface(9.0)))
 
 
-def test_a_coreset_of_everything_has_the_mean_of_all_as_background() -> None:
-    coreset, seen = build(smooth(2, (4, 5, 6)), keys=(0,))
-    assert (coreset.fraction, coreset.background) == (1.0, seen.mean)
-    assert coreset.box == ((0, 4), (0, 5), (0, 6))
-
-
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [
-        ((64, 64, 64), (8, 8, 16)),
-        ((1, 200, 200), (1, 29, 29)),
-        ((200, 1, 200), (29, 1, 29)),
-        ((200, 200, 1), (29, 29, 1)),
-        ((200, 200, 9), (8, 8, 9)),
-        ((200, 200, 5), (8, 16, 5)),
-        ((1, 1, 5000), (1, 1, 1000)),
-        ((1, 1, 1), (1, 1, 1)),
-        ((3, 3, 3), (3, 3, 3)),
-        ((2, 100, 100), (2, 15, 25)),
-        ((25, 125, 125), (7, 8, 16)),
-    ],
-)
-def test_thin_axes_hand_their_factors_to_the_others(size, expected) -> None:
-    assert brick_shape(size) == expected
-
-
 def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box() -> None:
     for size in np.random.default_rng(0).integers(1, 60, size=(300, 3)).tolist():
         brick = brick_shape(size)
@@ -200,25 +210,6 @@ def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box() -> N
             for edge, length, count in zip(brick, size, counts, strict=True)
         )
         assert prod(brick) >= 200 or prod(counts) < 40
-
-
-def test_progress_has_two_stages() -> None:
-    calls = []
-    series = ArraySeries(smooth(3, (2, 2, 2)))
-    build_coreset(
-        series,
-        scan(series, silent),
-        (0, 2),
-        (Everything(),),
-        0,
-        lambda *call: calls.append(call[:3]),
-    )
-    assert calls == [
-        ("selecting", 1, 2),
-        ("selecting", 2, 2),
-        ("gathering", 1, 2),
-        ("gathering", 2, 2),
-    ]
 
 
 def test_a_feature_that_selects_nothing_beside_others_is_warned_of() -> None:
@@ -240,24 +231,6 @@ def test_the_fringe_is_sampled_and_no_part_of_the_coreset() -> None:
         )
         np.testing.assert_array_equal(fringed.occupancy[key], plain.occupancy[key])
     assert (fringed.fraction, fringed.background) == (plain.fraction, plain.background)
-
-
-def test_samples_of_the_fringe_are_told_and_not_counted() -> None:
-    values = np.random.default_rng(1).random((3, 5, 20, 40)).astype(np.float32)
-    plain, _ = build(values, [Interval(0.95, 1.0)], dilation=0)
-    fringed, _ = build(values, [Interval(0.95, 1.0)], dilation=0, fringe=True)
-    assert plain.fringe is None
-    np.testing.assert_array_equal(plain.counts, np.diff(plain.offsets))
-    assert fringed.fringe.shape == fringed.values.shape
-    np.testing.assert_array_equal(fringed.values[~fringed.fringe], plain.values)
-    assert fringed.counts.sum() == len(plain.values) < len(fringed.values)
-    chosen = np.array([3, 0, 2])
-    places = fringed.places(chosen)
-    np.testing.assert_array_equal(
-        np.add.reduceat(~fringed.fringe[places], np.cumsum([0, *np.diff(fringed.offsets)[[3, 0]]])),
-        fringed.counts[chosen],
-    )
-    assert not fringed.places(chosen[:0]).size
 
 
 def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:

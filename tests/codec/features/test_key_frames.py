@@ -9,13 +9,7 @@ import pytest
 
 from fhash_codec.features.key_frames import (
     KeyTimes,
-    gram_matrix,
-    optimal_steps,
-    segment_costs,
     select_key_frames,
-    strictly_monotonic,
-    time_axis,
-    vertex_stride,
 )
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError, RegionError
@@ -107,71 +101,9 @@ def test_auto_is_the_best_of_all_subsets(count, times) -> None:
     assert interpolation_error(series.values, times, chosen) == pytest.approx(best, rel=1e-9)
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
-@pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_auto_does_not_depend_on_scale_or_offset(scale, offset) -> None:
-    series = series_of(9, seed=4)
-    assert pick("auto:4", ArraySeries((series.values + offset) * scale)) == pick("auto:4", series)
-
-
-def test_auto_finds_the_kinks_of_a_piecewise_linear_series() -> None:
-    times = np.array([0.0, 1, 3, 4, 7, 8, 9, 12])
-    a, b = np.random.default_rng(0).random((2, 3, 4, 5))
-    array = np.stack([a * np.interp(t, [0, 4, 9, 12], [0, 1, -1, 3]) + b for t in times])
-    assert pick("auto:4", ArraySeries(array), times) == (0, 3, 6, 7)
-    assert pick("auto:4", ArraySeries(array[::-1]), times[::-1]) == (0, 1, 4, 7)
-
-
-def test_auto_bears_missing_values_and_integers() -> None:
-    array = np.random.default_rng(0).integers(0, 100, (6, 2, 3, 4))
-    assert len(pick("auto:3", ArraySeries(array.astype(np.uint8)))) == 3
-    holed = array.astype(np.float32)
-    holed[:, 0, 0, 0], holed[2], holed[3, 1, 1, 1] = np.nan, np.nan, np.inf
-    assert len(pick("auto:3", ArraySeries(holed))) == 3
-    assert pick("auto:2", ArraySeries(np.full((3, 1, 1, 2), np.nan))) == (0, 2)
-
-
 def test_auto_needs_times_that_go_one_way() -> None:
     with pytest.raises(InputError, match="step numbers"):
         pick("auto:2", series_of(4), np.array([0.0, 1, 1, 2]))
-
-
-def test_costs_of_segments_are_the_definition() -> None:
-    series = series_of(8, seed=7)
-    frames = list(series.values.reshape(8, -1))
-    unit = np.stack(frames) * 2.0 ** -np.frexp(np.abs(frames).max())[1]
-    costs = segment_costs(gram_matrix(frames), UNEVEN)
-    for a, b in itertools.combinations(range(8), 2):
-        expected = interpolation_error(unit[a : b + 1], UNEVEN[a : b + 1], (0, b - a))
-        assert costs[a, b] == pytest.approx(expected, abs=1e-13)
-    assert np.isinf(costs[np.tril_indices(8)]).all()
-    assert optimal_steps(costs, 2) == (0, 7)
-
-
-@pytest.mark.parametrize(
-    ("shape", "limit", "stride"),
-    [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)],
-)
-def test_the_lattice_is_the_finest_that_fits(shape, limit, stride) -> None:
-    assert vertex_stride(shape, limit) == stride
-
-
-@pytest.mark.parametrize(
-    ("times", "expected"),
-    [
-        ([3], True),
-        ([0, 1, 5], True),
-        ([5, 1, 0], True),
-        ([0, 1, 1], False),
-        ([0, 2, 1], False),
-        ([0, np.nan], False),
-        ([np.inf, np.inf], False),
-    ],
-)
-def test_strictly_monotonic(times, expected) -> None:
-    times = np.array(times, dtype=float)
-    assert strictly_monotonic(times) is expected
-    np.testing.assert_array_equal(time_axis(times), times if expected else np.arange(times.size))
 
 
 @pytest.mark.parametrize(
@@ -196,52 +128,12 @@ def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_
             )
 
 
-def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere() -> None:
-    keys = KeyTimes(times=UNEVEN, key_frames=(2, 5))
-    assert [keys.key_index(step) for step in (0, 1.5, 2, 5, 6.5, 7)] == [0, 0, 0, 1, 1, 1]
-    assert [KeyTimes(times=UNEVEN, key_frames=(4,)).key_index(step) for step in (0, 3.3, 7)] == [
-        0,
-        0,
-        0,
-    ]
-    assert KeyTimes(times=np.array([5.0]), key_frames=(0,)).key_index(0) == 0
-
-
 @pytest.mark.parametrize("times", [UNEVEN, UNEVEN[::-1].copy(), -UNEVEN])
 def test_step_of_time_inverts_the_times(times) -> None:
     keys = KeyTimes(times=times, key_frames=(0, 7))
     assert [keys.step_of_time(time) for time in times] == list(range(8))
     assert keys.step_of_time((times[2] + times[3]) / 2) == pytest.approx(2.5)
     np.testing.assert_allclose(keys.steps_of_times(times.reshape(2, 4)), np.arange(8).reshape(2, 4))
-
-
-CLOSE = {
-    "next to each other": 3.5e5 + 2.0**-34 * np.arange(4),
-    "smallest": 5e-324 * np.arange(4),
-    "largest": 1.7e308 * np.array([-1.0, 0.0, 0.5, 1.0]),
-    "both": np.array([0.0, 5e-324, 1.0, 1.7e308]),
-}
-"""Times between which float64 has none, or whose differences it has not."""
-
-
-@pytest.mark.parametrize("times", CLOSE.values(), ids=CLOSE)
-@pytest.mark.parametrize("sign", [1, -1])
-def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(
-    times, sign
-) -> None:
-    every = KeyTimes(times=sign * times, key_frames=(0, 1, 2, 3))
-    steps = np.linspace(0, 3, 25)
-    np.testing.assert_array_equal(every.key_indices(steps), steps)
-    assert every.steps_of_times(sign * times).tolist() == [0, 1, 2, 3]
-    few = KeyTimes(times=sign * times, key_frames=(0, 3))
-    assert [few.key_index(0), few.key_index(3)] == [0, 1]
-    assert (np.diff(few.key_indices(steps)) >= 0).all()
-
-
-def test_times_whose_difference_overflows_have_a_middle() -> None:
-    ends = KeyTimes(times=1.7e308 * np.array([-1.0, 0.0, 1.0]), key_frames=(0, 2))
-    assert ends.key_index(1) == 0.5
-    assert KeyTimes(times=1.7e308 * np.array([-1.0, 1.0]), key_frames=(0, 1)).step_of_time(0) == 0.5
 
 
 def test_what_lies_outside_is_refused() -> None:
@@ -254,14 +146,3 @@ def test_what_lies_outside_is_refused() -> None:
             keys.key_index(step)
     with pytest.raises(InputError, match="step numbers"):
         KeyTimes(times=np.array([0.0, 0.0]), key_frames=(0,))
-
-
-@pytest.mark.parametrize("key_frames", [(0, 3, 7), (2, 5), (4,)])
-def test_one_step_has_the_bits_of_the_same_step_among_many(key_frames) -> None:
-    times = KeyTimes(times=UNEVEN, key_frames=key_frames)
-    steps = np.linspace(0, 7, 57)
-    assert [times.key_index(step) for step in steps] == times.key_indices(steps).tolist()
-    with pytest.raises(RegionError):
-        times.key_index(7.5)
-    with pytest.raises(RegionError):
-        times.key_index(float("nan"))

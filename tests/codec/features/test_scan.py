@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,18 +11,14 @@ import pytest
 from fhash_codec.features.scan import (
     ABSURD,
     HUGE,
-    LARGEST_FLOATS,
     MOST,
     SEVERAL,
     Extremes,
     SpanScan,
-    least_ratio,
     scan,
-    scan_steps,
 )
-from fhash_codec.measure.value_range import Ranks, ValueRange, pieces
+from fhash_codec.measure.value_range import Ranks, pieces
 from fhash_codec.progress import silent
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, StepsSeries
 
@@ -81,12 +75,6 @@ def test_a_fill_value_is_found(fill: float, low: float, high: float, dtype: str,
     assert suspects(values, step) == [float(np.array(fill, dtype))]
 
 
-def test_fill_values_at_both_ends_are_found() -> None:
-    values = masked(GRID, -1e30)
-    values[:, -1] = 1e30
-    assert suspects(values) == [float(np.float32(-1e30)), float(np.float32(1e30))]
-
-
 RANDOM = np.random.default_rng(0).normal(size=GRID.shape)
 PEAK = np.exp(-((GRID - 0.5) ** 2) / 1e-5)
 
@@ -136,35 +124,6 @@ def test_real_data_are_not_suspected(name: str, step: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "ratio"),
-    [
-        (-9999, MOST),
-        (-999.99, MOST),
-        (-99, MOST),
-        (-9, ABSURD),
-        (-98, ABSURD),
-        (99, ABSURD),
-        (999, SEVERAL),
-        (9999, SEVERAL),
-        (-32768, MOST),
-        (-32767, MOST),
-        (-32765, ABSURD),
-        (32767, SEVERAL),
-        (65534, SEVERAL),
-        (65533, ABSURD),
-        (1e20, HUGE),
-        (float(np.float32(1e20)), HUGE),
-        (1.00001e20, ABSURD),
-        (1e19, ABSURD),
-        (-LARGEST_FLOATS[1], HUGE),
-        (0, ABSURD),
-    ],
-)
-def test_how_far_away_a_value_must_be(value: float, ratio: float) -> None:
-    assert least_ratio(value) == ratio
-
-
-@pytest.mark.parametrize(
     ("value", "ratio"), [(-9999, MOST), (9999, SEVERAL), (1e20, HUGE), (12345.0, ABSURD)]
 )
 def test_each_ratio_on_both_sides(value: float, ratio: float) -> None:
@@ -198,21 +157,6 @@ def test_integers_of_an_array_with_missing_values() -> None:
     assert np.isnan(series.read(0)[MASK[0]]).all()
 
 
-def test_the_lowest_packed_integer_is_found_in_the_values_unpacked(tmp_path: Path) -> None:
-    counts = masked(4000 * GRID, -32767, "i2")[0]
-    for name, dtype in (("a", "i2"), ("b", "f4")):
-        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
-            file["sst"] = counts.astype(dtype)
-            file["sst"].attrs.update({"scale_factor": 0.01, "add_offset": 5.0})
-    words = r"'sst' has -322\.67 at .* --missing -322\.67 if"
-    with open_series(tmp_path / "a.h5") as series, pytest.raises(InputError, match=words):
-        scan(series, silent)
-    with open_series(tmp_path / "a.h5", missing=[-322.67]) as series:
-        assert scan(series, silent).value_range.low > 0
-    with open_series(tmp_path / "b.h5") as series:  # these are no counts of 16 bits
-        scan(series, silent)
-
-
 @pytest.mark.parametrize(
     "dtype", [np.uint8, np.int32, np.uint64, np.float16, np.float32, np.float64]
 )
@@ -242,57 +186,9 @@ def test_missing_values_are_left_out_and_known_by_step() -> None:
         np.testing.assert_array_equal(finite[step], True if mask is None else mask)
 
 
-def test_a_mask_that_stays_is_kept_once() -> None:
-    array = np.zeros((4, 2, 3, 3))
-    array[:, 0] = np.nan
-    array[3, 1] = np.nan
-    array[3, 0] = 1.0
-    missing = scan(ArraySeries(array), silent).missing
-    assert missing[0] is missing[1] is missing[2]
-    assert missing[3] is not missing[2]
-
-
-@pytest.mark.parametrize(
-    ("low", "high"), [(1e8, 1e8 + 1e-3), (-1.7e308, 1.7e308), (5e-324, 1e-322)]
-)
-def test_extreme_ranges_are_exact(low, high) -> None:
-    seen = scan(ArraySeries(np.array([low, high, low, high]).reshape(2, 1, 1, 2)), silent)
-    assert (seen.value_range.low, seen.value_range.high) == (low, high)
-    assert low <= seen.mean <= high
-
-
 def test_no_finite_value_at_all_is_refused() -> None:
     with pytest.raises(InputError, match="no finite value"):
         scan(ArraySeries(np.full((2, 2, 2, 2), np.nan)), silent)
-
-
-def test_progress_counts_the_steps() -> None:
-    calls = []
-    scan(ArraySeries(np.zeros((3, 1, 1, 1))), lambda *call: calls.append(call))
-    assert calls == [("scanning", 1, 3, ""), ("scanning", 2, 3, ""), ("scanning", 3, 3, "")]
-
-
-def test_masks_of_some_steps_are_those_of_the_whole() -> None:
-    array = np.random.default_rng(1).random((5, 3, 4, 5))
-    array[1:4, 0], array[3, 1, 1] = np.nan, np.inf
-    series = ArraySeries(array)
-    whole = scan(series, silent)
-    some = scan_steps(series, range(1, 4), whole.value_range, may_miss=True, progress=silent)
-    assert list(some) == [1, 2, 3]
-    for step, bits in some.items():
-        np.testing.assert_array_equal(bits, whole.missing[step])
-
-
-def test_steps_of_other_data_are_refused() -> None:
-    array = np.arange(24.0).reshape(2, 2, 2, 3)
-    series = ArraySeries(array)
-    for known in (ValueRange(1, 23), ValueRange(0, 22)):
-        with pytest.raises(InputError, match="the plan is of data from"):
-            scan_steps(series, range(2), known, may_miss=False, progress=silent)
-    array[1, 0, 0, 0] = np.nan
-    assert scan_steps(series, range(1), ValueRange(0, 23), may_miss=False, progress=silent) == {}
-    with pytest.raises(InputError, match="step 1 has missing values, and the plan is of data wit"):
-        scan_steps(series, range(2), ValueRange(0, 23), may_miss=False, progress=silent)
 
 
 @pytest.mark.parametrize("length", [1, 2, 5])

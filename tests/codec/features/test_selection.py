@@ -22,7 +22,6 @@ from fhash_codec.features.selection import (
     DaskSeries,
     LazyFrames,
     array_series,
-    is_lazy,
     labelled_series,
     open_source,
     select_features,
@@ -86,22 +85,6 @@ def test_times_are_counted_as_the_file_counted_them() -> None:
     assert series.coords["t"].attributes["units"].startswith("hours since 1999-12-31")
 
 
-def test_frames_of_a_lazy_array_are_computed_one_by_one() -> None:
-    source = dataset()[["u"]].chunk({"time": 1})
-    computed: list[int] = []
-
-    def note(block: Any, block_info: Any = None) -> Any:
-        if block_info:
-            computed.append(block_info[0]["chunk-location"][1])
-        return block
-
-    lazy = source["u"].copy(data=source["u"].data.map_blocks(note, dtype="f8"))
-    series = labelled_series(lazy)
-    assert computed == []
-    series.read(2)
-    assert computed == [2]
-
-
 def test_packing_is_that_of_the_file(tmp_path: Path) -> None:
     packing = {"u": {"dtype": "int16", "scale_factor": 0.5, "_FillValue": -1}}
     dataset().to_netcdf(tmp_path / "a.nc", engine="h5netcdf", encoding=packing)
@@ -129,11 +112,6 @@ def test_the_variable_must_be_clear() -> None:
         labelled_series(two, "w")
     with pytest.raises(InputError, match="no variable of 3"):
         labelled_series(source[["crs"]])
-
-
-def test_arrays_without_labels_are_arrays() -> None:
-    assert isinstance(array_series(np.zeros((2, 3, 4))), ArraySeries)
-    assert array_series(dataset()["u"]).name == "u"
 
 
 def forecast() -> xr.Dataset:
@@ -271,12 +249,6 @@ def test_a_series_of_dask_is_that_of_its_values(axes, dtype) -> None:
         series.read(plain.shape[0])
 
 
-def test_other_arrays_are_not_lazy() -> None:
-    assert is_lazy(dask.zeros((2, 2)))
-    assert not is_lazy(VALUES)
-    assert not is_lazy([1, 2])
-
-
 def test_lengths_that_are_not_known_are_refused() -> None:
     array = dask.from_array(VALUES, chunks=2)
     unknown = array[array[:, 0, 0, 0] > 30]
@@ -287,23 +259,6 @@ def test_lengths_that_are_not_known_are_refused() -> None:
 
 
 VALUES_SELECTION = np.random.default_rng(0).random((3, 4, 5, 6))
-
-
-def test_files_series_and_arrays_are_sources(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", VALUES_SELECTION)
-    series = ArraySeries(VALUES_SELECTION)
-    for source in (
-        tmp_path / "a.npy",
-        str(tmp_path / "a.npy"),
-        series,
-        VALUES_SELECTION,
-        VALUES_SELECTION.tolist(),
-    ):
-        with open_source(source) as opened:
-            assert opened.shape == VALUES_SELECTION.shape
-            np.testing.assert_array_equal(opened.read(2), VALUES_SELECTION[2])
-    with open_source(series) as opened:
-        assert opened is series
 
 
 def test_a_mask_replaces_all_and_joins_named_features() -> None:
@@ -318,15 +273,6 @@ def test_a_mask_replaces_all_and_joins_named_features() -> None:
     assert joined.extent.samples == (mask | (VALUES_SELECTION <= 0.1)).sum()
     with pytest.raises(InputError, match="mask has shape"):
         select_features(series, EncodeConfig(), silent, mask[1:])
-
-
-def test_times_that_are_no_axis_are_warned_of() -> None:
-    times = Coordinate(name="time", values=np.array([0.0, 2.0, 2.0]))
-    series = ArraySeries(VALUES_SELECTION, coords={"t": times})
-    with pytest.warns(FhashWarning, match="step numbers stand for them"):
-        selection = select_features(series, EncodeConfig(), silent)
-    assert selection.extent.key_frames == (0, 1, 2)
-    assert selection.scanned.finite_count == VALUES_SELECTION.size
 
 
 @pytest.mark.parametrize(

@@ -1,25 +1,22 @@
-"""The bulk: percentiles found in one or two passes."""
+"""Errors of frames and of whole series against plain numpy."""
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
 
 from fhash_codec.measure.errors import (
-    MIN_SHARE,
     Errors,
     bulk_of_ranks,
     error_sums,
     find_bulk,
-    histogram,
-    is_wide,
-    psnr,
     range_and_sum,
     squared_errors,
-    whole_psnr,
 )
+from fhash_codec.measure.metrics import Comparer, measure_quality, neighbours_of
 from fhash_codec.measure.value_range import Ranks, ValueRange
 from fhash_formats.errors import InputError
 
@@ -57,33 +54,10 @@ def test_the_ends_are_the_percentiles_rounded_outwards(dtype, scale) -> None:
     assert bulk.high - bulk.low <= (high - low) * 1.005
 
 
-@pytest.mark.parametrize("factor", [1e-300, 1e300])
-@pytest.mark.parametrize("offset", [0.0, 50.0])
-def test_the_bulk_scales_with_the_values(factor, offset) -> None:
-    values = heavy(20.0) + offset
-    plain, scaled = bulk_of(values), bulk_of(values * factor)
-    assert scaled.low / factor == pytest.approx(plain.low, abs=0.01)
-    assert scaled.high / factor == pytest.approx(plain.high, abs=0.01)
-
-
-def test_it_does_not_depend_on_the_order_or_the_pieces() -> None:
-    values = heavy(300.0).astype(np.float32)
-    expected = bulk_of(values)
-    assert bulk_of(values[::-1], pieces=7) == expected
-
-
 @pytest.mark.parametrize("dtype", [np.int8, np.uint16, np.int32, np.int64])
 def test_whole_numbers_have_whole_ends(dtype) -> None:
     labels = np.repeat([0, 1, 2, 3, 120], [500, 300, 150, 45, 5]).astype(dtype)
     assert bulk_of(labels, whole=True) == ValueRange(0.0, 3.0)
-
-
-def test_large_whole_numbers_have_ends_near_the_percentiles() -> None:
-    values = np.random.default_rng(0).integers(-(10**8), 10**8, 20_000)
-    bulk, (low, high) = bulk_of(values, whole=True), percentiles(values)
-    assert bulk.low == round(bulk.low)
-    assert bulk.low == pytest.approx(low, abs=0.001 * (high - low))
-    assert bulk.high == pytest.approx(high, abs=0.001 * (high - low))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -98,23 +72,6 @@ def test_a_plateau_of_nearly_all_values_has_no_bulk(others, found, sign) -> None
 @pytest.mark.parametrize("values", [[3.0], [3.0, 3.0], [0.0, 1e-12] * 500 + [1.0]], ids=len)
 def test_without_width_there_is_no_bulk(values) -> None:
     assert bulk_of(np.array(values)) is None
-
-
-def test_a_range_that_overflows_has_no_bulk() -> None:
-    assert bulk_of((2 * np.random.default_rng(0).random(1000) - 1) * 1.79e308) is None
-
-
-def test_two_values_are_their_own_bulk() -> None:
-    assert bulk_of(np.array([1.0, 3.0])) == ValueRange(1.0, 3.0)
-
-
-@pytest.mark.parametrize(("share", "wide"), [(MIN_SHARE, True), (MIN_SHARE * 0.999, False)])
-def test_a_wide_bulk_spans_a_share_of_the_range(share, wide) -> None:
-    assert is_wide(ValueRange(0.0, share), ValueRange(0.0, 1.0)) == wide
-
-
-def test_the_whole_psnr_has_the_same_rmse() -> None:
-    assert whole_psnr(40.0, ValueRange(1.0, 2.0), 10.0) == pytest.approx(60.0)
 
 
 @pytest.mark.parametrize("scale", [1.0, 20.0, 1e6])
@@ -183,28 +140,6 @@ def test_errors_are_those_of_plain_numpy(dtype, masked) -> None:
         assert figures.max_abs_error == pytest.approx(np.abs(errors_of_step).max(), rel=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_bulk_has_both_of_its_ends(dtype) -> None:
-    original = np.array([[[1, 2, 3, 4, 5]]], dtype)
-    decoded = original + np.array([0.5, 0.25, 0.125, 0.75, 0.5], dtype)
-    errors = Errors(4.0, ValueRange(2, 4))
-    errors.add(0, original, decoded)
-    mean = (0.25**2 + 0.125**2 + 0.75**2) / 3
-    assert errors.bulk_quality().rmse == pytest.approx(math.sqrt(mean), rel=1e-12)
-
-
-def test_values_that_are_not_finite_do_not_count() -> None:
-    original, decoded = frames()
-    original[0, 0, 0, :3] = np.nan, np.inf, -np.inf
-    decoded[0, 0, 0, 0] = np.nan
-    errors = added(Errors(1.0), original, decoded)
-    finite = np.isfinite(original)
-    assert errors.count == finite.sum() == original.size - 3
-    assert errors.rmse == pytest.approx(
-        math.sqrt(np.mean((original - decoded)[finite] ** 2)), rel=1e-12
-    )
-
-
 @pytest.mark.parametrize("factor", [2.0**-1040, 2.0**-900, 2.0**900, 2.0**1023])
 def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     original, decoded = frames()
@@ -214,51 +149,6 @@ def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     assert scaled.psnr == pytest.approx(plain.psnr, rel=1e-6)
     assert scaled.rmse == pytest.approx(plain.rmse * factor, rel=1e-6, abs=0)
     assert scaled.max_abs_error == pytest.approx(plain.max_abs_error * factor, rel=1e-6, abs=0)
-
-
-def test_the_psnr_of_denormals_does_not_come_from_their_rounding() -> None:
-    original = 5e-324 * np.arange(1000.0).reshape(1, 10, 100)
-    decoded = original.copy()
-    decoded[0, 0, :7] += 5e-324
-    errors = Errors(float(original.max()))
-    errors.add(0, original, decoded)
-    # The root mean square is less than the smallest number.
-    assert errors.psnr == pytest.approx(20 * math.log10(999 / math.sqrt(7 / 1000)))
-    assert errors.steps[0].psnr == errors.psnr
-
-
-def test_a_range_that_overflows_leaves_only_psnr_unknown() -> None:
-    original = np.array([-1.7e308, 1.7e308, 0.0]).reshape(1, 1, 3)
-    errors = Errors(math.inf)
-    errors.add(0, original, original + np.array([1e300, 0, -1e300]))
-    assert errors.psnr is None
-    assert errors.rmse == pytest.approx(1e300 * math.sqrt(2 / 3), rel=1e-6)
-    assert errors.max_abs_error == pytest.approx(1e300, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("data_range", "rmse"), [(0.0, 1.0), (1.0, 0.0), (1.0, None), (math.inf, 1.0)]
-)
-def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse) -> None:
-    assert psnr(data_range, rmse) is None
-
-
-def test_psnr_of_extreme_ratios() -> None:
-    assert psnr(1e308, 1e-308) == pytest.approx(20 * 616)
-    assert psnr(10.0, 1.0) == pytest.approx(20.0)
-
-
-def test_a_frame_of_which_nothing_counts_has_no_figures() -> None:
-    original, decoded = frames(1)
-    errors = Errors(1.0)
-    figures = errors.add(4, original[0], decoded[0], np.zeros(original[0].shape, bool))
-    assert (figures.step, figures.psnr, figures.rmse, figures.max_abs_error) == (
-        4,
-        None,
-        None,
-        None,
-    )
-    assert (errors.count, errors.psnr, errors.rmse, errors.max_abs_error) == (0, None, None, None)
 
 
 def test_wrong_frames_are_refused() -> None:
@@ -299,17 +189,6 @@ def test_range_and_sum_are_those_of_numpy(size, dtype, missing) -> None:
     assert total == pytest.approx(finite.sum() / 2, rel=1e-9, abs=1e-9)
 
 
-def test_zeros_have_no_sign_and_sums_may_be_infinite() -> None:
-    for values in ([0.0, -0.0], [-0.0, 0.0], [-0.0]):
-        _, low, high, _ = range_and_sum(np.array(values))
-        assert not np.signbit([low, high]).any()
-    largest = np.finfo(np.float64).max
-    assert range_and_sum(np.full(1000, largest)) == (1000, largest, largest, np.inf)
-    assert range_and_sum(np.full(1000, largest), 2.0**-20)[3] == pytest.approx(
-        largest * (1000 * 2.0**-20)
-    )
-
-
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize(
     "dtypes",
@@ -348,14 +227,6 @@ def test_the_bulk_is_summed_once_more(dtype) -> None:
     assert sums[:3] == squared_errors(original, decoded, None, 0.5)
 
 
-def test_values_beyond_a_histogram_go_to_its_ends() -> None:
-    counts = np.zeros(4, np.int64)
-    values = np.array([[-1e300, -1, 0, 0.99], [1, 3.5, 4, 1e300], [np.nan, np.inf, -np.inf, 2]])
-    histogram(values, counts, scale=1.0, low=0.0, factor=1.0)
-    histogram(np.array([1, 2, 9], np.uint8), counts, scale=1.0, low=0.0, factor=1.0)
-    assert counts.tolist() == [4, 2, 2, 4]
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_is_told(value) -> None:
     original, decoded = pair(20_000, np.float32)
@@ -368,12 +239,166 @@ def test_what_is_not_finite_is_told(value) -> None:
     assert squared_errors(original, decoded, None, 1.0)[0] == 19_999
 
 
-def test_arrays_need_not_be_contiguous() -> None:
-    original, decoded = (part.reshape(10, 20, 25) for part in pair(5000, np.float32))
-    mask = original > 0
-    assert squared_errors(
-        original[::2, :, ::-1], decoded[::2, :, ::-1], mask[::2, :, ::-1], 1.0
-    ) == squared_errors(
-        original[::2, :, ::-1].copy(), decoded[::2, :, ::-1].copy(), mask[::2, :, ::-1].copy(), 1.0
+RNG = np.random.default_rng(0)
+SOURCE = RNG.random((7, 4, 5, 6)).astype(np.float32)
+KEY_FRAMES = (1, 3, 4)
+MASKS = RNG.random((7, 4, 5, 6)) < 0.6
+
+
+def key_index(step: float) -> float:
+    return float(np.interp(step, KEY_FRAMES, np.arange(3)))
+
+
+def decoded(step: int) -> np.ndarray:
+    index = key_index(step)
+    around = MASKS[KEY_FRAMES[math.floor(index)]] | MASKS[KEY_FRAMES[math.ceil(index)]]
+    frame = SOURCE[step] + np.float32(0.01) * (step + 1)
+    return np.where(around, frame, np.float32(np.nan))
+
+
+def neighbours(source=SOURCE, read=None):
+    read = read or source.__getitem__
+    return neighbours_of(KEY_FRAMES, key_index, read, lambda step: MASKS[int(step)])
+
+
+def psnr(errors) -> float:
+    return -10 * math.log10(np.mean(np.concatenate(errors) ** 2))
+
+
+def quality_of(original, decode, steps, comparer, **options):
+    """The quality with the SSIM of all steps."""
+    return measure_quality(
+        comparer, original.__getitem__, decode, steps, list(range(steps)), **options
     )
-    assert range_and_sum(original[:, ::3]) == range_and_sum(original[:, ::3].copy())
+
+
+def test_figures_are_those_of_the_steps_and_of_the_interpolated_source() -> None:
+    quality = quality_of(SOURCE, decoded, 7, Comparer(1.0, 0.0), neighbours=neighbours()).between
+    own, linear, fringe, fringe_linear = [], [], [], []
+    mean = (SOURCE[1].astype(float) + SOURCE[3]) / 2
+    for step, frame in ((0, SOURCE[1]), (2, mean), (5, SOURCE[4]), (6, SOURCE[4])):
+        values = decoded(step)
+        there = np.isfinite(values)
+        own.append((values - SOURCE[step])[there])
+        linear.append((frame - SOURCE[step])[there])
+        if step == 2:
+            only_one = MASKS[1] ^ MASKS[3]
+            fringe.append((values - SOURCE[step])[only_one])
+            fringe_linear.append((frame - SOURCE[step])[only_one])
+    assert quality.psnr == pytest.approx(psnr(own), abs=1e-4)
+    assert quality.psnr_linear == pytest.approx(psnr(linear), abs=1e-4)
+    assert quality.psnr_fringe == pytest.approx(psnr(fringe), abs=1e-4)
+    assert quality.psnr_fringe_linear == pytest.approx(psnr(fringe_linear), abs=1e-4)
+    assert quality.fringe_fraction == len(fringe[0]) / sum(map(len, own))
+    keys = [(decoded(step) - SOURCE[step])[MASKS[step]] for step in KEY_FRAMES]
+    assert quality.psnr_key_frames == pytest.approx(psnr(keys), abs=1e-4)
+
+
+def test_vertices_that_a_key_frame_lacks_have_no_interpolated_source() -> None:
+    gaps = SOURCE.copy()
+    gaps[1, 0], gaps[3, 1] = np.nan, np.inf
+    found = neighbours(gaps)(2)
+    assert np.isfinite(found.interpolated()[2:]).all()
+    near = neighbours(gaps)
+    quality = quality_of(SOURCE, decoded, 7, Comparer(1.0, 0.0), neighbours=near).between
+    assert quality.psnr_linear is not None
+
+
+def test_huge_values_are_interpolated_without_overflow() -> None:
+    huge = np.full((7, 1, 1, 1), np.finfo(np.float64).max)
+    near = neighbours_of(KEY_FRAMES, key_index, huge.__getitem__, lambda step: huge[0] > 0)
+    assert np.isfinite(near(2).interpolated()).all()
+
+
+def test_quality_measures_the_coreset_and_the_domain() -> None:
+    original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
+    outside = np.random.default_rng(3).random(original.shape) < 0.4
+    outside[2] = True
+    decoded[outside] = np.nan
+    original[0, 0, 0, :2] = np.nan
+    calls = []
+    quality = quality_of(
+        original,
+        decoded.__getitem__,
+        4,
+        Comparer(1.0, 0.5),
+        progress=lambda *call: calls.append(call),
+    )
+    finite = np.isfinite(original)
+    inside = finite & ~outside
+    filled = np.where(outside, np.float32(0.5), decoded)
+    assert quality.rmse == pytest.approx(
+        math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2)), rel=1e-5
+    )
+    assert quality.rmse_domain == pytest.approx(
+        math.sqrt(np.mean((original - filled)[finite].astype(float) ** 2)), rel=1e-5
+    )
+    assert quality.psnr == pytest.approx(-20 * math.log10(quality.rmse))
+    assert quality.psnr_domain == pytest.approx(-20 * math.log10(quality.rmse_domain))
+    assert quality.max_abs_error == pytest.approx(
+        np.abs(original - decoded)[inside].max(), rel=1e-5
+    )
+    assert quality.max_abs_error_domain == pytest.approx(
+        np.abs(original - filled)[finite].max(), rel=1e-5
+    )
+    assert 0.9 < quality.ssim < 1
+    assert quality.ssim_window == {
+        "sigma": 1.5,
+        "window": 11,
+        "data_range": 1.0,
+        "steps": [0, 1, 2, 3],
+    }
+    figures = json.loads(json.dumps(quality.to_dict(), allow_nan=False))
+    overall = {
+        "psnr",
+        "rmse",
+        "max_abs_error",
+        "bulk",
+        "ssim",
+        "ssim_window",
+        "psnr_domain",
+        "rmse_domain",
+        "max_abs_error_domain",
+    }
+    assert set(figures) == overall | {"per_step", "between"}
+    assert [step["step"] for step in figures["per_step"]] == [0, 1, 2, 3]
+    assert figures["per_step"][2] == {"step": 2, "psnr": None, "rmse": None, "max_abs_error": None}
+    assert [call[:3] for call in calls] == [("measuring", step, 4) for step in (1, 2, 3, 4)]
+    # The note is of all steps so far, not of the last one, which has no PSNR here.
+    assert [calls[step][3] for step in (1, 2)] == [calls[1][3]] * 2
+    assert calls[3][3] == f"{figures['psnr']:.1f} dB so far"
+
+
+def test_the_bulk_is_measured_within_its_range_and_the_coreset() -> None:
+    original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
+    decoded[original > 0.75] += 1.0
+    decoded[np.random.default_rng(3).random(original.shape) < 0.4] = np.nan
+    comparer = Comparer(1.0, 0.5, ValueRange(0.25, 0.75))
+    quality = quality_of(original, decoded.__getitem__, 4, comparer)
+    inside = np.isfinite(decoded) & (original >= 0.25) & (original <= 0.75)
+    rmse = math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2))
+    assert quality.bulk.rmse == pytest.approx(rmse, rel=1e-5)
+    assert quality.bulk.psnr == pytest.approx(20 * math.log10(0.5 / rmse), rel=1e-6)
+    assert quality.bulk.psnr > 30 > quality.psnr
+    assert json.loads(json.dumps(quality.to_dict(), allow_nan=False))["bulk"] == {
+        "psnr": quality.bulk.psnr,
+        "rmse": quality.bulk.rmse,
+        "range": [0.25, 0.75],
+    }
+
+
+@pytest.mark.parametrize("held", [1, 8])
+def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held) -> None:
+    monkeypatch.setattr("fhash_codec.measure.metrics.FRAMES_HELD", held)
+    original, decoded = frames(9)
+    calls = []
+    quality = quality_of(
+        original,
+        decoded.__getitem__,
+        9,
+        Comparer(1.0, 0.0),
+        progress=lambda *call: calls.append(call),
+    )
+    assert [(call[1], call[2]) for call in calls] == [(step + 1, 9) for step in range(9)]
+    assert [step.step for step in quality.per_step] == list(range(9))
+    assert quality.max_abs_error == pytest.approx(np.abs(original - decoded).max())

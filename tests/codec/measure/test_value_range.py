@@ -1,24 +1,20 @@
-"""Ranks of many values in one pass: exact while they fit, then within the error that is told."""
+"""Ranges, ranks and likeness of values."""
 
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from skimage import metrics
 
-from fhash_codec.measure.value_range import (
-    PIECE,
-    Mean,
-    Ranks,
-    RanksSpan,
-    ValueRange,
-    pieces,
-    power_of_two,
-)
+from fhash_codec.measure.ssim import ssim, ssim_steps
+from fhash_codec.measure.value_range import Mean, Ranks, RanksSpan, ValueRange, power_of_two
 from fhash_formats.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -39,14 +35,6 @@ def ranks_of(values: np.ndarray, size: int, parts: int) -> Ranks:
     for part in np.array_split(values, parts):
         ranks.add(part)
     return ranks
-
-
-@pytest.mark.parametrize("beyond", [0, 1, 400, 19_999])
-@pytest.mark.parametrize("kind", KINDS)
-def test_values_that_fit_have_their_exact_ranks(kind: str, beyond: int) -> None:
-    ranks, ordered = ranks_of(KINDS[kind], 50_000, 7), np.sort(KINDS[kind])
-    assert ranks.error == 0
-    assert ranks.middle(beyond) == (ordered[beyond], ordered[-1 - beyond])
 
 
 @pytest.mark.parametrize("parts", [1, 13])
@@ -75,25 +63,6 @@ def test_ends_lie_outside_by_the_error_at_most(
 def test_an_end_that_is_not_known_is_infinite() -> None:
     ranks = ranks_of(np.arange(1000.0), 10, 1)
     assert ranks.middle(0) == (-math.inf, math.inf)
-
-
-def test_only_finite_values_count() -> None:
-    ranks = Ranks()
-    ranks.add(np.array([[np.nan, 3.0], [np.inf, 1.0]]))
-    ranks.add(np.full(3, np.nan))
-    assert ranks.count == 2
-    assert ranks.middle(0) == (1.0, 3.0)
-
-
-def test_the_error_is_small_where_memory_is() -> None:
-    """The whole blocks of n values give log2(n / size) n / (2 size) at most."""
-    size, count = 1 << 10, 1 << 18
-    ranks = ranks_of(np.random.default_rng(1).random(count), size, 5)
-    assert ranks.error == 8 * count // (2 * size)
-    low, high = ranks.middle(count // 100)
-    shift = abs(low - 0.01), abs(high - 0.99)
-    assert max(shift) < 3 * ranks.error / count
-    assert ranks.count == count
 
 
 @pytest.mark.parametrize("dtype", ["f4", "i2", "f8"])
@@ -170,40 +139,6 @@ def test_error_law_for_any_values(numbers) -> None:
     check_round_trip(np.array(numbers), min(numbers), max(numbers))
 
 
-@pytest.mark.parametrize("level", [0.0, -3.5, 1.7e308, 5e-324])
-def test_a_constant_range_gives_zero_and_comes_back_exactly(level) -> None:
-    value_range = ValueRange(level, level)
-    np.testing.assert_array_equal(
-        value_range.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
-    )
-    np.testing.assert_array_equal(value_range.from_unit([0.0, 0.3, 1.0]), [level] * 3)
-
-
-def test_missing_values_become_nan_and_stay_so() -> None:
-    value_range = ValueRange(-1.0, 1.0)
-    unit = value_range.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
-    np.testing.assert_array_equal(
-        unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32)
-    )
-    np.testing.assert_array_equal(
-        value_range.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
-    )
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64, np.uint64, np.float16, np.float32])
-def test_every_number_type(dtype) -> None:
-    values = np.array([[0, 1], [50, 100]], dtype=dtype)
-    np.testing.assert_allclose(
-        ValueRange(0.0, 100.0).to_unit(values), [[0, 0.01], [0.5, 1]], rtol=1e-7
-    )
-
-
-def test_pieces_do_not_change_the_result() -> None:
-    values = np.linspace(0, 1, 2 * PIECE + 5)
-    assert [part.size for part in pieces(values)] == [PIECE, PIECE, 5]
-    np.testing.assert_array_equal(ValueRange(0.0, 1.0).to_unit(values), values.astype(np.float32))
-
-
 @pytest.mark.parametrize(("low", "high"), [(1.0, 0.0), (np.nan, 1.0), (0.0, np.inf)])
 def test_a_pair_that_is_no_range_is_refused(low, high) -> None:
     with pytest.raises(InputError, match="lower first"):
@@ -244,3 +179,149 @@ def test_means_of_parts_make_that_of_the_whole() -> None:
         one.add(part)
         parts.join(one)
     assert (parts.count, parts.value()) == (whole.count, whole.value())
+
+
+SHAPES = [
+    (11, 11, 11),
+    (12, 64, 70),
+    (25, 40, 33),
+    (1, 60, 70),
+    (1, 1, 90),
+    (5, 30, 2),
+    (3, 4, 5),
+    (1, 1, 1),
+]
+
+
+def pair(shape, seed=0):
+    rng = np.random.default_rng(seed)
+    original = rng.random(shape)
+    return original, original + 0.1 * rng.standard_normal(shape)
+
+
+def blurred(field):
+    """The Gaussian mean around each vertex, mirrored at the borders, tap by tap."""
+    weights = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    weights /= weights.sum()
+    for axis in range(3):
+        size = field.shape[axis]
+        padded = np.pad(
+            field, [(5, 5) if a == axis else (0, 0) for a in range(3)], mode="symmetric"
+        )
+        field = sum(w * padded.take(range(i, i + size), axis) for i, w in enumerate(weights))
+    return field
+
+
+def similarity(a, b, data_range):
+    mean_a, mean_b = blurred(a), blurred(b)
+    variance_a, variance_b = blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    above = (2 * mean_a * mean_b + c1) * (2 * (blurred(a * b) - mean_a * mean_b) + c2)
+    return above / ((mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2))
+
+
+@pytest.mark.parametrize("shape", [(11, 11, 11), (12, 64, 70), (25, 40, 33), (1, 60, 70)], ids=str)
+@pytest.mark.parametrize("offset", [0.0, 300.0])
+def test_agrees_with_scikit_image(shape, offset) -> None:
+    original, decoded = (field + offset for field in pair(shape))
+    expected = metrics.structural_similarity(
+        original.squeeze(),
+        decoded.squeeze(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.2,
+    )
+    total, count = ssim(original, decoded, 1.2)
+    assert total / count == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_a_mask_counts_its_vertices_and_hides_the_rest(shape) -> None:
+    original, decoded = pair(shape)
+    mask = np.random.default_rng(4).random(shape) < 0.4
+    mask.flat[0] = False
+    expected = similarity(original, np.where(mask, decoded, original), 1.0)[mask]
+    decoded[~mask] = np.nan
+    total, count = ssim(original, decoded, 1.0, mask)
+    assert count == mask.sum()
+    assert total == pytest.approx(expected.sum(), rel=1e-9, abs=1e-12)
+
+
+def test_a_mask_of_everything_is_no_mask() -> None:
+    original, decoded = pair((12, 20, 13))
+    assert ssim(original, decoded, 1.0, np.ones(original.shape, bool)) == ssim(
+        original, decoded, 1.0
+    )
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_vertices_that_are_not_finite_do_not_count(masked) -> None:
+    original, decoded = pair((6, 7, 40))
+    bad = np.random.default_rng(5).random(original.shape) < 0.1
+    mask = (
+        np.random.default_rng(6).random(original.shape) < 0.5
+        if masked
+        else np.ones(original.shape, bool)
+    )
+    mean = original[~bad].mean()
+    one, other = (
+        np.where(bad, mean, original),
+        np.where(bad, mean, np.where(mask, decoded, original)),
+    )
+    counts = mask & ~bad
+    if not masked:
+        counts[..., :5] = counts[..., -5:] = False
+    original[bad], decoded[bad] = np.inf, np.nan
+    total, count = ssim(original, decoded, 1.0, mask if masked else None)
+    assert count == counts.sum()
+    assert total == pytest.approx(similarity(one, other, 1.0)[counts].sum(), rel=1e-9)
+
+
+def test_wrong_frames_are_refused() -> None:
+    original, decoded = pair((5, 6, 7))
+    with pytest.raises(InputError, match="one shape"):
+        ssim(original, decoded[1:], 1.0)
+    with pytest.raises(InputError, match="one shape"):
+        ssim(original[0], decoded[0], 1.0)
+    decoded[2, 2, 2] = np.nan
+    with pytest.raises(InputError, match="not finite"):
+        ssim(original, decoded, 1.0)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 7, 48, 1000])
+@pytest.mark.parametrize("vertices", [1, 1000, 2**20])
+@pytest.mark.parametrize("budget", [1, 2**21, 2**25])
+def test_measured_steps_are_even_within_budget_and_include_the_ends(
+    steps, vertices, budget
+) -> None:
+    chosen = ssim_steps(steps, vertices, budget)
+    assert len(chosen) == max(1, min(steps, budget // vertices))
+    assert len(chosen) == 1 or (chosen[0], chosen[-1]) == (0, steps - 1)
+    gaps = np.diff(chosen)
+    assert all(0 <= step < steps for step in chosen)
+    assert not len(gaps) or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
+
+
+MEMORY = """
+import resource
+import numpy as np
+from fhash_codec.measure.ssim import _Frames
+frame = np.zeros((16, 1200, 1200), np.float32)
+frame[3] = 1
+frames = _Frames(frame, frame, 1.0, None)
+with open("/proc/self/status") as status:
+    used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
+resource.setrlimit(resource.RLIMIT_DATA, (used + (64 << 20), used + (64 << 20)))
+try:
+    frames.similarity(((0, 16), (0, 1200), (0, 1200)))
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's limits on memory")
+def test_no_memory_for_a_tile_is_said_and_ends_no_process() -> None:
+    done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "no memory to compare" in done.stdout

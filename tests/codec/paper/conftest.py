@@ -1,19 +1,32 @@
-"""Random networks of many shapes, and the 16-corner formula in float64 that they are held to."""
+"""Networks, coresets and trainings of the profile paper, and the formulas that they are held to."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 
+import fhash_codec
+from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
-from fhash_codec.paper.network import ArrayTable, Network, level_resolutions
+from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
+from fhash_codec.features.scan import scan
+from fhash_codec.paper.encode import Selection, select
+from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.network import Architecture, ArrayTable, Floats, Network, level_resolutions
+from fhash_codec.paper.tables import Bricks, TrainedTable, trained_tables
+from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
+from fhash_codec.progress import silent
+from fhash_formats.series import ArraySeries
 
 Points = list[npt.NDArray[np.float64]]
 """Key indices, z, y and x of points, each (n,)."""
@@ -155,3 +168,201 @@ def network(request: pytest.FixtureRequest) -> Network:
     """A random network of each shape."""
     make: Callable[..., Network] = Networks.random
     return make(*request.param)
+
+
+def _noise_coreset(
+    shape: tuple[int, int, int, int], low: float = 0.3, fringe: bool = False
+) -> Coreset:
+    series = ArraySeries(np.random.default_rng(3).random(shape, dtype=np.float32))
+    scanned = scan(series, silent)
+    return build_coreset(
+        series, scanned, FeatureChoice(range(shape[0]), [Interval(low, 1.0)]), silent, fringe=fringe
+    )
+
+
+def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
+    return np.unpackbits(coreset.mask_bits, axis=1, count=prod(coreset.brick_shape)).astype(bool)
+
+
+def _trained(coreset: Coreset, settings: dict[str, Any], name: str, device: str) -> dict[str, Any]:
+    """Train an engine, go on from its state in another one, and return what came of it."""
+    key_frames, samples = len(coreset.key_frames), len(coreset.values)
+    architecture = Architecture.for_box(coreset.box.shape, key_frames, **{"width": 16, **settings})
+    plan = plan_training(
+        coreset, epochs=1, learning_rate=0.01, schedule="constant", batch=samples // 4 + 1, seed=0
+    )
+    rates = np.append(plan.rates, [0.01, 0.01])
+
+    def new() -> Any:
+        return make_engine(name, architecture, coreset, rates, seed=7, device=torch.device(device))
+
+    first, second, every = new(), new(), np.arange(len(coreset.bricks))
+    train(first, plan, coreset, TrainingProgress())
+    second.restore({name: np.array(array) for name, array in first.state().items()})
+    for _ in range(2):
+        error = float(second.train(every[::2].copy()))
+    psnr, values = Probe(coreset).psnr(second), second.infer(every)
+    assert values.device.type == device
+    second.settle()
+    parameters = second.parameters()
+    return {
+        "error": error,
+        "psnr": psnr,
+        "values": values.cpu().numpy(),
+        **{part: getattr(parameters, part).numpy() for part in ("fine", "coarse", "network")},
+    }
+
+
+@pytest.fixture(scope="session")
+def trained() -> Callable[..., dict[str, Any]]:
+    """A function of (coreset, settings, name, device): what a training and a continuation give."""
+    return _trained
+
+
+@pytest.fixture(scope="session")
+def noise_coreset() -> Callable[..., Coreset]:
+    """A function of (shape, low, fringe): noise; values from `low` to 1 are the feature."""
+    return _noise_coreset
+
+
+@pytest.fixture(scope="session")
+def in_coreset() -> Callable[[Coreset], npt.NDArray[np.bool_]]:
+    """A function of a coreset: which vertices (bricks, vertices) of its bricks are samples."""
+    return _in_coreset
+
+
+CODED = EncodeConfig(
+    profile="paper", epochs=6, width=16, fold=2, embedding_size=2, tables="transform"
+)
+
+
+def _waves(shape: tuple[int, ...] = (5, 9, 12, 20)) -> npt.NDArray[np.float32]:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    return (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def waves() -> Callable[..., npt.NDArray[np.float32]]:
+    """A function of a shape: a smooth moving field."""
+    return _waves
+
+
+@pytest.fixture(scope="session")
+def coded_config() -> EncodeConfig:
+    """Settings of a short training whose tables are coded."""
+    return CODED
+
+
+@pytest.fixture(scope="session", params=["all", "feature", "one", "three"])
+def pair(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[dict[str, Any], Path]]:
+    """The figures and paths of one training: `exact`, its tables as float32, and `coded`."""
+    settings: dict[str, dict[str, Any]] = {
+        "all": {},
+        "feature": {"features": ("interval:50:200",), "dilation": 0},
+        "one": {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
+        "three": {"embedding_size": 3, "key_frames": "0,2,4", "features": ("interval:20:300",)},
+    }
+    folder = tmp_path_factory.mktemp("coded")
+    config = replace(CODED, **settings[request.param])
+    files = {}
+    for name, tables in {"exact": "float32", "coded": "transform"}.items():
+        path = folder / f"{name}.fhz"
+        files[name] = (fhash_codec.encode(_waves(), path, replace(config, tables=tables)), path)
+    return files
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomModel:
+    """A coreset in which many vertices do not count, and random numbers in place of a training."""
+
+    field: npt.NDArray[np.float32]
+    selection: Selection
+    bricks: Bricks
+    fine: Floats
+    tables: list[Floats]
+    layers: tuple[tuple[Floats, Floats], ...]
+    trained: list[TrainedTable]
+
+    def network(self, fill: float | None = None) -> Network:
+        """The network, with `fill` in place of embeddings that are not needed."""
+        architecture = self.selection.architecture
+        tables = []
+        for table in self.trained:
+            region = tuple(slice(0, n) for n in table.shape)
+            values = table.read(region)
+            if fill is not None:
+                values = np.where(table.needed(region)[..., None], values, np.float32(fill))
+            tables.append(ArrayTable(values))
+        return Network(
+            levels=architecture.levels,
+            embedding_size=architecture.embedding_size,
+            tables=tables,
+            layers=self.layers,
+            box_size=architecture.box_size,
+            key_frames=architecture.key_frames,
+        )
+
+
+@pytest.fixture(scope="session")
+def random_model() -> RandomModel:
+    config = replace(CODED, features=("interval:100:200",), dilation=0)
+    field = _waves()
+    selection = select(ArraySeries(field), config, silent)
+    architecture, coreset = selection.architecture, selection.coreset
+    random = np.random.default_rng(0)
+    size = architecture.embedding_size
+    fine = random.random((size, len(coreset.values)), dtype=np.float32)
+    tables = [random.random((prod(level), size), np.float32) for level in architecture.levels[1:]]
+    layers = tuple(
+        (
+            random.standard_normal(shape).astype(np.float32),
+            random.random(shape[0], dtype=np.float32),
+        )
+        for shape in architecture.layer_shapes
+    )
+    bricks = Bricks(coreset)
+    return RandomModel(
+        field=field,
+        selection=selection,
+        bricks=bricks,
+        fine=fine,
+        tables=tables,
+        layers=layers,
+        trained=trained_tables(architecture, coreset, bricks, fine, tables),
+    )
+
+
+def _coreset(bend: float) -> Coreset:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 12, 20, 36)), indexing="ij")
+    values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
+    series = ArraySeries(values + bend * values**2)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(range(3), [Everything()]), silent
+    )
+
+
+@pytest.fixture(scope="session")
+def coreset() -> Coreset:
+    return _coreset(0.0)
+
+
+@pytest.fixture(scope="session")
+def other_coreset() -> Coreset:
+    """The same vertices with other values."""
+    return _coreset(0.5)
+
+
+@pytest.fixture(scope="session")
+def setup() -> Callable[..., Any]:
+    """A function of a coreset and settings: the plan and a slab engine."""
+
+    def make(coreset: Coreset, epochs: int = 4, **settings: Any) -> Any:
+        usual = {"learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
+        plan = plan_training(coreset, epochs=epochs, **usual | settings)
+        architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
+        device = torch.device("cpu")
+        return plan, make_engine("slab", architecture, coreset, plan.rates, seed=5, device=device)
+
+    return make

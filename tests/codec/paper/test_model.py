@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import replace
-from fractions import Fraction
-from itertools import pairwise, product
+from itertools import product
 from math import prod
 
 import numpy as np
@@ -21,12 +19,9 @@ from fhash_codec.paper.model import (
     PaperModel,
     PointSampler,
     PointTables,
-    corners_before,
-    decode_region,
-    input_slopes,
     sample_points,
 )
-from fhash_codec.paper.network import Architecture, ArrayTable, Network, level_resolutions
+from fhash_codec.paper.network import Architecture, Network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
 
@@ -52,37 +47,9 @@ def test_points_on_vertices_have_the_values_of_a_region(model) -> None:
     np.testing.assert_allclose(values, frame.ravel(), atol=1e-5 * np.ptp(frame))
 
 
-def test_occupancy_between_key_frames_is_that_of_both(model) -> None:
-    paper, size = model
-    box = Box.of_shape(size)
-    both = paper.occupied(0, 1, box)
-    np.testing.assert_array_equal(both, paper.occupied(0, 0, box) | paper.occupied(1, 1, box))
-    np.testing.assert_array_equal(
-        paper.occupied(0, 1, Box((1, 2), (0, 3), (2, 4))), both[1:2, :3, 2:4]
-    )
-
-
 def test_there_are_no_levels_of_detail(model) -> None:
     with pytest.raises(InputError, match="no levels of detail; decode it whole"):
         model[0].read_lod(0, 1, Box.of_shape((1, 1, 1)))
-
-
-def test_values_match_the_sixteen_corner_formula(networks, network) -> None:
-    for key_index in networks.key_indices(network):
-        vertices = networks.vertices(network, key_index)
-        np.testing.assert_allclose(
-            sample_points(network, *vertices),
-            networks.reference(network, vertices),
-            rtol=1e-5,
-            atol=1e-5,
-        )
-    scattered = networks.points(network, 500)
-    np.testing.assert_allclose(
-        sample_points(network, *scattered),
-        networks.reference(network, scattered),
-        rtol=1e-5,
-        atol=1e-5,
-    )
 
 
 def test_values_and_gradients_are_those_of_the_papers_model_by_autograd(networks, network) -> None:
@@ -115,94 +82,6 @@ def test_values_and_gradients_are_those_of_the_papers_model_by_autograd(networks
         close = np.isclose(slopes[:, axis], exact, rtol=1e-4, atol=1e-4)
         # Near a ReLU's kink float32 may take the other side.
         assert close.mean() > 0.98
-
-
-def test_gradients_match_central_differences(networks, network) -> None:
-    scattered = networks.points(network, 400, seed=2)
-    values, slopes = sample_points(network, *scattered, gradient=True)
-    np.testing.assert_array_equal(values, sample_points(network, *scattered))
-    assert slopes.shape == (400, 4)
-    step = 1e-5
-    for axis, size in enumerate((network.key_frames, *network.box_size)):
-        if size == 1:
-            assert not slopes[:, axis].any()
-            continue
-        after, before = [list(scattered) for _ in range(2)]
-        after[axis] = np.minimum(scattered[axis] + step, size - 1)
-        before[axis] = np.maximum(scattered[axis] - step, 0)
-        difference = networks.reference(network, after) - networks.reference(network, before)
-        expected = difference / (after[axis] - before[axis])
-        close = np.abs(slopes[:, axis] - expected) <= 1e-4 * (1 + np.abs(expected))
-        # A few differences straddle the kink of a ReLU or the border of a cell.
-        assert close.mean() > 0.97
-
-
-@pytest.mark.parametrize(
-    "shape", [((5, 9, 17), 6, 2), ((1, 12, 2), 1, 3), ((7, 1, 10), 3, 2)], ids=str
-)
-def test_a_linear_field_and_its_gradient_are_reproduced(networks, shape) -> None:
-    box, key_frames, fold = shape
-    levels = level_resolutions(box, key_frames, fold)
-    sizes, slope = np.array((key_frames, *box)), np.array([0.5, -0.25, 0.125, 0.375])
-    tables = []
-    for level in levels:
-        corners = np.stack(
-            np.meshgrid(
-                *(np.linspace(0, s - 1, r) for s, r in zip(sizes, level, strict=True)),
-                indexing="ij",
-            ),
-            axis=-1,
-        )
-        tables.append(ArrayTable((corners @ slope)[..., None].astype(np.float32)))
-    readout = (np.full((1, len(levels)), 1 / len(levels), np.float32), np.array([2.0], np.float32))
-    net = Network(
-        levels=levels,
-        embedding_size=1,
-        tables=tables,
-        layers=(readout,),
-        box_size=box,
-        key_frames=key_frames,
-    )
-    # Cell borders and both ends too: the derivative is one-sided there, never missing.
-    scattered = [
-        np.concatenate([p, [0, s - 1, s // 2]])
-        for p, s in zip(networks.points(net, 200), sizes, strict=True)
-    ]
-    values, slopes = sample_points(net, *scattered, gradient=True)
-    np.testing.assert_allclose(values, 2 + slope @ np.array(scattered), atol=1e-5)
-    np.testing.assert_allclose(
-        slopes, np.broadcast_to(np.where(sizes > 1, slope, 0), slopes.shape), atol=1e-5
-    )
-    middle = 0.5 * (key_frames - 1)
-    frame = decode_region(net, middle, networks.box(net))
-    np.testing.assert_allclose(
-        frame.ravel(), 2 + slope @ np.array(networks.vertices(net, middle)), atol=1e-5
-    )
-
-
-def test_the_derivative_on_a_border_is_that_of_the_cell_after_it() -> None:
-    table = np.array([0, 1, 3, 7], np.float32).reshape(1, 1, 1, 4, 1)
-    readout = (np.ones((1, 1), np.float32), np.zeros(1, np.float32))
-    net = Network(
-        levels=((1, 1, 1, 4),),
-        embedding_size=1,
-        tables=[ArrayTable(table)],
-        layers=(readout,),
-        box_size=(1, 1, 4),
-        key_frames=1,
-    )
-    values, slopes = sample_points(net, 0, 0, 0, [0.0, 1.0, 2.0, 3.0], gradient=True)
-    assert values.tolist() == [0, 1, 3, 7]
-    assert slopes[:, 3].tolist() == [1, 2, 4, 4]
-
-
-def test_half_precision_tables_give_the_values_of_their_float32_numbers(networks) -> None:
-    half = networks.random((5, 12, 21), 4, 2, 2, 1, dtype=np.float16)
-    full = replace(
-        half, tables=[ArrayTable(table.values.astype(np.float32)) for table in half.tables]
-    )
-    scattered = networks.points(half, 50)
-    np.testing.assert_array_equal(sample_points(half, *scattered), sample_points(full, *scattered))
 
 
 def test_points_far_apart_are_read_apart_and_come_out_alike(networks, monkeypatch) -> None:
@@ -252,43 +131,6 @@ def test_wrong_arguments_are_refused(networks) -> None:
         sample_points(net, [0, 0, 0], 0, 0, [1, 2])
     with pytest.raises(InputError, match="one length"):
         sample_points(net, np.zeros((2, 2)), 0, 0, 0)
-
-
-def test_slopes_by_the_inputs_are_differences() -> None:
-    architecture = Architecture.for_box((4, 6, 9), 3, width=8)
-    random = np.random.default_rng(0)
-    tables = [
-        random.standard_normal((*level, 2)).astype(np.float32) for level in architecture.levels
-    ]
-    layers = tuple(
-        (random.standard_normal((n, m)).astype(np.float32) / 4, random.random(n, dtype=np.float32))
-        for m, n in pairwise([architecture.inputs, 8, 1])
-    )
-
-    def network() -> Network:
-        return Network(
-            levels=architecture.levels,
-            embedding_size=2,
-            tables=[ArrayTable(table) for table in tables],
-            layers=layers,
-            box_size=architecture.box_size,
-            key_frames=3,
-        )
-
-    vertices = np.array([[0, 1, 2, 2], [3, 0, 1, 2], [5, 4, 0, 1], [8, 0, 3, 7]], dtype=np.float64)
-    slopes = input_slopes(network(), vertices)
-    assert slopes.shape == (architecture.inputs, 4)
-    for number, table in enumerate(tables):
-        for e in range(2):
-            # A shift of the whole level shifts every interpolated embedding by as much.
-            values = []
-            for shift in (1e-3, -1e-3):
-                table[..., e] += np.float32(shift)
-                values.append(sample_points(network(), *vertices))
-                table[..., e] -= np.float32(shift)
-            difference = np.subtract(*values) / 2e-3
-            close = np.isclose(slopes[2 * number + e], difference, atol=5e-3, rtol=0.02)
-            assert close.sum() >= 3  # a kink of the network may lie between
 
 
 SHAPES = [
@@ -358,101 +200,9 @@ def test_tables_at_one_time_give_the_same_bits(library, networks, network) -> No
         np.testing.assert_array_equal(once, values)
 
 
-def test_few_points_of_one_time_have_the_bits_of_many(networks, library, monkeypatch) -> None:
-    network = networks.random((20, 21, 22), 5, 2, 2, 1)
-    places = [np.array([2.3]), *networks.points(network, 2000)[1:]]
-    values = sample_points(network, *places)
-    once = []
-    at = PointTables.at
-    monkeypatch.setattr(
-        PointTables, "at", lambda self, key, path: once.append(key) or at(self, key, path)
-    )
-    np.testing.assert_array_equal(sample_points(network, *places), values)
-    few = [places[0], *(p[:5] for p in places[1:])]
-    monkeypatch.setattr(points, "READ_PER_POINT", 0)
-    np.testing.assert_array_equal(sample_points(network, *few), values[:5])
-    assert once == [2.3]
-
-
-def test_points_beside_borders_are_read_where_they_are_evaluated(networks, library) -> None:
-    """One point a call: a cell that was not read would show at once."""
-    network = networks.random((7, 50, 125), 3, 2, 2, 1)
-    for level in network.levels[1:4]:
-        border = [
-            k * (s - 1) / max(r - 1, 1)
-            for k, s, r in zip((1, 2, 11, 29), (3, 7, 50, 125), level, strict=True)
-        ]
-        border = [min(b, s - 1.0) for b, s in zip(border, (3, 7, 50, 125), strict=True)]
-        for end in (0.0, 1e9):
-            place = [
-                min(float(np.nextafter(b, end)), s - 1.0)
-                for b, s in zip(border, (3, 7, 50, 125), strict=True)
-            ]
-            np.testing.assert_allclose(
-                sample_points(network, *place),
-                networks.reference(network, [np.array([p]) for p in place]),
-                rtol=1e-5,
-                atol=1e-5,
-            )
-
-
-def test_strided_places_and_several_threads_change_nothing(networks, library) -> None:
-    network = networks.random((20, 21, 22), 5, 2, 2, 1)
-    rows = np.stack(networks.points(network, 100_000), axis=1)
-    apart = sample_points(network, *np.ascontiguousarray(rows.T), threads=1)
-    np.testing.assert_array_equal(sample_points(network, *rows.T, threads=4), apart)
-
-
 def test_a_path_that_is_not_there_is_refused(networks, library) -> None:
     network = networks.random((2, 3, 4), 1, 2, 2, 1)
     sampler = PointSampler(PointTables.of_box(network, 0), path=3)
     with pytest.raises(MemoryError):
         sampler.evaluate([np.zeros(1)] * 4, np.empty(1, np.float32))
     assert best_path(library) == max(paths(library))
-
-
-def test_layers_that_overflow_stay_so(networks, library) -> None:
-    network = networks.random((2, 3, 4), 2, 2, 2, 2)
-    huge = tuple((np.full_like(weight, 3e38), bias) for weight, bias in network.layers)
-    assert not np.isfinite(sample_points(replace(network, layers=huge), 0.5, 1, 1, 1)).any()
-
-
-def test_a_part_holds_the_corners_of_all_points(networks, network) -> None:
-    recording = networks.recording(network)
-    points = np.array(networks.points(network, 7))
-    tables = PointTables.read(recording, points.min(axis=1).tolist(), points.max(axis=1).tolist())
-    for level, patch in zip(network.levels, tables.patches, strict=True):
-        before = np.array([corners_before(tables.sizes, level, point) for point in points.T])
-        last = np.minimum(before + 1, np.array(level) - 1)
-        assert (before.min(axis=0) == patch.first).all()
-        assert (last.max(axis=0) < np.add(patch.first, patch.values.shape[:4])).all()
-    assert all(len(table.regions) == 1 for table in recording.tables)
-
-
-def test_tables_at_one_time_are_those_between_its_nodes(networks) -> None:
-    network = networks.random((4, 5, 6), 5, 2, 2, 1, dtype=np.float16)
-    tables = PointTables.of_box(network, 1.7)
-    still = tables.at(1.7)
-    assert (still.still, tables.still) == (True, False)
-    assert still.at(0.0) is still
-    for level, patch, table in zip(network.levels, still.patches, network.tables, strict=True):
-        position = 1.7 * (level[0] - 1) / 4
-        node = int(position)
-        low, high = table.values[node].astype(float), table.values[node + 1].astype(float)
-        expected = low + (position - node) * (high - low)
-        np.testing.assert_allclose(patch.values[0], expected, rtol=1e-6, atol=1e-6)
-        assert patch.values.dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("size", "resolution"), [(125, 63), (80, 41), (7, 3), (997, 499), (50, 2), (1, 1), (64, 64)]
-)
-def test_points_beside_a_border_lie_in_the_exact_cell(size: int, resolution: int) -> None:
-    """The native library finds cells without a quotient: it must find the same, which were read."""
-    borders = np.arange(1, resolution - 1) * (size - 1) / max(resolution - 1, 1)
-    places = np.concatenate([borders, *(np.nextafter(borders, end) for end in (0, size))])
-    places = np.append(places, [0.0, size - 1.0])
-    before = [corners_before((size,) * 4, (resolution,) * 4, [at] * 4)[0] for at in places]
-    scaled = [Fraction(float(place * (resolution - 1))) for place in places]
-    exact = [min(at // max(size - 1, 1), max(resolution - 2, 0)) for at in scaled]
-    assert before == exact

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 from readable_paper import FHash
 
+from fhash_codec.paper import network as ranked
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import (
     Architecture,
-    ArrayTable,
     NumberType,
-    axis_resolutions,
+    RankedBits,
+    SparseFrame,
+    between,
     ceil_log,
     level_resolutions,
     parameter_count,
@@ -34,23 +38,6 @@ def test_parameters_are_those_of_the_model(settings) -> None:
     model = FHash(architecture, tables, layers)
     assert sum(p.numel() for p in model.parameters()) == architecture.parameters
     assert architecture.parameters > parameter_count(architecture.levels, size)
-
-
-def test_the_defaults_are_the_papers() -> None:
-    architecture = Architecture.for_box((54, 110, 200), 10)
-    assert architecture.sizes == architecture.levels[0] == (10, 54, 110, 200)
-    assert len(architecture.levels) == 8  # ceil(log2 200)
-    assert architecture.inputs == 16
-    assert architecture.layer_shapes == [(64, 16), (64, 64), (1, 64)]
-
-
-@pytest.mark.parametrize(
-    ("box", "parameters"),
-    [((54, 110, 200), 25_374_176), ((185, 183, 156), 112_857_968)],
-    ids=["combustion", "supernova"],
-)
-def test_the_papers_parameter_counts(box, parameters):
-    assert parameter_count(level_resolutions(box, 10, 2), 2) == parameters
 
 
 @pytest.mark.parametrize("base", range(2, 12))
@@ -73,11 +60,6 @@ def test_levels_follow_the_papers_rule(fold, box, key_frames):
     for finer, coarser in pairwise(levels):
         for before, after in zip(finer, coarser, strict=True):
             assert after == (1 if before == 1 else -(-before // fold) if before > fold else 2)
-
-
-def test_an_axis_of_one_vertex_stays_one_and_a_short_one_is_padded_with_two():
-    assert axis_resolutions(1, 2, 4) == [1, 1, 1, 1]
-    assert axis_resolutions(5, 2, 5) == [5, 3, 2, 2, 2]
 
 
 def test_a_network_whose_parts_do_not_fit_is_refused(networks) -> None:
@@ -112,23 +94,6 @@ def test_a_table_that_is_not_finite_is_refused_not_decoded(networks, bad) -> Non
         sample_points(net, 0, 0, 0, 0)
 
 
-@pytest.mark.parametrize("gradient", [False, True])
-def test_weights_that_overflow_give_no_warning(networks, gradient) -> None:
-    """Hostile files may hold such weights."""
-    net = networks.random((2, 3, 4), 2, 2, 2, 2)
-    huge = np.float32(3e38)
-    mixed = tuple((np.where(weight > 0, huge, -huge), bias) for weight, bias in net.layers)
-    positive = tuple((np.full_like(weight, huge), bias) for weight, bias in net.layers)
-    tables = [ArrayTable(np.abs(table.values) + 1) for table in net.tables]
-    points = np.full((4, 3), 0.5)
-    for hostile in (replace(net, layers=mixed), replace(net, layers=positive, tables=tables)):
-        result = sample_points(hostile, *points, gradient=gradient)
-        frame = decode_region(hostile, 0.5, ((0, 2), (0, 3), (0, 4)))
-    values = result[0] if gradient else result
-    assert not np.isfinite(values).any()
-    assert not np.isfinite(frame).any()
-
-
 def test_unsigned_numbers_span_the_range_and_zero() -> None:
     values = np.array([2.0, 5.0], np.float32)
     kind = NumberType.of(values, "uint8")
@@ -137,10 +102,54 @@ def test_unsigned_numbers_span_the_range_and_zero() -> None:
     assert kind.attributes == {"offset": 0.0, "scale": 5.0 / 255}
 
 
-@pytest.mark.parametrize("name", ["float16", "float32"])
-def test_floats_are_stored_as_they_are(name: str) -> None:
-    values = np.array([[0.25, -3.5]], np.float32)
-    kind = NumberType.of(values, name)
-    assert kind.stored(values).dtype == name
-    np.testing.assert_array_equal(kind.stored(values), values)
-    assert kind.attributes == {}
+SHAPE = (5, 7, 13)
+
+
+def mask_of(share: float, shape: tuple[int, ...] = SHAPE, seed: int = 0) -> npt.NDArray[np.bool_]:
+    return np.random.default_rng(seed).random(shape) < share
+
+
+def frame_of(
+    share: float, dtype: str = "float32", seed: int = 0
+) -> tuple[SparseFrame, npt.NDArray[np.floating[Any]]]:
+    """A sparse frame and the same embeddings with 0 at the vertices that it does not hold."""
+    mask = mask_of(share, seed=seed)
+    held = np.random.default_rng(seed).normal(size=(int(mask.sum()), 3)).astype(dtype)
+    dense = np.zeros((*SHAPE, 3), dtype)
+    dense[mask] = held
+    return SparseFrame.of(mask, held), dense
+
+
+def bits_of(mask: npt.NDArray[np.bool_]) -> RankedBits:
+    return RankedBits.of_octets(np.packbits(mask, bitorder="little"))
+
+
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 255, 256, 257, 1000, 4096])
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 1.0])
+def test_a_rank_is_the_number_of_ones_before(size: int, share: float) -> None:
+    mask = mask_of(share, (size,))
+    bits = bits_of(mask)
+    expected = np.where(mask, np.cumsum(mask) - 1, mask.sum())
+    np.testing.assert_array_equal(bits.lookup(np.arange(size)), expected)
+    np.testing.assert_array_equal(bits.positions(), np.flatnonzero(mask))
+    assert bits.count == mask.sum()
+
+
+def test_more_ones_than_a_count_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ranked, "MAX_COUNT", 99)
+    with pytest.raises(InputError, match="needs 100 vertices at one time; at most 99"):
+        bits_of(np.ones(100, np.bool_))
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+def test_a_frame_between_two_has_the_bits_of_dense_ones(dtype: str) -> None:
+    (before, dense_before), (after, dense_after) = (
+        frame_of(share, dtype, seed) for share, seed in ((0.2, 3), (0.3, 4))
+    )
+    weight = np.float32(0.3)
+    mixed = between(before, after, weight)
+    dense = dense_before * np.float32(1 - weight) + dense_after * weight
+    whole = tuple(slice(0, n) for n in SHAPE)
+    np.testing.assert_array_equal(mixed.read(whole), dense)
+    assert mixed.values.dtype == np.float32
+    assert mixed.bits.count < before.bits.count + after.bits.count

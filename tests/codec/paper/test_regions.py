@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import prod
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 
 from fhash_codec.paper import model as points
 from fhash_codec.paper.model import decode_region, sample_points
-from fhash_codec.paper.network import ArrayTable
 from fhash_formats.errors import InputError, RegionError
 
 
@@ -33,45 +31,11 @@ def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(
             np.testing.assert_array_equal(cut, frame[tuple(slice(*r) for r in region)])
 
 
-def test_the_law_holds_for_the_default_network(networks) -> None:
-    net = networks.random((25, 40, 75), 3, 2, 2, 1, width=64)
-    frame = decode_region(net, 0.4, networks.box(net), threads=4)
-    for region in [
-        ((0, 25), (0, 40), (0, 75)),
-        ((3, 19), (11, 27), (50, 66)),
-        ((24, 25), (39, 40), (74, 75)),
-    ]:
-        np.testing.assert_array_equal(
-            decode_region(net, 0.4, region, threads=2), frame[tuple(slice(*r) for r in region)]
-        )
-
-
 def test_regions_match_the_sixteen_corner_formula(networks, network) -> None:
     for key_index in networks.key_indices(network):
         frame = decode_region(network, key_index, networks.box(network))
         expected = networks.reference(network, networks.vertices(network, key_index))
         np.testing.assert_allclose(frame.ravel(), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_a_vertex_on_a_corner_has_exactly_its_embedding(networks) -> None:
-    net = networks.random((6, 20, 40), 3, 2, 1, 0)
-    weight = np.zeros((1, net.inputs), np.float32)
-    weight[0, 0] = 1
-    net = replace(net, layers=((weight, np.zeros(1, np.float32)),))
-    for key in range(3):
-        np.testing.assert_array_equal(
-            decode_region(net, key, networks.box(net)), net.tables[0].values[key, ..., 0]
-        )
-
-
-def test_half_precision_tables_decode_as_their_float32_numbers(networks) -> None:
-    half = networks.random((5, 12, 21), 4, 2, 2, 1, dtype=np.float16)
-    full = replace(
-        half, tables=[ArrayTable(table.values.astype(np.float32)) for table in half.tables]
-    )
-    np.testing.assert_array_equal(
-        decode_region(half, 1.3, networks.box(half)), decode_region(full, 1.3, networks.box(full))
-    )
 
 
 def test_vertices_are_points_and_those_that_nobody_requested_are_nan(networks) -> None:

@@ -1,23 +1,31 @@
-"""The fringe in the finest table: rounded alone, and to a step that follows from its numbers."""
+"""The model in its file: number types, sparse tables beside dense ones, and damage."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
 from math import prod
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Interval
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
 from fhash_codec.features.scan import scan
-from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
+from fhash_codec.paper.network import Architecture, Network, level_resolutions
 from fhash_codec.paper.storage import (
+    Needed,
+    SparseTable,
     StoredTable,
     fringe_step,
-    mix_components,
+    needed_by,
     round_fringe,
     table_chunk,
     write_tables,
@@ -35,7 +43,9 @@ def coreset_of(fringe: bool) -> Coreset:
         values[step, 2 * step : 2 * step + 2] = 1.0
     series = ArraySeries(values)
     scanned = scan(series, silent)
-    return build_coreset(series, scanned, range(3), [Interval(0.5, 2.0)], 0, silent, fringe=fringe)
+    return build_coreset(
+        series, scanned, FeatureChoice(range(3), [Interval(0.5, 2.0)]), silent, fringe=fringe
+    )
 
 
 @pytest.fixture
@@ -65,17 +75,6 @@ def test_only_the_fringe_is_rounded_and_by_half_a_step_at_most(coreset, scale) -
         assert not np.signbit(rounded[~inside][rounded[~inside] == 0]).any()
 
 
-def test_the_step_is_a_power_of_two_below_half_of_the_root_mean_square(coreset) -> None:
-    table = finest()
-    outside = np.concatenate(
-        [table(key)[~unpack(coreset.occupancy[key], coreset.box.shape)].ravel() for key in range(3)]
-    )
-    root = np.sqrt(np.mean(outside[outside != 0].astype(float) ** 2))
-    step = fringe_step(coreset, 3, table)
-    assert np.log2(step) == np.floor(np.log2(step))
-    assert step <= root / 2 < 2 * step
-
-
 def test_without_a_fringe_nothing_is_rounded(coreset) -> None:
     assert fringe_step(coreset, 3, lambda key: np.zeros((6, 5, 7, 2), np.float32)) is None
     table = finest()
@@ -83,9 +82,11 @@ def test_without_a_fringe_nothing_is_rounded(coreset) -> None:
 
 
 @pytest.fixture(scope="module")
-def coreset_storage() -> Coreset:
+def tiny() -> Coreset:
     series = ArraySeries(np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5))
-    return build_coreset(series, scan(series, silent), range(2), [Everything()], 0, silent)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(range(2), [Everything()]), silent
+    )
 
 
 class Stored:
@@ -99,34 +100,28 @@ class Stored:
         return self.values
 
 
-def written(coreset_storage: Coreset, kind: str, values: list[float]) -> np.ndarray:
+def written(tiny: Coreset, kind: str, values: list[float]) -> np.ndarray:
     """The coarsest table as it is read back, of a model with `values` first in every level."""
-    architecture = Architecture.for_box(coreset_storage.box.shape, 2, embedding_size=1)
-    fine = np.zeros((1, len(coreset_storage.values)), np.float32)
+    architecture = Architecture.for_box(tiny.box.shape, 2, embedding_size=1)
+    fine = np.zeros((1, len(tiny.values)), np.float32)
     tables = [np.zeros((prod(level), 1), np.float32) for level in architecture.levels[1:]]
     for table in (fine, *tables):
         table.reshape(-1)[: len(values)] = values
     stored = Stored()
-    write_tables(stored, architecture, coreset_storage, fine, tables, kind)
+    write_tables(stored, architecture, tiny, fine, tables, kind)
     return StoredTable(stored).read(())
 
 
 @pytest.mark.parametrize("kind", ["float32", "float16", "uint8"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_not_finite_are_refused(coreset_storage, kind, value) -> None:
+def test_numbers_that_are_not_finite_are_refused(tiny, kind, value) -> None:
     with pytest.raises(InputError, match="not finite"):
-        written(coreset_storage, kind, [0.5, value])
+        written(tiny, kind, [0.5, value])
 
 
-@pytest.mark.parametrize("value", [65505.0, -65536.0, 1e9])
-def test_what_half_precision_does_not_hold_is_refused(coreset_storage, value) -> None:
-    with pytest.raises(InputError, match=r"more than float16 holds; use --tables float32"):
-        written(coreset_storage, "float16", [value])
-
-
-def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset_storage) -> None:
+def test_a_range_that_eight_bits_cannot_give_back_is_refused(tiny) -> None:
     with pytest.raises(InputError, match=r"more than uint8 holds; use --tables float32"):
-        written(coreset_storage, "uint8", [-3e38, 3e38])
+        written(tiny, "uint8", [-3e38, 3e38])
 
 
 @pytest.mark.parametrize(
@@ -142,10 +137,8 @@ def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset_storage) ->
         ("uint8", [0.0], 0.0),
     ],
 )
-def test_what_fits_comes_back_within_the_step_of_its_type(
-    coreset_storage, kind, values, within
-) -> None:
-    back = written(coreset_storage, kind, values).astype(np.float64)
+def test_what_fits_comes_back_within_the_step_of_its_type(tiny, kind, values, within) -> None:
+    back = written(tiny, kind, values).astype(np.float64)
     assert np.all(np.isfinite(back))
     exact = np.zeros(len(back), np.float32)
     exact[: len(values)] = values
@@ -160,11 +153,6 @@ def test_chunks_are_one_time_node_of_bounded_size(shape) -> None:
     assert all(1 <= n <= length for n, length in zip(chunk, shape, strict=True))
 
 
-def decoded(path) -> np.ndarray:
-    with fhash_codec.open(path) as volume:
-        return volume[...]
-
-
 def rewritten(path, target, mixing) -> None:
     """Write the same arrays, not coded, with other attributes of a component of level 1."""
     with Container.open(path) as container, ContainerWriter(target) as writer:
@@ -175,7 +163,7 @@ def rewritten(path, target, mixing) -> None:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
+def coded_small(tmp_path_factory):
     """A small file with coded tables of two components."""
     path = tmp_path_factory.mktemp("small") / "a.fhz"
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 4, 5, 6)), indexing="ij")
@@ -185,25 +173,18 @@ def small(tmp_path_factory):
     return path
 
 
-def test_coded_or_not_the_components_mean_the_same(tmp_path, small) -> None:
-    with Container.open(small) as container:
-        mixing = dict(container.arrays["tables/level_1/component_2"].attributes)
-    rewritten(small, tmp_path / "a.fhz", mixing)
-    np.testing.assert_array_equal(decoded(tmp_path / "a.fhz"), decoded(small))
-
-
 @pytest.mark.parametrize(
     "mixing",
     [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}],
     ids=str,
 )
-def test_a_mixing_of_other_numbers_is_refused(tmp_path, small, mixing) -> None:
+def test_a_mixing_of_other_numbers_is_refused(tmp_path, coded_small, mixing) -> None:
     with pytest.raises(InputError, match="array tables/level_1/component_2 attribute mixing"):
-        rewritten(small, tmp_path / "a.fhz", mixing)
+        rewritten(coded_small, tmp_path / "a.fhz", mixing)
 
 
-def test_a_mixing_beyond_float32_is_damage(tmp_path, small) -> None:
-    rewritten(small, tmp_path / "a.fhz", {"mixing": [1e308, 0.0]})
+def test_a_mixing_beyond_float32_is_damage(tmp_path, coded_small) -> None:
+    rewritten(coded_small, tmp_path / "a.fhz", {"mixing": [1e308, 0.0]})
     with (
         fhash_codec.open(tmp_path / "a.fhz") as volume,
         pytest.raises(DamagedFileError, match="not finite"),
@@ -211,15 +192,193 @@ def test_a_mixing_beyond_float32_is_damage(tmp_path, small) -> None:
         volume.read(0)
 
 
-def test_mixing_adds_the_components_from_the_first_on() -> None:
+@pytest.mark.parametrize("fringe", [False, True])
+@pytest.mark.parametrize(
+    ("box", "keys", "fold"), [((5, 6, 7), 5, 2), ((1, 9, 4), 1, 2), ((4, 3, 11), 7, 3)]
+)
+def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
+    """The law in words: every corner with a weight, of every sample, and nothing else."""
     random = np.random.default_rng(0)
-    components, mixing = (
-        [random.random((3, 4), dtype=np.float32) for _ in range(3)],
-        random.random((3, 3), dtype=np.float32),
+    masks = random.random((keys, *box)) < 0.04
+    levels = level_resolutions(box, keys, fold)
+    packed = [occupancy.pack(mask) for mask in masks]
+    needed = Needed(levels, packed.__getitem__, fringe=fringe)
+    samples = masks.copy()
+    if fringe:
+        samples[1:] |= masks[:-1]
+        samples[:-1] |= masks[1:]
+    for number, level in enumerate(levels):
+        expected = np.zeros(level, np.bool_)
+        sizes = (keys, *box)
+        for sample in np.argwhere(samples):
+            around = [
+                {p * (r - 1) // max(n - 1, 1), -(-p * (r - 1) // max(n - 1, 1))}
+                for p, r, n in zip(sample.tolist(), level, sizes, strict=True)
+            ]
+            for corner in product(*around):
+                expected[corner] = True
+        found = np.stack([needed.mask(number, node) for node in range(level[0])])
+        np.testing.assert_array_equal(found, expected)
+        assert needed.counts(number) == expected.sum(axis=(1, 2, 3)).tolist()
+
+
+FEATURE = EncodeConfig(
+    profile="paper",
+    epochs=2,
+    width=8,
+    features=("interval:80:120",),
+    dilation=0,
+    key_frames="0,2,4",
+    timings=False,
+)
+
+
+def sparse(network: Network, model: Any) -> Network:
+    """The network with tables that hold the needed vertices of a random model alone."""
+    needed = needed_by(model.selection.architecture, model.selection.coreset)
+    tables = []
+    for level, table in enumerate(network.tables):
+        values = table.read(tuple(slice(0, n) for n in table.shape))
+        masks = np.stack([needed.mask(level, node) for node in range(len(values))])
+        held = values[masks]
+        tables.append(
+            SparseTable(
+                values.shape,
+                masks.sum(axis=(1, 2, 3)).tolist(),
+                lambda first, end, held=held: held[first:end],
+                lambda node, masks=masks: masks[node],
+                f"level {level + 1}",
+            )
+        )
+    return replace(network, tables=tables)
+
+
+def test_regions_of_a_table_are_those_of_a_dense_one(random_model) -> None:
+    dense = random_model.network(fill=0.0)
+    chance = np.random.default_rng(0)
+    for table, other in zip(sparse(dense, random_model).tables, dense.tables, strict=True):
+        assert tuple(table.shape) == tuple(other.shape)
+        for _ in range(20):
+            spans = [sorted(chance.choice(n + 1, 2, replace=False)) for n in table.shape]
+            region = tuple(slice(int(start), int(stop)) for start, stop in spans)
+            np.testing.assert_array_equal(table.read(region), other.read(region))
+
+
+@pytest.mark.parametrize("small", [0, 200, 10**6])
+@pytest.mark.parametrize("key", [0.0, 0.4, 2.0, 3.75, 4.0])
+def test_a_decoded_region_has_the_bits_of_a_dense_one(
+    random_model, monkeypatch, key, small
+) -> None:
+    """Whichever levels get all their vertices first."""
+    monkeypatch.setattr("fhash_codec.paper.model.SMALL_NUMBERS", small)
+    dense = random_model.network(fill=0.0)
+    network = sparse(dense, random_model)
+    whole = tuple((0, n) for n in dense.box_size)
+    for region in (whole, ((2, 7), (0, 12), (3, 17)), tuple((n - 1, n) for n in dense.box_size)):
+        np.testing.assert_array_equal(
+            decode_region(network, key, region), decode_region(dense, key, region)
+        )
+    requested = np.random.default_rng(1).random(dense.box_size) < 0.1
+    np.testing.assert_array_equal(
+        decode_region(network, key, whole, requested=requested)[requested],
+        decode_region(dense, key, whole, requested=requested)[requested],
     )
-    expected = np.stack(
-        [(components[0] * m[0] + components[1] * m[1]) + components[2] * m[2] for m in mixing.T],
-        axis=-1,
-    )
-    np.testing.assert_array_equal(mix_components(components, mixing), expected)
-    assert mix_components(components, mixing).dtype == np.float32
+
+
+@pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
+def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
+    """Pictures through the network do so."""
+    dense = random_model.network(fill=0.0)
+    network = sparse(dense, random_model)
+    tables = PointTables.of_box(network, key)
+    assert all(isinstance(patch, SparsePatch) for patch in tables.patches)
+    chance = np.random.default_rng(3)
+    places = [np.zeros(1), *(chance.random(300) * (n - 1) for n in dense.box_size)]
+    for column, size in zip(places[1:], dense.box_size, strict=True):
+        column[:20] = chance.integers(0, size, 20)
+    read = []
+    for box in (tables, PointTables.of_box(dense, key)):
+        values, slopes = np.empty(300, np.float32), np.empty((300, 4), np.float32)
+        PointSampler(box, key).sample(places, values, slopes, 1)
+        read.append((values, slopes))
+    np.testing.assert_array_equal(read[0][0], read[1][0])
+    np.testing.assert_array_equal(read[0][1], read[1][1])
+
+
+def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
+    tables = PointTables.of_box(sparse(random_model.network(fill=0.0), random_model), 1.3)
+    with pytest.raises(AssertionError, match="at several times"):
+        PointSampler(tables)
+    PointSampler(tables, 1.3)
+
+
+def test_numbers_that_are_not_finite_are_damage(random_model) -> None:
+    network = sparse(random_model.network(fill=0.0), random_model)
+    frame = network.tables[1].frame(0)
+    frame.values[0, 0] = np.nan
+    with pytest.raises(DamagedFileError, match="level 2 holds numbers that are not finite"):
+        decode_region(network, 0.0, tuple((0, n) for n in network.box_size))
+
+
+@pytest.fixture(scope="module", params=["float16", "float32", "uint8"])
+def files(request, tmp_path_factory, waves) -> tuple[Path, Path]:
+    """The files of one training: with all vertices, and with the needed ones alone."""
+    folder = tmp_path_factory.mktemp("sparse")
+    config = replace(FEATURE, tables=request.param)
+    for name, share in {"dense": 0.0, "sparse": 2.0}.items():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("fhash_codec.paper.encode.SPARSE_BELOW", share)
+            fhash_codec.encode(waves(), folder / f"{name}.fhz", config)
+    return folder / "dense.fhz", folder / "sparse.fhz"
+
+
+def test_both_files_decode_to_the_same_bits(files) -> None:
+    with fhash_codec.open(files[0]) as dense, fhash_codec.open(files[1]) as other:
+        assert "sparse" not in dense.info["model"]
+        assert other.info["model"]["sparse"] == "fringe"
+        assert other.info["required_features"] == ["sparse-tables"]
+        for t in (0, 0.7, 1, 2, 3.5, 4):
+            np.testing.assert_array_equal(dense.read(t), other.read(t))
+        points = np.random.default_rng(0).random((2000, 4)) * [4, 8, 11, 19]
+        np.testing.assert_array_equal(dense.model(points), other.model(points))
+        assert np.isfinite(other.model(points)).sum() > 20
+
+
+def copied(source: Path, target: Path, changes: dict[str, Any]) -> None:
+    """Write the same arrays, some of them replaced by (values, attributes)."""
+    with Container.open(source) as container, ContainerWriter(target) as writer:
+        for name, array in container.arrays.items():
+            values, attributes = changes.get(name, (array.read(), dict(array.attributes)))
+            writer.add_whole(name, values, attributes=attributes)
+        writer.commit(container.header)
+
+
+def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) -> None:
+    with Container.open(files[1]) as container:
+        table = container.arrays["tables/level_1"]
+        values, attributes = table.read(), dict(table.attributes)
+        bits = container.arrays["occupancy/bits"].read()
+    first, *others = attributes["counts"]
+    moved = {**attributes, "counts": [first - 1, others[0] + 1, *others[1:]]}
+    copied(files[1], tmp_path / "a.fhz", {"tables/level_1": (values, moved)})
+    message = rf"a.fhz: array tables/level_1 has {first - 1} vertices at time node 0; .* {first}$"
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        pytest.raises(DamagedFileError, match=message),
+    ):
+        volume.read(0)
+    everywhere = np.full_like(bits, 255)
+    copied(files[1], tmp_path / "b.fhz", {"occupancy/bits": (everywhere, {})})
+    with (
+        fhash_codec.open(tmp_path / "b.fhz") as volume,
+        pytest.raises(DamagedFileError, match="the occupancy asks for"),
+    ):
+        volume.read(0)
+
+
+def test_a_table_of_other_rows_is_refused(files, tmp_path) -> None:
+    with Container.open(files[1]) as container:
+        table = container.arrays["tables/level_2"]
+        values, attributes = table.read(), dict(table.attributes)
+    with pytest.raises(InputError, match=r"array tables/level_2 is .* asks for"):
+        copied(files[1], tmp_path / "a.fhz", {"tables/level_2": (values[1:], attributes)})

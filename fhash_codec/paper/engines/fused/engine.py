@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines import Chosen
 from fhash_codec.paper.engines.fused.program import (
     DeviceLimits,
     Sizes,
@@ -26,7 +25,7 @@ from fhash_codec.paper.engines.fused.program import (
     missed_step_tables,
     with_files,
 )
-from fhash_codec.paper.engines.parameters import corrections
+from fhash_codec.paper.engines.parameters import Chosen, corrections
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch
 from fhash_codec.paper.network import Architecture, Network, Resolution

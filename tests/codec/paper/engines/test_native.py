@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
 import re
-import resource
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,18 +16,12 @@ from fhash_codec.native import network
 from fhash_codec.native.network import PATHS, machine_paths
 from fhash_codec.paper.engines import native
 from fhash_codec.paper.engines.native import (
-    BLOCK,
-    GROUP,
-    REACH,
     Bricks,
     Gaps,
     Level,
     NativeEngine,
-    groups_of_corners,
     refusal,
-    two_corners,
 )
-from fhash_codec.paper.engines.parameters import axis_matrices
 from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
@@ -162,60 +152,6 @@ def test_the_same_seed_path_and_threads_give_the_same_bits(model_of, path, threa
         np.testing.assert_array_equal(array, states[1][name], err_msg=name)
 
 
-def test_threads_change_no_more_than_the_last_digits(model_of, threads) -> None:
-    coreset, architecture = model_of("plain")
-    ends = []
-    for count in (1, 3):
-        threads(count)
-        engine = NativeEngine(architecture, coreset, RATES, seed=3)
-        for _ in range(4):
-            engine.train(np.arange(len(coreset.bricks)))
-        ends.append(engine.infer(np.arange(len(coreset.bricks))[::-1].copy()).numpy())
-    np.testing.assert_allclose(*ends, atol=1e-5)
-
-
-WITHOUT_THREADS = """
-import pickle, resource, sys, threading
-import numpy as np, torch
-from fhash_codec.paper.engines.native import NativeEngine
-with open(sys.argv[1], "rb") as file:
-    architecture, coreset = pickle.load(file)
-torch.set_num_threads(3)
-engine = NativeEngine(architecture, coreset, np.full(9, 0.01), seed=3)
-if sys.argv[2] == "none":
-    with open("/proc/self/statm") as pages:
-        taken = int(pages.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (taken + (512 << 20), resource.RLIM_INFINITY))
-    try:
-        threading.Thread(target=print).start()
-        sys.exit("a thread could be made")
-    except RuntimeError:
-        pass
-for _ in range(3):
-    engine.train(np.arange(len(coreset.bricks)))
-values = engine.infer(np.arange(len(coreset.bricks)))
-sys.stdout.buffer.write(engine.state()["flat"].tobytes() + values.numpy().tobytes())
-"""
-"""A program that prints trained numbers. It may make no thread, of whose stack it lacks the GiB."""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are those of Linux")
-def test_threads_that_cannot_be_made_change_nothing(model_of, tmp_path) -> None:
-    coreset, architecture = model_of("plain")
-    (tmp_path / "model").write_bytes(pickle.dumps((architecture, coreset)))
-    (tmp_path / "program.py").write_text(WITHOUT_THREADS)
-    most = resource.getrlimit(resource.RLIMIT_STACK)[1]
-    if 0 <= most < 1 << 30:
-        pytest.skip("no thread may have a stack of a GiB here")
-    files = [str(tmp_path / name) for name in ("program.py", "model")]
-    command = ["sh", "-c", 'ulimit -s 1048576; exec "$0" "$@"', sys.executable, *files]
-    results = [
-        subprocess.run([*command, threads], check=True, capture_output=True).stdout
-        for threads in ("some", "none")
-    ]
-    assert results[0] == results[1] != b""
-
-
 @pytest.mark.parametrize("case", ["plain", "a few vertices far apart", "no coarse levels"])
 def test_slab_and_native_go_on_from_each_other(model_of, case) -> None:
     coreset, architecture = model_of(case)
@@ -236,88 +172,6 @@ def test_slab_and_native_go_on_from_each_other(model_of, case) -> None:
         assert float(alternating.train(batch)) == pytest.approx(error, rel=1e-3, abs=1e-6)
     assert alternating.name == "native"
     assert_near(alternating.parameters(), slab.parameters())
-
-
-def test_a_step_moves_no_block_that_it_does_not_need(model_of) -> None:
-    coreset, architecture = model_of(((3, 30, 40, 50), {"hidden_layers": 1}))
-    engine = NativeEngine(architecture, coreset, RATES, seed=7)
-    assert len(engine.blocks) == -(-engine.lazy // BLOCK)
-    engine.train(np.array([0]))
-    visited = engine.blocks > 0
-    assert 0 < visited.sum() < 0.2 * len(visited)
-    behind = engine.flat.copy()
-    engine.train(np.array([len(coreset.bricks) - 1]))
-    same = np.repeat(engine.blocks != 2, BLOCK)[: engine.lazy]
-    np.testing.assert_array_equal(engine.flat[: engine.lazy][same], behind[: engine.lazy][same])
-    # The state has what a dense Adam has: it moves what had a gradient before.
-    settled = engine.state()["flat"]
-    moved = np.repeat(visited & (engine.blocks != 2), BLOCK)[: engine.lazy]
-    assert (settled[: engine.lazy][moved] != engine.flat[: engine.lazy][moved]).any()
-
-
-def test_evaluation_changes_nothing(model_of) -> None:
-    coreset, architecture = model_of("plain")
-    bricks = len(coreset.bricks)
-    ends = []
-    for looks in (False, True):
-        engine = NativeEngine(architecture, coreset, RATES, seed=7)
-        for step in range(9):
-            engine.train(np.array([step % bricks]))
-            if looks:
-                engine.infer(np.arange(bricks))
-                engine.state()
-        ends.append(engine.state())
-    for name, array in ends[0].items():
-        np.testing.assert_array_equal(array, ends[1][name], err_msg=name)
-
-
-def test_settling_changes_no_value_beyond_rounding(model_of) -> None:
-    coreset, architecture = model_of("plain")
-    engine = NativeEngine(architecture, coreset, RATES, seed=7)
-    for brick in range(len(coreset.bricks)):
-        engine.train(np.array([brick]))
-    bricks = np.arange(len(coreset.bricks))
-    before = engine.infer(bricks).numpy()
-    engine.settle()
-    np.testing.assert_allclose(engine.infer(bricks).numpy(), before, atol=1e-6)
-
-
-def test_other_learning_rates_count_from_the_next_step_on(model_of) -> None:
-    """A training that goes on beyond its plan has a longer course of the rate."""
-    coreset, architecture = model_of("plain")
-    engines = [
-        NativeEngine(architecture, coreset, RATES[:11], seed=7),
-        NativeEngine(architecture, coreset, RATES, seed=7),
-    ]
-    for step in range(20):
-        if step == 10:
-            engines[0].rates = RATES
-        errors = {float(engine.train(np.array([step % 3]))) for engine in engines}
-        assert len(errors) == 1
-
-
-def test_training_holds_the_finest_embeddings_of_samples_alone(model_of) -> None:
-    coreset, architecture = model_of(((3, 9, 20, 35), {"hidden_layers": 1}))
-    engine = NativeEngine(architecture, coreset, RATES, seed=7)
-    engine.train(np.arange(len(coreset.bricks)))
-    for numbers in (engine.fine, engine.fine_mean, engine.fine_square, engine.parameters().fine):
-        assert numbers.shape == (2, len(coreset.values))
-        assert (numbers != 0).all()
-
-
-def test_a_step_writes_the_samples_of_its_bricks_alone(model_of, path) -> None:
-    """Rows of samples begin and end anywhere: a vector must not reach into a neighbour's."""
-    coreset, architecture = model_of(((2, 9, 20, 35), {"hidden_layers": 1, "low": 0.7}))
-    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
-    for chosen in (np.arange(0, len(coreset.bricks), 2), np.array([2])):
-        before = [numbers.copy() for numbers in (engine.fine, engine.fine_mean, engine.fine_square)]
-        engine.train(chosen)
-        own = np.zeros(len(coreset.values), bool)
-        own[coreset.places(chosen)] = True
-        after = (engine.fine, engine.fine_mean, engine.fine_square)
-        for old, new in zip(before, after, strict=True):
-            np.testing.assert_array_equal(old[:, ~own], new[:, ~own])
-            assert (old[:, own] != new[:, own]).all()
 
 
 def test_a_state_of_another_model_is_refused(model_of) -> None:
@@ -346,8 +200,6 @@ def test_what_it_does_not_take_is_named(model_of) -> None:
 
 
 HEADER = (Path(network.__file__).parent / "bricks.hpp").read_text(encoding="utf-8")
-AXES = [(125, 63, 16, 8), (35, 3, 12, 3), (1, 1, 1, 1), (700, 350, 700, 1), (20, 20, 7, 3)]
-"""Vertices and corners of an axis, and vertices and number of the runs along it."""
 
 
 @pytest.mark.parametrize("structure", [Level, Gaps, Bricks])
@@ -368,27 +220,3 @@ def test_constants_are_those_of_the_header(name) -> None:
     value = re.search(rf"FHASH_{name} = (\d+);", HEADER)
     assert value is not None
     assert int(value.group(1)) == getattr(native, name)
-
-
-@pytest.mark.parametrize("axis", AXES, ids=str)
-def test_two_corners_have_all_the_weight(axis) -> None:
-    _, weights = axis_matrices(*axis)
-    first, two = two_corners(weights)
-    again = np.zeros((*weights.shape[:2], weights.shape[2] + 1))
-    np.put_along_axis(again, first[..., None] + np.arange(2), two, axis=2)
-    np.testing.assert_allclose(again[..., :-1], weights, atol=1e-7)
-
-
-@pytest.mark.parametrize("axis", AXES, ids=str)
-def test_groups_hold_the_weights_of_their_vertices(axis) -> None:
-    _, weights = axis_matrices(*axis)
-    reach, spread = groups_of_corners(weights)
-    again = np.zeros((weights.shape[0], reach.shape[1] * GROUP, weights.shape[2] + REACH))
-    for coordinate, group in np.ndindex(reach.shape[:2]):
-        first, count = reach[coordinate, group]
-        assert 0 < count <= GROUP + 1
-        assert not spread[coordinate, group, count:].any()
-        part = again[coordinate, group * GROUP : (group + 1) * GROUP]
-        part[:, first : first + REACH] = spread[coordinate, group].T
-    np.testing.assert_allclose(again[:, : weights.shape[1], : weights.shape[2]], weights, atol=1e-7)
-    assert not again[:, weights.shape[1] :].any()

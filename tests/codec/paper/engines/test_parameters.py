@@ -18,7 +18,6 @@ from fhash_codec.paper.engines.parameters import (
     Upsampling,
     adam_step,
     adam_step_on_device,
-    axis_matrices,
     catch_up,
     catch_up_numbers,
     corrections,
@@ -42,21 +41,6 @@ def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
     )
 
 
-def test_parameters_are_within_their_bounds_and_split_by_level_and_layer(noise_coreset) -> None:
-    coreset = noise_coreset((2, 5, 6, 7))
-    architecture = Architecture.for_box(coreset.box.shape, 2)
-    parameters = initial_parameters(architecture, coreset, 0)
-    tables, layers = parameters.dense(architecture)
-    assert [tuple(table.shape) for table in tables] == [
-        (prod(level), 2) for level in architecture.levels[1:]
-    ]
-    for table in (parameters.fine, *tables):
-        assert 0.5 * SPREAD < float(table.abs().max()) <= SPREAD
-    for (weight, bias), (outputs, inputs) in zip(layers, architecture.layer_shapes, strict=True):
-        assert (weight.shape, bias.shape) == ((outputs, inputs), (outputs,))
-        assert max(float(weight.abs().max()), float(bias.abs().max())) <= inputs**-0.5
-
-
 def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
     noise_coreset, in_coreset, monkeypatch
 ) -> None:
@@ -72,21 +56,6 @@ def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
 
 
 CPU = torch.device("cpu")
-
-
-@pytest.mark.parametrize(
-    ("size", "corners", "length", "count"),
-    [(1, 1, 1, 1), (5, 5, 5, 1), (5, 3, 2, 3), (20, 7, 6, 4), (9, 2, 4, 3)],
-)
-def test_axis_matrices_give_every_vertex_its_position(size, corners, length, count) -> None:
-    start, weights = axis_matrices(size, corners, length, count)
-    assert (start >= 0).all()
-    assert (start + weights.shape[2] <= corners).all()
-    np.testing.assert_allclose(weights.sum(axis=2), 1, rtol=1e-15)
-    position = (weights * (start[:, None, None] + np.arange(weights.shape[2]))).sum(axis=2)
-    vertex = np.minimum(np.arange(count * length), size - 1)
-    expected = vertex * (corners - 1) / max(size - 1, 1)
-    np.testing.assert_allclose(position.ravel(), expected, rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize(("shape", "low"), [((3, 9, 10, 20), 0.3), ((2, 20, 30, 40), 0.9995)])

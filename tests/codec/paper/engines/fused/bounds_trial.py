@@ -14,7 +14,7 @@ import torch
 from emulator import EmulatedDevice, HeldTable
 
 from fhash_codec.features.bricks import build_coreset
-from fhash_codec.features.features import Interval
+from fhash_codec.features.features import FeatureChoice, Interval
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines.fused.engine import FusedEngine, FusedPoints, PointKernels
 from fhash_codec.paper.network import Architecture, ArrayTable, Network
@@ -25,7 +25,8 @@ from fhash_formats.series import ArraySeries
 def bricks(device: EmulatedDevice, layers: int) -> None:
     """Train and evaluate, with atomics and in a fixed order."""
     series = ArraySeries(np.random.default_rng(3).random((2, 5, 9, 13), dtype=np.float32))
-    coreset = build_coreset(series, scan(series, silent), range(2), [Interval(0.3, 1.0)], 0, silent)
+    choice = FeatureChoice(range(2), [Interval(0.3, 1.0)])
+    coreset = build_coreset(series, scan(series, silent), choice, silent)
     architecture = Architecture.for_box(coreset.box.shape, 2, width=12, hidden_layers=layers)
     engine = FusedEngine(
         architecture, coreset, np.full(9, 0.01), seed=7, device=torch.device("cpu"), kernels=device

@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from engine_checks import assert_gradient_of_autograd
 from pretended_cuda import CUDA, pretended_cuda
 from readable_paper import FHash
 
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import (
-    FILES,
     FusedEngine,
     FusedPoints,
     PointKernels,
@@ -24,7 +22,7 @@ from fhash_codec.paper.engines.fused.engine import (
     start_fused,
     start_points,
 )
-from fhash_codec.paper.engines.fused.program import KERNELS, Unavailable
+from fhash_codec.paper.engines.fused.program import Unavailable
 from fhash_codec.paper.engines.slab import STATE
 from fhash_codec.paper.model import PointSampler, PointTables
 from fhash_codec.paper.network import Architecture, ArrayTable
@@ -45,17 +43,6 @@ CASES = [
         (3, 20, 24, 40), {"hidden_layers": 1, "low": 0.9998}, id="a few vertices far apart"
     ),
 ]
-WIDE = [
-    pytest.param({"width": 128, "hidden_layers": 1}, {"threads": 128, "columns": (64,)}, id="128"),
-    pytest.param({"width": 64, "hidden_layers": 2}, {"threads": 256, "columns": (128,)}, id="64x2"),
-    pytest.param(
-        {"width": 128, "hidden_layers": 2},
-        {"threads": 256, "columns": (32,), "shared_per_block": 120 << 10},
-        id="128x2, sums in the device's memory",
-    ),
-    pytest.param({"width": 1, "hidden_layers": 2}, {}, id="one neuron"),
-]
-"""Models, and devices for them."""
 
 
 def assert_close(ours, theirs, scale: float) -> None:
@@ -88,17 +75,6 @@ def test_kernels_train_and_evaluate_as_the_oracle_does(engines_of, shape, settin
     assert_close(parts(fused.parameters()), parts(oracle.parameters()), 0.01)
     settled = fused.infer(every[::-1].copy()).numpy()
     np.testing.assert_allclose(settled, unsettled, atol=1e-6)
-
-
-@pytest.mark.parametrize(("settings", "sizes"), WIDE)
-def test_gradients_equal_those_of_autograd_in_float64(engines_of, settings, sizes) -> None:
-    coreset, fused, _, oracle = engines_of((2, 9, 9, 13), settings, **sizes)
-    bricks = np.arange(len(coreset.bricks))
-    fused.train(bricks)
-    oracle.train(bricks)
-    # The mean of the gradients after the first step is a tenth of the first one.
-    assert_gradient_of_autograd(10 * fused.flat_mean, fused.upsampling.used, oracle)
-    assert not fused.gradient.any()
 
 
 def trained(fused, coreset, steps: int = 3) -> list[np.ndarray]:
@@ -171,23 +147,6 @@ def test_every_barrier_is_needed_and_its_absence_is_found(engines_of) -> None:
     assert not unseen, [text.splitlines()[number - 2] for number in unseen]
 
 
-def test_coarse_gradients_are_the_same_in_a_fixed_order(engines_of) -> None:
-    states, launched = [], []
-    for deterministic in (False, True):
-        coreset, fused, _, _ = engines_of((3, 9, 20, 35), {"hidden_layers": 1})
-        torch.use_deterministic_algorithms(deterministic)
-        try:
-            fused.train(np.arange(len(coreset.bricks)))
-        finally:
-            torch.use_deterministic_algorithms(False)
-        states.append(fused.flat_mean.clone())
-        launched.append(fused._program.launched)
-    assert launched[0] == ["train_bricks", "move_flat"]
-    assert launched[1] == ["train_bricks", "sum_entries", "move_flat"]
-    assert states[0][: fused.coarse].abs().max() > 0
-    np.testing.assert_allclose(states[0], states[1], atol=1e-6 * float(states[0].abs().max()))
-
-
 def test_each_engine_goes_on_with_the_other_ones_state(engines_of) -> None:
     coreset, fused, slab, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
     _, straight, _, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
@@ -218,21 +177,6 @@ def test_new_kernels_are_tried_first(engines_of, faulty) -> None:
         np.testing.assert_array_equal(array, slab.state()[name], err_msg=name)
     every = np.arange(len(coreset.bricks))
     assert float(fused.train(every)) == pytest.approx(float(slab.train(every)), rel=1e-6)
-
-
-def test_tiles_without_samples_are_passed_over(engines_of) -> None:
-    coreset, fused, slab, _ = engines_of((2, 8, 8, 16), {"hidden_layers": 1, "low": 0.99})
-    rows = fused._sizes.tile_rows * coreset.brick_shape[2]
-    masks = np.unpackbits(coreset.mask_bits, axis=1)[:, : fused.vertices]
-    starts = np.arange(0, fused.vertices, rows)
-    full = np.add.reduceat(masks.astype(int), starts, axis=1) > 0
-    assert 0 < full.sum() < full.size
-    every = np.arange(len(coreset.bricks))
-    for engine in (fused, slab):
-        engine.fine_mean.fill_(0.1)
-        engine.fine_square.fill_(0.01)
-        engine.train(every)
-    np.testing.assert_allclose(fused.fine, slab.fine, atol=1e-7)
 
 
 CPU = torch.device("cpu")
@@ -352,27 +296,6 @@ def test_boxes_and_embeddings_of_every_shape_give_the_values_of_the_host(
         assert not ours[1][:, flat].any()
 
 
-def test_float16_tables_of_one_key_frame_are_taken(points_of, networks) -> None:
-    network = networks.random((5, 13, 18), 1, 2, 2, 1, dtype=np.float16)
-    places = places_in(network)
-    ours, theirs = evaluated(points_of(network), places), on_host(network, places)
-    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-5, atol=1e-5)
-
-
-def test_a_place_has_the_same_bits_in_any_pass(points_of, networks) -> None:
-    network = networks.random((5, 13, 18), 4, 2, 2, 2, width=20)
-    points, places = points_of(network), places_in(network)
-    values, slopes = evaluated(points, places)
-    random = np.random.default_rng(4)
-    for count in (0, 1, 2, 31, 32, 33, 100):
-        chosen = random.permutation(len(places))[:count]
-        ours = evaluated(points, places[chosen])
-        np.testing.assert_array_equal(ours[0], values[chosen])
-        np.testing.assert_array_equal(ours[1], slopes[chosen])
-    strided = np.repeat(places, 2, axis=0)[::2]
-    np.testing.assert_array_equal(evaluated(points, strided)[0], values)
-
-
 def test_a_call_is_one_launch_and_no_wait(emulated, networks) -> None:
     """Places that lie apart take a launch of torch more."""
     network = networks.random((5, 13, 18), 4, 2, 2, 2)
@@ -458,53 +381,6 @@ def test_new_kernels_are_tried_first_points(points_of, networks, old, new) -> No
         points_of(network, new=True, change=change)
 
 
-def test_kernels_are_loaded_once_for_networks_of_the_same_layers(emulated, networks) -> None:
-    device, loaded = emulated(), []
-    load = device.load
-    device.load = lambda sizes: loaded.append(sizes) or load(sizes)
-    kernels = PointKernels(device)
-    for box, key in (((5, 13, 18), 0.0), ((5, 13, 18), 1.5), ((6, 14, 17), 1.5)):
-        FusedPoints(networks.random(box, 4, 2, 2, 1), key, device=CPU, kernels=kernels)
-    assert len(loaded) == 1
-    FusedPoints(networks.random((5, 13, 18), 4, 2, 2, 2), 0.0, device=CPU, kernels=kernels)
-    assert len(loaded) == 2
-
-
-def test_a_kernel_that_cannot_be_launched_is_found_at_the_start(emulated, networks) -> None:
-    device = emulated()
-    load = device.load
-
-    def broken(sizes):
-        program = load(sizes)
-
-        def launch(*_):
-            raise Unavailable("a reason of this test")
-
-        program.launch = launch
-        return program
-
-    device.load = broken
-    with pytest.raises(Unavailable, match="a reason of this test"):
-        FusedPoints(
-            networks.random((5, 6, 7), 2, 2, 2, 1), 0.5, device=CPU, kernels=PointKernels(device)
-        )
-
-
-def test_layers_that_overflow_stay_so(points_of, networks) -> None:
-    network = networks.random((2, 3, 4), 2, 2, 2, 2)
-    huge = tuple((np.full_like(weight, 3e38), bias) for weight, bias in network.layers)
-    points = points_of(replace(network, layers=huge))
-    assert not np.isfinite(evaluated(points, np.array([[1.0, 1.0, 1.0]]))[0]).any()
-
-
-def test_places_that_are_none_give_no_number(points_of, networks) -> None:
-    """A march clips its places to the box; one that it could not clip must not be read beyond."""
-    network = networks.random((5, 13, 18), 4, 2, 2, 1)
-    places = np.array([[np.nan, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, np.nan, np.nan]])
-    values, _ = evaluated(points_of(network), places)
-    assert np.isnan(values).tolist() == [True, False, True]
-
-
 def test_what_the_kernels_cannot_do_is_said(networks, emulated) -> None:
     limits = emulated().limits
 
@@ -526,14 +402,6 @@ def test_what_the_kernels_cannot_do_is_said(networks, emulated) -> None:
     with pytest.raises(Unavailable, match="more shared memory than the 4096 bytes"):
         sizes(network, replace(limits, shared_per_block=4096))
     assert isinstance(sizes(network), PointSizes)
-
-
-def test_the_text_is_that_of_the_sizes_and_the_files(networks, emulated) -> None:
-    network = networks.random((5, 6, 7), 2, 2, 2, 2)
-    text = point_sizes(architecture_of(network), True, emulated().limits).text()
-    assert "constexpr bool SPARSE = true;" in text
-    assert all((KERNELS / name).read_text() in text for name in FILES)
-    assert "#include" not in text
 
 
 class Cuda:
@@ -560,11 +428,6 @@ def test_a_processor_has_no_fused_engine(start) -> None:
     assert start(torch.device("cpu")) is None
     with pytest.raises(InputError, match="needs a CUDA device, but the device is 'cpu'"):
         start(torch.device("cpu"), required=True)
-
-
-def test_a_torch_without_cuda_goes_on_without_a_warning(start, monkeypatch) -> None:
-    monkeypatch.setattr(torch.version, "cuda", None)
-    assert start(Cuda()) is None
 
 
 def test_a_failure_is_one_warning_or_an_error_if_the_engine_is_required(start, monkeypatch) -> None:
@@ -598,14 +461,6 @@ def test_the_engine_is_started_on_the_device(start, monkeypatch, emulated) -> No
     assert float(engine.train(np.array([0]))) > 0
 
 
-def test_points_are_left_to_torch_without_cuda(networks, monkeypatch) -> None:
-    network = networks.random((5, 6, 7), 2, 2, 2, 1)
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert start_points(network, 0.5, torch.device("cpu")) is None
-    monkeypatch.setattr(torch.version, "cuda", None)
-    assert start_points(network, 0.5, Cuda()) is None
-
-
 def test_points_that_the_kernels_cannot_do_are_left_to_torch_with_one_warning(
     networks, monkeypatch, emulated
 ) -> None:
@@ -619,22 +474,3 @@ def test_points_that_the_kernels_cannot_do_are_left_to_torch_with_one_warning(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert start_points(network, 0.5, device) is None
-
-
-def test_points_are_started_on_a_device_that_is_looked_at_once(
-    networks, monkeypatch, emulated
-) -> None:
-    looked, device = [], Cuda()
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(driver, "CudaDevice", lambda device: looked.append(device) or emulated())
-    original = FusedPoints.__init__
-
-    def on_cpu(self, *arguments, device, **settings):
-        original(self, *arguments, device=torch.device("cpu"), **settings)
-
-    monkeypatch.setattr(FusedPoints, "__init__", on_cpu)
-    for key in (0.0, 0.5):
-        points = start_points(networks.random((5, 6, 7), 2, 2, 2, 1), key, device)
-        assert isinstance(points, FusedPoints)
-        assert points.values(torch.ones(3, 3, dtype=torch.float64)).isfinite().all()
-    assert looked == [device]

@@ -17,33 +17,7 @@ from hypothesis import strategies as st
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume
 from fhash_codec.views.view import FEW_BYTES, MOST_BYTES, ZarrView, opened_view, view_chunks
-from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
-from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
-
-
-@pytest.mark.parametrize(
-    ("shape", "tile", "itemsize", "chunk"),
-    [
-        # one tile of all steps: a frame each, or several where frames are small
-        ((12, 25, 125, 125), (12, 25, 125, 125), 4, (1, 25, 125, 125)),
-        ((12, 13, 63, 63), (12, 13, 63, 63), 4, (6, 13, 63, 63)),
-        # a tile of a good size stays
-        ((12, 25, 125, 125), (4, 25, 42, 42), 4, (4, 25, 42, 42)),
-        # steps are cut by divisors, so that no chunk reaches into the next tile
-        ((40, 25, 125, 125), (10, 25, 125, 125), 1, (5, 25, 125, 125)),
-        # huge frames: blocks of like sides
-        ((3, 512, 512, 512), (1, 512, 512, 512), 4, (1, 64, 64, 128)),
-        # tiny tiles are joined, in space first
-        ((12, 25, 125, 125), (4, 9, 9, 9), 4, (4, 25, 36, 18)),
-        ((1000, 4, 4, 4), (10, 4, 4, 4), 8, (320, 4, 4, 4)),
-        ((1, 1, 1, 1), (4, 8, 8, 8), 8, (1, 1, 1, 1)),
-    ],
-)
-def test_chunks_by_tile(
-    shape: tuple[int, ...], tile: tuple[int, ...], itemsize: int, chunk: tuple[int, ...]
-) -> None:
-    assert view_chunks(shape, tile, itemsize) == chunk
-
+from fhash_formats.series import ArraySeries, Coordinate
 
 sides = st.tuples(st.integers(1, 99), *[st.integers(1, 700)] * 3)
 
@@ -126,40 +100,6 @@ def test_the_root_document_holds_all_metadata(view_of: ViewOf, whole: Path) -> N
     assert set(level) == {"density", "time", "height", "lat", "lon"}
 
 
-def test_attributes_say_what_values_are_and_not_how_they_were_packed(
-    view_of: ViewOf, whole: Path
-) -> None:
-    view = view_of(whole)
-    assert document(view, "density")["attributes"] == {
-        "standard_name": "air_density",
-        "note": "é",
-        "units": "kg m-3",
-    }
-    assert document(view, "time")["attributes"] == {
-        "axis": "T",
-        "units": "hours since 2001-02-03",
-        "calendar": "standard",
-    }
-    assert document(view, "density")["dimension_names"] == ["time", "height", "lat", "lon"]
-    assert document(view, "")["attributes"] == {}
-
-
-def test_the_levels_are_a_multiscale_image(view_of: ViewOf, feature: Path) -> None:
-    view = view_of(feature)
-    (entry,) = document(view, "lod")["attributes"]["ome"]["multiscales"]
-    assert document(view, "lod")["attributes"]["ome"]["version"] == "0.5"
-    assert [dataset["path"] for dataset in entry["datasets"]] == ["0/density", "1/density"]
-    for dataset in entry["datasets"]:
-        node = document(view, f"lod/{dataset['path']}")
-        assert node["dimension_names"] == [axis["name"] for axis in entry["axes"]]
-        assert node["data_type"] == "float32"
-        scale = dataset["coordinateTransformations"][0]["scale"]
-        translation = dataset["coordinateTransformations"][1]["translation"]
-        path = f"lod/{dataset['path']}".rpartition("/")[0]
-        lon = np.frombuffer(view.get(f"{path}/lon/c/0") or b"", "<f8")
-        np.testing.assert_array_equal(lon, translation[3] + scale[3] * np.arange(lon.size))
-
-
 @pytest.mark.usefixtures("apart")
 @pytest.mark.parametrize("kind", ["whole", "feature"])
 def test_every_key_has_as_many_bytes_as_told(
@@ -173,25 +113,6 @@ def test_every_key_has_as_many_bytes_as_told(
         assert data is not None
         assert view.size(key) == len(data)
         assert view.is_document(key) == key.endswith("zarr.json")
-
-
-@pytest.mark.usefixtures("apart")
-def test_chunks_without_a_vertex_of_the_box_are_left_out(feature: Path) -> None:
-    with fhash_codec.open(feature) as volume:
-        view = ZarrView({"density": volume})
-        array = view.arrays["density"]
-        values = np.full(array.shape, np.nan, dtype=np.float32)
-        keys = [key for key in view.listing("density/c/") if key.count("/") == 5]
-        assert 0 < len(keys) < np.prod(array.grid)
-        for key in keys:
-            index = tuple(map(int, key.split("/")[2:]))
-            chunk = np.frombuffer(view.get(key) or b"", "<f4").reshape(array.chunk_shape)
-            region = tuple(
-                slice(i * n, min((i + 1) * n, m))
-                for i, n, m in zip(index, array.chunk_shape, array.shape, strict=True)
-            )
-            values[region] = chunk[tuple(slice(0, along.stop - along.start) for along in region)]
-        assert values.tobytes() == volume[...].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -220,29 +141,6 @@ def test_names_below_a_path(view_of: ViewOf, whole: Path) -> None:
     assert list(view.children("density/c/1/0/0")) == [str(n) for n in range(grid[3])]
     assert list(view.children("nope")) == []
     assert set(view.listing("lod/1/lat")) == {"lod/1/lat/zarr.json", "lod/1/lat/c/0"}
-
-
-def test_integers_have_their_fill_value_where_some_are_missing(view_of: ViewOf) -> None:
-    golden = Path(__file__).resolve().parents[2] / "golden"
-    view = view_of(golden / "compact-labels.fhz")
-    node = document(view, "density")
-    assert (node["data_type"], node["fill_value"]) == ("int8", -100)
-    assert node["attributes"]["_FillValue"] == -100
-
-
-def test_a_fill_value_of_ones_own_marks_missing_floats(view_of: ViewOf, feature: Path) -> None:
-    node = document(view_of(feature, fill=-9), "density")
-    assert node["fill_value"] == node["attributes"]["missing_value"] == -9
-    assert "_FillValue" not in node["attributes"]
-
-
-def test_integers_without_missing_values_mark_none(view_of: ViewOf, tmp_path: Path) -> None:
-    path = tmp_path / "a.fhz"
-    values = np.arange(60, dtype=np.int32).reshape(1, 3, 4, 5)
-    fhash_codec.encode(values, path, EncodeConfig(effort=1, max_error=0.0))
-    node = document(view_of(path), "values")
-    assert (node["data_type"], node["fill_value"]) == ("int32", 0)
-    assert "_FillValue" not in node["attributes"]
 
 
 @pytest.mark.parametrize(
@@ -320,66 +218,8 @@ def test_the_nodes_of_a_group_stand_together(whole: Path, feature: Path) -> None
         assert {"lod/2/density", "lod/1/density_2"} <= view.arrays.keys()
 
 
-def test_the_tag_tells_files_and_settings_apart(
-    view_of: ViewOf, whole: Path, feature: Path
-) -> None:
-    assert view_of(whole).tag == view_of(whole).tag
-    tags = {view_of(whole).tag, view_of(feature).tag, view_of(feature, fill=1).tag}
-    assert len(tags) == 3
-
-
-def test_nothing_is_decoded_before_a_chunk_is_asked_for(whole: Path) -> None:
-    with fhash_codec.open(whole) as volume:
-        before = volume.container.bytes_read
-        view = ZarrView({"density": volume})
-        assert all(view.size(key) is not None for key in view.listing())
-        assert volume.container.bytes_read == before
-        view.get("density/c/0/0/0/0")
-        assert volume.container.bytes_read > before
-
-
-@pytest.mark.usefixtures("apart")
-def test_a_damaged_tile_is_refused_and_others_are_read(view_of: ViewOf, damaged: Path) -> None:
-    view = view_of(damaged)
-    with pytest.raises(DamagedFileError, match=r"damaged\.fhz"):
-        view.get("density/c/0/0/0/0")
-    last = list(view.listing("density/c/"))[-1]
-    assert view.get(last)
-
-
-def test_what_cannot_be_opened_is_refused(tmp_path: Path, whole: Path) -> None:
-    with pytest.raises(MissingInputError):
-        opened_view(tmp_path / "nope.fhz")
-    (tmp_path / "text.fhz").write_text("no container")
-    with pytest.raises(DamagedFileError):
-        opened_view(tmp_path / "text.fhz")
-    opened, view = opened_view(whole)
-    opened.close()
-    with pytest.raises(InputError, match="closed"):
-        view.get("density/c/0/0/0/0")
-
-
 def test_attributes_of_the_file_may_be_arrays(view_of: ViewOf) -> None:
     golden = Path(__file__).resolve().parents[2] / "golden"
     attributes = document(view_of(golden / "compact-source.fhz"), "")["attributes"]
     assert attributes["title"] == "golden"
     assert attributes["range"][0] == pytest.approx(0.1)
-
-
-def test_positions_do_not_take_the_place_of_an_array_beside_other_values(
-    view_of: ViewOf, tmp_path: Path
-) -> None:
-    """`lat` is an array of two dimensions of one variable, and the positions of another."""
-    first = ArraySeries(np.zeros((2, 1, 3, 4), np.float32), name="u")
-    first.metadata = SourceMetadata(
-        dimensions={"time": "t", "y": "y", "x": "x"},
-        variables=(SourceVariable(name="lat", dimensions=("y", "x"), values=np.eye(3, 4)),),
-    )
-    along = Coordinate(name="lat", values=np.arange(3) * 2.0)
-    second = ArraySeries(np.ones((2, 1, 3, 4), np.float32), name="v", coords={"y": along})
-    config = EncodeConfig(effort=1, max_error=0.0)
-    fhash_codec.encode_dataset({"u": first, "v": second}, tmp_path / "a.fhz", config)
-    view = view_of(tmp_path / "a.fhz")
-    assert view.arrays["lat"].shape == (3, 4)
-    assert view.arrays["v"].dimension_names[-2:] == ("lat_2", "x")
-    assert view.arrays["lat_2"].shape == (3,)

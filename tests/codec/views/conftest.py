@@ -1,7 +1,8 @@
-"""Small containers that views are made of."""
+"""Containers to view: a whole one, one of a feature, one with gaps, a damaged one."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.views import view as chunking
 from fhash_formats.series import ArraySeries, Coordinate
+
+sys.path.insert(0, str(Path(__file__).parent))
+
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 LABELS = GOLDEN / "compact-labels.fhz"

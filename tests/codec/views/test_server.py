@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import errno
 import http.client
-import json
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-import fhash_codec
 from fhash_codec.views.server import UNSATISFIABLE, Server, byte_range, names_tag
 from fhash_codec.views.view import opened_view
 from fhash_formats.errors import InputError
@@ -46,11 +42,6 @@ from fhash_formats.errors import InputError
 )
 def test_ranges(header: str | None, span: tuple[int, int] | None) -> None:
     assert byte_range(header, 100) == span
-
-
-def test_nothing_can_be_taken_from_nothing() -> None:
-    assert byte_range("bytes=-5", 0) == UNSATISFIABLE
-    assert byte_range("bytes=0-", 0) == UNSATISFIABLE
 
 
 @pytest.mark.parametrize(
@@ -130,29 +121,6 @@ def test_every_key_has_the_bytes_of_the_view(feature: Path) -> None:
         assert ask(absent)[0] == 404
 
 
-def test_values_are_those_of_the_volume(ask: Ask, whole: Path) -> None:
-    status, headers, body = ask("/density/zarr.json")
-    assert (status, headers["Content-Type"]) == (200, "application/json")
-    chunk = json.loads(body)["chunk_grid"]["configuration"]["chunk_shape"]
-    status, headers, body = ask(CHUNK)
-    assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
-    assert "Content-Encoding" not in headers
-    with fhash_codec.open(whole) as volume:
-        expected = volume[tuple(slice(0, n) for n in chunk)]
-    assert np.frombuffer(body, "<f4").reshape(chunk).tobytes() == expected.tobytes()
-
-
-@pytest.mark.parametrize("path", ["/zarr.json", CHUNK])
-def test_head_tells_what_get_gives(ask: Ask, path: str) -> None:
-    status, headers, body = ask(path)
-    told = ask(path, "HEAD")
-    assert (status, told[0], told[2]) == (200, 200, b"")
-    assert int(headers["Content-Length"]) == len(body)
-    headers.pop("Date")
-    told[1].pop("Date")
-    assert told[1] == headers
-
-
 def test_ranges_server(ask: Ask) -> None:
     _, headers, body = ask(CHUNK)
     size = len(body)
@@ -184,14 +152,6 @@ def test_what_a_client_has_is_not_sent_again(ask: Ask) -> None:
     assert ask("/zarr.json")[1]["ETag"] != tag
     assert ask(CHUNK, Range="bytes=0-3", If_Range=tag)[0] == 206
     assert ask(CHUNK, Range="bytes=0-3", If_Range='"other"')[::2] == (200, body)
-
-
-def test_tags_are_of_the_file_and_not_of_the_server(whole: Path, feature: Path) -> None:
-    tags = []
-    for path in (whole, whole, feature):
-        with serving(path) as server:
-            tags.append(asking(server)("/time/c/0")[1]["ETag"])
-    assert tags[0] == tags[1] != tags[2]
 
 
 @pytest.mark.parametrize("path", ["/zarr.json", CHUNK, "/nope"])
@@ -312,11 +272,6 @@ def test_other_methods_are_refused(ask: Ask, method: str) -> None:
     assert body == b"GET, HEAD and OPTIONS are served\n"
 
 
-def test_queries_and_percent_signs_are_understood(ask: Ask) -> None:
-    assert ask("/zarr.json?time=1")[::2] == ask("/zarr.json")[::2]
-    assert ask("/%7Aarr.json")[::2] == ask("/zarr.json")[::2]
-
-
 def test_what_is_no_http_is_refused_and_the_server_goes_on(whole: Path) -> None:
     with serving(whole) as server:
         for line in (b"nonsense\r\n\r\n", b"GET /zarr.json HTTP/9.9\r\n\r\n", b"\x00\xff\r\n\r\n"):
@@ -359,17 +314,6 @@ def test_a_defect_is_a_failure_of_one_answer(whole: Path, monkeypatch: pytest.Mo
         assert asking(server)(CHUNK)[0] == 500
         assert news == [f"{CHUNK[1:]}: unexpected KeyError: 'several\\nlines'"]
         assert asking(server)("/zarr.json")[0] == 200
-
-
-@pytest.mark.usefixtures("apart")
-def test_several_clients_at_once(whole: Path) -> None:
-    with serving(whole) as server, ThreadPoolExecutor(8) as pool:
-        keys = [key for key in server.view.listing() if "/c/" in key] * 4
-        answers = list(pool.map(lambda key: asking(server)(f"/{key}"), keys))
-        assert all(
-            (status, body) == (200, server.view.get(key))
-            for key, (status, _, body) in zip(keys, answers, strict=True)
-        )
 
 
 def test_addresses(whole: Path) -> None:

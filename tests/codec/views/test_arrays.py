@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-import zarr
 
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.views import view as chunking
 from fhash_codec.views.arrays import (
     Level,
-    Region,
     ViewArray,
     arrays_beside,
     chunk_index,
     chunk_key,
     level_count,
     multiscale,
-    naming_attributes,
     positions_along,
     shown_axes,
 )
 from fhash_codec.views.view import ZarrView
-from fhash_formats.series import Coordinate
 
 VALUES = np.arange(35, dtype=np.int16).reshape(5, 7)
 
@@ -62,25 +57,6 @@ def test_the_document_is_of_zarr_3() -> None:
     assert document["attributes"] == {"units": "m"}
 
 
-@pytest.mark.parametrize(
-    ("dtype", "fill", "written"),
-    [
-        ("float32", None, "NaN"),
-        ("float64", float("nan"), "NaN"),
-        ("float32", float("-inf"), "-Infinity"),
-        ("float32", 1e20, 1e20),
-        ("int32", None, 0),
-        ("uint8", 255, 255),
-    ],
-)
-def test_fill_values_in_json(dtype: str, fill: float | None, written: object) -> None:
-    assert view_array(VALUES.astype(dtype), fill=fill).document()["fill_value"] == written
-
-
-def test_single_bytes_have_no_order() -> None:
-    assert view_array(VALUES.astype(np.uint8)).document()["codecs"] == [{"name": "bytes"}]
-
-
 def test_chunks_are_little_endian_and_full_at_the_ends() -> None:
     array = view_array()
     assert array.grid == (3, 2)
@@ -95,23 +71,6 @@ def test_chunks_without_values_and_outside_the_grid_are_not_there() -> None:
     array = view_array()
     assert list(array.indices()) == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert not any(map(array.has, [(0, 0), (3, 0), (1, 2), (1,), (1, 0, 0), (-1, 0)]))
-
-
-@pytest.mark.parametrize(("fill", "left_out"), [(2**53, True), (2**53 + 1, False)])
-def test_chunks_stay_where_browsers_would_round_the_fill_value(fill: int, left_out: bool) -> None:
-    array = view_array(VALUES.astype(np.int64), fill=fill)
-    assert array.has((0, 0)) is not left_out
-
-
-def test_the_read_region_ends_with_the_array() -> None:
-    regions: list[Region] = []
-
-    def read(region: Region) -> np.ndarray:
-        regions.append(region)
-        return VALUES[region]
-
-    view_array(read=read).chunk((2, 1))
-    assert regions == [(slice(4, 5), slice(4, 7))]
 
 
 @pytest.mark.parametrize(
@@ -144,16 +103,6 @@ def region_of(level: Level) -> tuple[slice, ...]:
     return tuple(slice(0, n) for n in level.shape)
 
 
-@pytest.mark.parametrize(
-    "name", ["compact-labels", "compact-counts", "paper-sparse", "compact-linear"]
-)
-def test_level_0_has_the_bits_of_the_volume(name: str) -> None:
-    with fhash_codec.open(GOLDEN / f"{name}.fhz") as volume:
-        level = Level(volume, 0)
-        assert level.shape == volume.shape
-        assert level.read(region_of(level)).tobytes() == volume[...].tobytes()
-
-
 @pytest.mark.parametrize("kind", ["whole", "feature"])
 @pytest.mark.parametrize("lod", [1, 2, 3])
 def test_coarse_levels_are_those_of_the_box_and_empty_elsewhere(
@@ -175,51 +124,6 @@ def test_coarse_levels_are_those_of_the_box_and_empty_elsewhere(
         assert np.isfinite(expected).any()
         assert got.tobytes() == expected.tobytes()
         assert level.holds(region_of(level))
-
-
-def test_regions_of_a_level_are_parts_of_it(feature: Path) -> None:
-    with fhash_codec.open(feature) as volume:
-        level = Level(volume, 1)
-        whole = level.read(region_of(level))
-        outside = 0
-        for lows in product(*(range(0, n, 3) for n in level.shape)):
-            region = tuple(
-                slice(low, min(low + 3, n)) for low, n in zip(lows, level.shape, strict=True)
-            )
-            assert level.read(region).tobytes() == whole[region].tobytes()
-            if not level.holds(region):
-                outside += 1
-                assert np.isnan(whole[region]).all()
-        assert outside
-
-
-def test_integers_stay_integers_and_keep_their_fill_value() -> None:
-    with fhash_codec.open(GOLDEN / "compact-labels.fhz") as volume:
-        level = Level(volume, 1)
-        coarse = level.read(region_of(level))
-        assert coarse.dtype == np.int8
-        # labels are taken at vertices, not averaged
-        assert coarse[:, :, :, 1:-1].tobytes() == volume[:, ::2, ::2, 2:-2:2].tobytes()
-        assert (coarse[:, :, :, 0] == volume.fill).all()
-
-
-@pytest.mark.parametrize("kind", ["whole", "feature"])
-def test_missing_values_and_a_fill_value_of_ones_own(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
-    with fhash_codec.open(request.getfixturevalue(kind), fill=-7) as volume:
-        for lod in (0, 1):
-            level = Level(volume, lod)
-            values = level.read(region_of(level))
-            assert not np.isnan(values).any()
-            assert (values == -7).any() == (kind == "feature")
-
-
-def test_missing_values_are_missing(gappy: Path) -> None:
-    with fhash_codec.open(gappy) as volume:
-        level = Level(volume, 1)
-        assert np.isnan(Level(volume, 0).read(region_of(Level(volume, 0)))[0, 1, 3:7, 5:9]).all()
-        assert np.isnan(level.read(region_of(level))[1]).sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -303,32 +207,6 @@ def test_vertices_lead_to_positions_where_these_are_even(feature: Path) -> None:
             assert translation["translation"][2] == level.first[1]
 
 
-@pytest.mark.parametrize(
-    ("values", "units", "scale", "unit"),
-    [
-        ([0.0, 1.0, 3.0], "m", 1.0, None),
-        ([0.0, 2.0, 4.0], "km", 2.0, "kilometer"),
-        ([0.0, 2.0, 4.0], "Meters", 2.0, "meter"),
-        ([0.0, 2.0, 4.0], "s", 2.0, None),
-        ([3.0, 2.0, 1.0], "m", 1.0, None),
-        ([1.0, 1.0, 1.0], "m", 1.0, None),
-        ([0.0, np.inf, 1.0], "m", 1.0, None),
-        ([-1e308, 0.0, 1e308], "m", 1.0, None),
-        (np.float32([0.1, 0.2, 0.3]).tolist(), "m", 0.1, "meter"),
-    ],
-)
-def test_uneven_positions_count_vertices(
-    whole: Path, values: list[float], units: str, scale: float, unit: str | None
-) -> None:
-    with fhash_codec.open(whole) as volume:
-        coordinate = Coordinate(name="x", values=np.array(values), attributes={"units": units})
-        entry = multiscale("a", {**volume.coords, "x": coordinate}, NAMES, {"a": Level(volume, 0)})
-        assert entry["axes"][3].get("unit") == unit
-        (given, _) = entry["datasets"][0]["coordinateTransformations"]
-        assert given["scale"][3] == pytest.approx(scale)
-        assert all(0 < number < np.inf for number in given["scale"])
-
-
 SHAPE = (3, 20, 24)
 
 
@@ -391,19 +269,6 @@ def test_levels_have_it_at_their_vertices(ice: Path) -> None:
         np.testing.assert_array_equal(coarse["time_bnds"], fine["time_bnds"])
 
 
-def test_values_have_the_bits_of_the_volume_without_the_axis(ice: Path) -> None:
-    with fhash_codec.open(ice) as volume, fhash_codec.zarr_store(ice) as store:
-        assert shown_axes(volume) == (0, 2, 3)
-        array = zarr.open_group(store, mode="r")["ice"]
-        assert array[...].tobytes() == volume[...].tobytes()
-        assert array[1:, 3, 4:9].tobytes() == volume[1:, 0, 3, 4:9].tobytes()
-        scalar = zarr.open_group(store, mode="r")["rotated"]
-        assert (scalar.shape, int(scalar[()])) == ((), 0)
-        assert store.view.size("rotated/c") == 4
-        assert store.view.get("rotated/c/0") is None
-        assert set(store.view.listing("rotated/")) == {"rotated/zarr.json", "rotated/c"}
-
-
 def test_variables_share_what_is_equal(ice: Path) -> None:
     with fhash_codec.open(ice) as first, fhash_codec.open(ice) as second:
         view = ZarrView({"first": first, "second": second})
@@ -414,14 +279,6 @@ def test_variables_share_what_is_equal(ice: Path) -> None:
         assert view.arrays["ice"].attributes == view.arrays["ice_2"].attributes
         assert view.arrays["time"].attributes["bounds"] == "time_bnds"
         assert view.arrays["ice"].attributes["grid_mapping"] == "rotated"
-
-
-def test_an_image_of_two_axes_in_space_is_a_multiscale_image(ice: Path) -> None:
-    with fhash_codec.zarr_store(ice) as store:
-        (entry,) = zarr.open_group(store, mode="r", path="lod").attrs["ome"]["multiscales"]
-        assert [axis["name"] for axis in entry["axes"]] == ["time", "rlat", "rlon"]
-        scale = entry["datasets"][1]["coordinateTransformations"][0]["scale"]
-        assert scale == [1.0, 2.0, 2.0]
 
 
 def test_arrays_of_other_lengths_are_left_out(ice: Path) -> None:
@@ -444,18 +301,3 @@ def test_positions_have_the_type_of_the_source(ice: Path, whole: Path) -> None:
         assert positions_along(volume, "y") is volume.coords["y"].values
         assert shown_axes(volume) == (0, 1, 2, 3)
         assert list(arrays_beside(volume, Level(volume, 0), {}, {})) == []
-
-
-@pytest.mark.parametrize(
-    ("raw", "kept"),
-    [
-        ({"coordinates": "a b", "units": "m"}, {"coordinates": "a b"}),
-        ({"coordinates": "a gone"}, {"coordinates": "a"}),
-        ({"coordinates": "gone"}, {}),
-        ({"grid_mapping": "gone", "bounds": "b"}, {"bounds": "b"}),
-        ({"cell_measures": "area: a volume: gone"}, {}),
-        ({"bounds": 3}, {}),
-    ],
-)
-def test_attributes_name_what_is_there(raw: dict[str, object], kept: dict[str, str]) -> None:
-    assert naming_attributes(raw, {"a", "b"}) == kept

@@ -1,9 +1,8 @@
-"""The coding of a level: components that keep its embeddings, one step for all."""
+"""Coded tables: their tiles, their loss, and the step that keeps a promise."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,24 +12,178 @@ import pytest
 
 import fhash_codec
 from fhash_codec import FhashWarning, QualityError
-from fhash_codec.paper.storage import mix_components
-from fhash_codec.paper.table_step import (
-    MAX_LOSS,
-    StepSearch,
-    Window,
-    choose_codings,
-    squared_weights,
+from fhash_codec.features import occupancy
+from fhash_codec.features.occupancy import unpack
+from fhash_codec.paper import tables as small_parts
+from fhash_codec.paper.encode import select
+from fhash_codec.paper.model import decode_region
+from fhash_codec.paper.storage import finest_frame, mix_components
+from fhash_codec.paper.table_step import MAX_LOSS, StepSearch, Window, choose_codings
+from fhash_codec.paper.tables import (
+    MIN_WEIGHTS,
+    WEIGHT_STEPS,
+    CoarseTable,
+    Samples,
+    components_of,
+    quantised_layers,
+    tile_region,
+    tile_shape,
 )
-from fhash_codec.paper.tables import CoarseTable, components_of, tile_region
+from fhash_codec.progress import silent
 from fhash_formats.container import Container
+from fhash_formats.series import ArraySeries
 
 
-@pytest.mark.parametrize(("length", "resolution"), [(1, 1), (5, 3), (5, 5), (9, 2), (20, 7)])
-def test_squared_weights_are_those_of_the_interpolation(length, resolution) -> None:
-    position = np.arange(length) * (resolution - 1) / max(length - 1, 1)
-    # Vertex r of the level weighs 1 - |position - r| where that is positive.
-    weights = np.maximum(1 - np.abs(position[:, None] - np.arange(resolution)), 0)
-    assert squared_weights(length, resolution) == pytest.approx((weights**2).sum(axis=1).mean())
+@pytest.mark.parametrize("key", range(5))
+def test_regions_are_those_of_the_frame(random_model, key) -> None:
+    bricks, coreset = random_model.bricks, random_model.selection.coreset
+    size = random_model.selection.architecture.box_size
+    box = tuple((0, n) for n in size)
+    mask, values = bricks.mask(key, box), bricks.samples(key, box)
+    occupied = unpack(coreset.occupancy[key], size)
+    assert not (occupied & ~mask).any()
+    assert (mask & ~occupied).any()  # the fringe
+    assert 0 < mask.mean() < 1
+    to_unit = random_model.selection.scanned.value_range.to_unit
+    frame = random_model.field[(key, *(slice(low, high) for low, high in coreset.box))]
+    np.testing.assert_array_equal(values[mask], to_unit(frame[mask]))
+    for region in (((1, 4), (0, 3), (7, 11)), ((3, 4), (5, 6), (2, 3))):
+        inner = tuple(slice(*span) for span in region)
+        np.testing.assert_array_equal(bricks.mask(key, region), mask[inner])
+        np.testing.assert_array_equal(bricks.samples(key, region), values[inner])
+        np.testing.assert_array_equal(
+            bricks.embeddings(random_model.fine, key, region),
+            finest_frame(coreset, random_model.fine, key)[inner],
+        )
+
+
+@pytest.fixture(scope="module")
+def samples(random_model) -> Samples:
+    selection = random_model.selection
+    tile = (2, *tile_shape(selection.architecture.levels[0])[1:3], 8)
+    return Samples(selection.coreset, random_model.bricks, tile)
+
+
+def test_errors_are_those_of_the_clipped_values_at_all_samples(random_model, samples) -> None:
+    network = random_model.network()
+    squares, count = samples.squares(network, list(samples.counts))
+    box = tuple((0, n) for n in network.box_size)
+    coreset = random_model.selection.coreset
+    masks = [unpack(coreset.occupancy[key], network.box_size) for key in range(5)]
+    # Samples of the fringe do not count: the promise is about the coreset.
+    assert coreset.values.size > count == sum(int(mask.sum()) for mask in masks)
+    assert sum(samples.counts.values()) == count
+    direct = 0.0
+    for key, mask in enumerate(masks):
+        unit = np.clip(decode_region(network, key, box).astype(np.float64), 0, 1)
+        error = unit - random_model.bricks.samples(key, box)
+        direct += float((error[mask] ** 2).sum())
+    assert squares == pytest.approx(direct)
+
+
+def layers(rows: int, columns: int):
+    random = np.random.default_rng(0)
+    return [
+        (
+            random.standard_normal((rows, columns)).astype(np.float32),
+            random.standard_normal(rows).astype(np.float32),
+        ),
+        (np.ones((1, rows), np.float32), np.zeros(1, np.float32)),
+    ]
+
+
+def worst(changed, original) -> float:
+    return max(
+        float(np.square(a - b).mean()) for (a, _), (b, _) in zip(changed, original, strict=True)
+    )
+
+
+@pytest.mark.parametrize("allowed", [1e-2, 1e-4, 1e-6])
+def test_the_largest_step_that_is_allowed_is_taken(allowed) -> None:
+    original = layers(32, MIN_WEIGHTS // 32)
+    quantised, settings = quantised_layers(
+        original, lambda changed: worst(changed, original), allowed
+    )
+    first, last = settings
+    assert first is not None
+    assert last is None  # too small to gain anything
+    assert worst(quantised, original) <= allowed
+    np.testing.assert_array_equal(quantised[1][0], original[1][0])
+    np.testing.assert_array_equal(quantised[0][1], original[0][1])
+    # Twice the step would have been too large.
+    assert first.step > 0.8 * np.sqrt(12 * allowed) / 2 or first.step >= WEIGHT_STEPS[0] / 2
+
+
+def test_layers_that_no_step_keeps_stay_as_they_are() -> None:
+    original = layers(32, 32)
+    quantised, settings = quantised_layers(original, lambda _: 1.0, 0.5)
+    assert settings == [None, None]
+    assert quantised[0][0] is original[0][0]
+
+
+@pytest.mark.parametrize("vertices", [1, 5000, 1 << 22])
+def test_the_mask_is_the_occupancy(tmp_path, waves, coded_config, monkeypatch, vertices) -> None:
+    monkeypatch.setattr(small_parts, "MASK_VERTICES", vertices)
+    config = replace(coded_config, epochs=1, features=("interval:50:150",), dilation=0)
+    path = tmp_path / "a.fhz"
+    fhash_codec.encode(waves(), path, config)
+    coreset = select(ArraySeries(waves()), config, silent).coreset
+    with Container.open(path) as container:
+        assert "occupancy/bits" not in container.arrays
+        mask = container.arrays["occupancy/mask"].read(
+            tuple(slice(0, n) for n in container.arrays["occupancy/mask"].shape)
+        )
+    for step, bits in zip(mask, coreset.occupancy, strict=True):
+        np.testing.assert_array_equal(step != 0, occupancy.unpack(bits, coreset.box.shape))
+    with fhash_codec.open(path) as volume:
+        both = volume.occupancy(0.5)
+        np.testing.assert_array_equal(both, volume.occupancy(0) | volume.occupancy(1))
+
+
+def decoded(path) -> np.ndarray:
+    with fhash_codec.open(path) as volume:
+        return volume[...]
+
+
+@pytest.mark.parametrize(
+    "index",
+    [np.s_[3], np.s_[1:4, 2:7, 3:11, 5:17], np.s_[:, 8, ::-2, 19], np.s_[4, 3:5, 4:6, 7:9]],
+    ids=str,
+)
+def test_a_region_is_that_slice_of_the_whole_bit_for_bit(pair, index) -> None:
+    path = pair["coded"][1]
+    whole = decoded(path)
+    with fhash_codec.open(path) as volume:
+        np.testing.assert_array_equal(volume[index], whole[index])
+
+
+def test_points_and_times_between_are_as_smooth_as_before(waves, pair) -> None:
+    random = np.random.default_rng(0)
+    points = {
+        axis: random.random(300) * (n - 1) for axis, n in zip("tzyx", waves().shape, strict=True)
+    }
+    with fhash_codec.open(pair["coded"][1]) as volume, fhash_codec.open(pair["exact"][1]) as other:
+        values, slopes = volume.sample(**points, gradient=True)
+        expected = other.sample(**points)
+        finite = np.isfinite(expected)
+        assert finite.sum() > 30
+        np.testing.assert_array_equal(finite, np.isfinite(values))
+        assert np.isfinite(slopes[finite]).all()
+        span = float(np.ptp(waves()))
+        assert np.sqrt(np.mean((values - expected)[finite] ** 2)) < 0.05 * span
+
+
+def test_the_coreset_does_not_depend_on_what_is_not_needed(random_model) -> None:
+    for table in random_model.trained[:2]:
+        region = tuple(slice(0, n) for n in table.shape[:4])
+        assert (~table.needed(region)).sum() > 50
+    one, other = random_model.network(fill=5.0), random_model.network(fill=-7.0)
+    box = tuple((0, n) for n in one.box_size)
+    for key in range(5):
+        mask = random_model.bricks.mask(key, box)
+        np.testing.assert_array_equal(
+            decode_region(one, key, box)[mask], decode_region(other, key, box)[mask]
+        )
 
 
 def test_components_keep_the_embeddings_and_lie_in_their_range(random_model) -> None:
@@ -90,11 +243,6 @@ def rough_waves(waves) -> np.ndarray:
     return waves() + noise.astype(np.float32)
 
 
-def decoded(path) -> np.ndarray:
-    with fhash_codec.open(path) as volume:
-        return volume[...]
-
-
 def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
     (exact, _), (coded, path) = pair["exact"], pair["coded"]
     loss = exact["psnr"] - coded["psnr"]
@@ -147,23 +295,6 @@ def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) ->
     assert missed.value.figures["bytes"] <= free["bytes"] + 40  # the texts of the settings
 
 
-def test_by_default_coded_tables_have_few_levels_and_take_fewer_bytes(
-    rough_waves, coded_config, tmp_path
-) -> None:
-    source = rough_waves
-    config = replace(coded_config, epochs=30, psnr=38.0)
-    published = fhash_codec.encode(source, tmp_path / "a.fhz", config)
-    config = replace(config, fold=0, embedding_size=0)
-    figures = fhash_codec.encode(source, tmp_path / "b.fhz", config)
-    assert 38.0 <= figures["psnr"] < 38.1
-    assert figures["bytes"] < 0.75 * published["bytes"]
-    with fhash_codec.open(tmp_path / "b.fhz") as volume:
-        model = volume.info["model"]
-        assert (model["fold"], model["embedding_size"]) == (8, 1)
-        assert model["levels"] == [[5, 9, 12, 20], [2, 2, 2, 3]]
-        assert volume.info["config"]["fold"] == 0
-
-
 def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> None:
     config = replace(coded_config, epochs=10)
     free = fhash_codec.encode(rough_waves, tmp_path / "a.fhz", config)
@@ -173,32 +304,6 @@ def test_training_goes_on_for_a_promise(rough_waves, coded_config, tmp_path) -> 
     assert wanted <= figures["psnr"] < wanted + 0.1
     with fhash_codec.open(tmp_path / "b.fhz") as volume:
         assert volume.info["training"]["epochs"] > 10
-
-
-@pytest.mark.parametrize(
-    "shape", [(1, 1, 1, 1), (3, 1, 1, 1), (1, 1, 1, 7), (2, 2, 2, 2), (7, 3, 5, 11)]
-)
-def test_every_shape_comes_back(coded_config, tmp_path, shape) -> None:
-    source = np.random.default_rng(0).random(shape, dtype=np.float32)
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", coded_config)
-    back = decoded(tmp_path / "a.fhz")
-    assert back.shape == shape
-    assert np.isfinite(back).all()
-    assert figures["max_abs_error"] == pytest.approx(np.abs(back - source).max(), rel=1e-5)
-
-
-def test_a_constant_series_comes_back_exactly(coded_config, tmp_path) -> None:
-    figures = fhash_codec.encode(np.full((3, 4, 5, 6), 7.25), tmp_path / "a.fhz", coded_config)
-    assert (decoded(tmp_path / "a.fhz") == 7.25).all()
-    assert figures["rmse"] == 0
-
-
-def test_the_same_input_gives_the_same_bytes(waves, coded_config, tmp_path) -> None:
-    for name in ("a.fhz", "b.fhz"):
-        fhash_codec.encode(
-            waves((3, 6, 7, 8)), tmp_path / name, replace(coded_config, epochs=2, timings=False)
-        )
-    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
 
 
 def test_other_readers_see_what_is_needed(pair) -> None:
@@ -240,19 +345,6 @@ def test_the_search_ends_in_the_window(start, power, room) -> None:
     assert trials <= TRIALS
 
 
-def test_a_course_that_is_no_power_takes_a_few_more_trials() -> None:
-    window = Window.of(1e-6, 3e-5, 0.05)
-    # The error bends twice, as that of tables does in which whole levels become zero.
-    search, _ = searched(
-        window,
-        lambda step: 1e-6 + 2e-5 * math.tanh(step) ** 2 + 1e-5 * max(step - 2, 0.0) ** 3,
-        1e-3,
-    )
-    assert search.done
-    assert search.best is not None
-    assert search.best > 2
-
-
 def test_a_jump_over_the_window_keeps_the_allowed_side() -> None:
     window = Window.of(1e-6, 1e-5, 0.05)
     search, _ = searched(window, lambda step: 1e-6 + (1e-6 if step < 3 else 1e-3), 1.0)
@@ -267,11 +359,3 @@ def test_nothing_below_the_smallest_step_is_tried() -> None:
     assert search.done
     assert search.step == 0.5
     assert trials < TRIALS
-
-
-@pytest.mark.parametrize(("exact", "width"), [(0.0, 0.05), (9.99e-6, 0.00217), (1e-6, 0.05)])
-def test_a_window_leaves_room_for_what_coding_adds(exact, width) -> None:
-    window = Window.of(exact, 1e-5, 0.05)
-    assert exact < window.least < window.allowed == 1e-5
-    assert 10 * math.log10(window.allowed / window.least) == pytest.approx(width, rel=0.01)
-    assert 0 < window.aim < window.allowed - exact

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 import zarr
 from zarr.abc.store import OffsetByteRequest, RangeByteRequest, SuffixByteRequest
 from zarr.core.buffer import default_buffer_prototype
@@ -46,89 +45,6 @@ def test_zarr_reads_the_bits_of_the_volume(kind: str, request: pytest.FixtureReq
         assert np.asarray(array[part]).tobytes() == volume[part].tobytes()
         for axis, name in zip("tzyx", array.metadata.dimension_names, strict=True):
             np.testing.assert_array_equal(group[name][...], volume.coords[axis].values)
-
-
-def test_levels_of_detail_are_groups(feature: Path) -> None:
-    with fhash_codec.open(feature) as volume, fhash_codec.zarr_store(feature) as store:
-        group = zarr.open_group(store, mode="r", path="lod/1")
-        coarse = group["density"][...]
-        vertices = volume.lod_vertices(1)
-        inside = tuple(slice(along[0] // 2, along[0] // 2 + len(along)) for along in vertices)
-        for step in range(volume.shape[0]):
-            got = coarse[(step, *inside)]
-            assert got.tobytes() == volume.read_lod(step, 1).tobytes()
-        assert np.isfinite(coarse).sum() == np.isfinite(coarse[(slice(None), *inside)]).sum()
-
-
-def test_without_consolidated_metadata_the_store_lists_what_it_has(whole: Path) -> None:
-    with fhash_codec.zarr_store(whole) as store:
-        group = zarr.open_group(store, mode="r", use_consolidated=False)
-        names = {"density", "time", "height", "lat", "lon", "lod"}
-        assert set(group.keys()) == names
-        assert set(zarr.open_group(store, mode="r").keys()) == names
-        assert set(zarr.open_group(store, mode="r", path="lod").group_keys()) == {"0", "1", "2"}
-
-
-@pytest.mark.usefixtures("apart")
-def test_xarray_shows_dates_coordinates_and_units_and_reads_lazily(whole: Path) -> None:
-    with fhash_codec.open(whole) as volume, fhash_codec.zarr_store(whole) as store:
-        data = xr.open_zarr(store)
-        density = data["density"]
-        assert list(data.data_vars) == ["density"]
-        assert density.dims == ("time", "height", "lat", "lon")
-        assert density.attrs["units"] == "kg m-3"
-        assert density.dtype == np.float32
-        assert data["time"].values[1] == np.datetime64("2001-02-03T06:00")
-        assert data["lat"].attrs["units"] == "degrees_north"
-        assert density.chunks is not None
-        assert density.values.tobytes() == volume[...].tobytes()
-        line = density.sel(lat=55.0, lon=3.0).isel(time=2)
-        assert line.values.tobytes() == volume[2, :, 10, 6].tobytes()
-        mean = density.mean(["height", "lat", "lon"]).compute()
-        np.testing.assert_allclose(mean, volume[...].mean(axis=(1, 2, 3)), rtol=1e-5)
-
-
-@pytest.mark.usefixtures("apart")
-def test_xarray_reads_nothing_before_it_computes(whole: Path) -> None:
-    with fhash_codec.zarr_store(whole) as store:
-        container = store.view.volumes["density"].container
-        before = container.bytes_read
-        frame = xr.open_zarr(store)["density"].isel(time=0, height=0)
-        assert container.bytes_read == before
-        frame.load()
-        some = container.bytes_read
-        xr.open_zarr(store)["density"].load()
-        assert before < some < container.bytes_read
-
-
-def test_xarray_takes_missing_integers_for_missing(request: pytest.FixtureRequest) -> None:
-    path = NAMES["labels"]
-    with fhash_codec.open(path) as volume, fhash_codec.zarr_store(path) as store:
-        values = volume[...]
-        masked = xr.open_zarr(store)["density"].values
-        np.testing.assert_array_equal(np.isnan(masked), values == volume.fill)
-        raw = xr.open_zarr(store, mask_and_scale=False)["density"]
-        assert raw.dtype == np.int8
-        assert raw.values.tobytes() == values.tobytes()
-
-
-def test_levels_open_as_datasets_with_their_own_positions(feature: Path) -> None:
-    with fhash_codec.zarr_store(feature) as store:
-        tree = xr.open_datatree(store, engine="zarr", group="lod")
-        assert set(tree.children) == {"0", "1"}
-        fine, coarse = (xr.open_zarr(store, group=f"lod/{n}") for n in (0, 1))
-        assert coarse.sizes["lon"] < fine.sizes["lon"]
-        for name in ("lat", "lon", "height"):
-            assert set(coarse[name].values) <= set(fine[name].values)
-        np.testing.assert_array_equal(coarse["time"], fine["time"])
-
-
-def test_a_dataset_can_be_written_elsewhere(whole: Path, tmp_path: Path) -> None:
-    with fhash_codec.zarr_store(whole) as store:
-        data = xr.open_zarr(store)
-        data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
-        with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as written:
-            xr.testing.assert_identical(written.load(), data.load())
 
 
 def test_a_store_travels_to_other_processes(whole: Path, tmp_path: Path) -> None:

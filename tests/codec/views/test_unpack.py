@@ -1,4 +1,4 @@
-"""`unpack`: a Zarr store of a container shows what xarray's engine shows, and packs again."""
+"""`unpack`: the chunks of a store are the tiles of a container, in the dimensions of its source."""
 
 from __future__ import annotations
 
@@ -11,9 +11,63 @@ import zarr
 from coded_stores import dataset, shown, without_provenance, write
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, OutputExistsError
+from fhash_codec import EncodeConfig
+from fhash_codec import InputError as InputError_unpack
+from fhash_codec.views.unpack import ChunkTable
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Zarr format 3 specification")
+
+
+@pytest.mark.parametrize(
+    ("dimensions", "chunk", "axes"),
+    [
+        (("time", "level", "lat", "lon"), (2, 3, 4, 4), None),
+        (("time", "lat", "lon"), (2, 4, 4), None),
+        (("lon", "time", "lat"), (4, 2, 4), None),
+        (("lat", "lon", "level", "time"), (4, 4, 3, 2), None),
+    ],
+)
+def test_chunks_have_the_dimensions_of_the_source(
+    tmp_path: Path, dimensions: tuple[str, ...], chunk: tuple[int, ...], axes: list[str] | None
+) -> None:
+    lengths = {"time": 2, "level": 3, "lat": 4, "lon": 4}
+    run = tmp_path / "run.fhz"
+    store = write(tmp_path, dataset(dimensions), dask={name: lengths[name] for name in dimensions})
+    fhash_codec.pack(store, run)
+    with fhash_codec.open(run) as volume:
+        table = ChunkTable(volume)
+        assert tuple(table.outline.dimensions) == dimensions
+        assert table.chunk == chunk
+        assert table.shard is not None
+        # What the codec of the store took for z, y, x is so again.
+        assert table.codec.axes is axes
+        assert table.codec.reading
+        assert len(table.stream([0] * len(dimensions))) > 10
+        assert table.fill is None
+
+
+def test_a_made_up_axis_is_left_out_and_the_codec_says_so(tmp_path: Path) -> None:
+    data = dataset(("time", "lat", "lon"))
+    data.to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
+    run = tmp_path / "run.fhz"
+    config = fhash_codec.EncodeConfig(max_error=0.1, effort=1, tile="2x1x4x4")
+    fhash_codec.encode(tmp_path / "run.nc", run, config)
+    with fhash_codec.open(run) as volume:
+        table = ChunkTable(volume)
+        assert table.chunk == (2, 4, 4)
+        assert table.codec.axes == ("t", "y", "x")
+
+
+def test_a_feature_is_refused(tmp_path: Path) -> None:
+    run, values = tmp_path / "run.fhz", dataset().u.values
+    mask = np.zeros(values.shape, bool)
+    mask[:, 1:4, 2:5, 2:5] = True
+    config = fhash_codec.EncodeConfig(max_error=0.1, effort=1, dilation=0)
+    fhash_codec.encode(ArraySeries(values), run, config, mask=mask)
+    with fhash_codec.open(run) as volume, pytest.raises(InputError, match="a part of its domain"):
+        ChunkTable(volume)
 
 
 def encoded(folder: Path, data: xr.Dataset, **settings: object) -> Path:
@@ -113,13 +167,13 @@ def test_several_variables_come_into_one_store(tmp_path: Path) -> None:
     report = fhash_codec.unpack(run, tmp_path / "one.zarr", variables=["w"])
     assert list(report["variables"]) == ["w"]
     assert list(shown(tmp_path / "one.zarr").data_vars) == ["crs", "w"]
-    with pytest.raises(InputError, match="no variable 'x'"):
+    with pytest.raises(InputError_unpack, match="no variable 'x'"):
         fhash_codec.unpack(run, tmp_path / "two.zarr", variables=["x"])
 
 
 def test_the_profile_paper_is_refused(tmp_path: Path) -> None:
     golden = Path(__file__).parents[2] / "golden" / "paper-plain.fhz"
-    with pytest.raises(InputError, match=r"the profile paper.*fhash decode .* -o OUT\.zarr"):
+    with pytest.raises(InputError_unpack, match=r"the profile paper.*fhash decode .* -o OUT\.zarr"):
         fhash_codec.unpack(golden, tmp_path / "out.zarr")
     assert not (tmp_path / "out.zarr").exists()
 
@@ -130,23 +184,5 @@ def test_plain_files_and_integers_with_gaps_are_refused(tmp_path: Path) -> None:
         ("compact-plain-head", "tables of plain numbers"),
         ("compact-counts", "integers of which some have no value"),
     ):
-        with pytest.raises(InputError, match=what):
+        with pytest.raises(InputError_unpack, match=what):
             fhash_codec.unpack(golden / f"{name}.fhz", tmp_path / "out.zarr")
-
-
-def test_an_existing_store_is_replaced_on_request_alone(tmp_path: Path) -> None:
-    run = encoded(tmp_path, dataset())
-    store = tmp_path / "out.zarr"
-    fhash_codec.unpack(run, store)
-    with pytest.raises(OutputExistsError):
-        fhash_codec.unpack(run, store)
-    fhash_codec.unpack(run, store, force=True)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(fhash_codec.OutputError, match="no Zarr store"):
-        fhash_codec.unpack(run, tmp_path / "folder", force=True)
-    assert sorted(each.name for each in tmp_path.iterdir()) == [
-        "folder",
-        "out.zarr",
-        "run.fhz",
-        "run.nc",
-    ]

@@ -1,26 +1,41 @@
-"""Checkpoints: stopping and going on changes nothing, and each belongs to one training."""
+"""Training: batches, rates, rounds, checkpoints, devices, and what ends one."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from math import log10
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from pretended_cuda import pretended_cuda
 
+import fhash_codec
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset, build_coreset
-from fhash_codec.features.features import Everything, Interval
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.fit import (
+    MAX_DOUBLINGS,
+    MIN_STEPS,
+    Goal,
+    Round,
+    decide,
+    extended,
+    train_model,
+)
 from fhash_codec.paper.network import Architecture
 from fhash_codec.paper.train import (
+    LOWER,
+    MAX_RESTARTS,
+    Breaks,
     Diverged,
     Probe,
     TrainingProgress,
-    batch_ends,
     checkpoint_path,
     load_checkpoint,
     plan_training,
@@ -28,7 +43,7 @@ from fhash_codec.paper.train import (
     train,
 )
 from fhash_codec.progress import silent
-from fhash_formats.errors import InputError, TrainingError
+from fhash_formats.errors import FhashWarning, InputError, TrainingError
 from fhash_formats.series import ArraySeries
 from fhash_formats.support.files import StopRequest
 
@@ -44,15 +59,8 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(setup, coreset, tmp_pa
     def ask(stage, done, total, note):
         stop.asked = done >= moment
 
-    assert not train(
-        engine,
-        plan,
-        coreset,
-        reached,
-        stop=stop,
-        save=lambda c: save_checkpoint(path, engine.state(), c),
-        progress=ask,
-    )
+    breaks = Breaks(stop=stop, save=lambda c: save_checkpoint(path, engine.state(), c))
+    assert not train(engine, plan, coreset, reached, breaks, ask)
     state, later = load_checkpoint(path)
     _, resumed = setup(coreset)
     resumed.restore(state)
@@ -85,26 +93,6 @@ def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path) -> None:
             load_checkpoint(path)
 
 
-def test_tables_that_change_the_sizes_of_the_model_have_a_checkpoint_of_their_own(
-    coreset, tmp_path
-) -> None:
-    def path(**settings):
-        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", **settings))
-
-    published = {"fold": 2, "embedding_size": 2, "width": 64}
-    assert path() == path(tables="uint8") == path(**published)
-    assert path() == path(tables="transform", **published)
-    for setting in published:
-        assert path() != path(tables="transform", **(published | {setting: 0}))
-
-
-def test_engines_that_go_on_from_each_other_share_a_checkpoint(coreset, tmp_path) -> None:
-    def path(engine):
-        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", engine=engine))
-
-    assert path("auto") == path("native") == path("slab")
-
-
 SHAPE = (3, 9, 10, 21)
 
 
@@ -134,7 +122,9 @@ class Engine:
 def built(field: np.ndarray, feature: object, fringe: bool) -> Coreset:
     series = ArraySeries(field)
     keys = range(len(field))
-    return build_coreset(series, scan(series, silent), keys, [feature], 0, silent, fringe=fringe)
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(keys, [feature]), silent, fringe=fringe
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,28 +162,6 @@ def test_a_value_that_is_not_finite_ends_the_training(field, value) -> None:
         Probe(coreset).psnr(Engine(coreset, broken))
 
 
-def test_a_choice_of_bricks_has_some_of_the_coreset_in_each(field) -> None:
-    # Only the last key frame holds the feature: the bricks of the first have neither.
-    late = field * np.float32(0.5)
-    late[2] = field[2]
-    coreset = built(late, Interval(0.9, 1.0), fringe=True)
-    assert set(coreset.bricks[:, 0]) == {1, 2}
-    for limit in (None, 3, 1):
-        probe = Probe(coreset, limit, seed=4)
-        assert set(coreset.bricks[probe.bricks, 0]) == {2}
-        assert len(probe.bricks) == (limit or np.count_nonzero(coreset.bricks[:, 0] == 2))
-    assert Probe(coreset).samples == np.count_nonzero(late >= np.float32(0.9))
-
-
-def test_the_error_of_a_constant_is_that_of_the_mean_of_all_samples(field) -> None:
-    coreset = built(field, Interval(0.8, 1.0), fringe=True)
-    values = field[field >= np.float32(0.8)].astype(np.float64)
-    mean = coreset.values.mean(dtype=np.float64)
-    assert Probe(coreset).error_of_constant() == pytest.approx(np.square(values - mean).mean())
-    plain = built(field, Interval(0.8, 1.0), fringe=False)
-    assert Probe(plain).error_of_constant() == pytest.approx(values.var())
-
-
 def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, coreset) -> None:
     plan, _ = setup(coreset)
     orders = [np.concatenate(plan.order(epoch)) for epoch in range(4)]
@@ -201,18 +169,6 @@ def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, cores
         assert sorted(order) == list(range(plan.bricks))
     assert not np.array_equal(orders[0], orders[1])
     np.testing.assert_array_equal(orders[2], np.concatenate(setup(coreset)[0].order(2)))
-
-
-@pytest.mark.parametrize(
-    ("batch", "batches"),
-    [(0, 20), (2**21, 1), (1008, 26), (5000, 5), (1, 54)],
-)
-def test_batches_of_an_epoch(setup, coreset, batch, batches) -> None:
-    assert len(coreset.bricks) == 54  # 3 key frames of 2 x 3 x 3 bricks of 6 x 7 x 12 vertices
-    assert len(coreset.values) == 25_920  # fewer than 54 whole bricks: the last ones are cut
-    plan, _ = setup(coreset, batch=batch)
-    assert plan.batches == min(batches, plan.bricks)
-    assert len(plan.rates) == 4 * plan.batches + 1
 
 
 @pytest.mark.parametrize("batch", [500, 1700, 4000])
@@ -230,50 +186,9 @@ def test_a_batch_has_as_many_samples_as_asked_however_full_the_bricks(coreset, b
         assert abs(counts[chosen].sum() - counts.sum() / plan.batches) <= 504
 
 
-@pytest.mark.parametrize(
-    "counts", [[1] * 7, [100, 1, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 1, 100], [0, 0, 3, 0, 0, 9, 0]]
-)
-def test_no_batch_is_empty(counts) -> None:
-    for batches in range(1, 8):
-        cuts = batch_ends(np.array(counts), batches)
-        parts = np.split(np.arange(7), cuts)
-        assert len(parts) == batches
-        assert all(len(part) for part in parts)
-
-
 @pytest.mark.parametrize(("batch", "epochs"), [(0, 50), (1, 20), (2**20, 1000)])
 def test_epochs_that_suit_the_data(setup, coreset, batch, epochs) -> None:
     assert setup(coreset, epochs=0, batch=batch)[0].epochs == epochs
-
-
-def test_rates_fall_to_zero_or_stay(setup, coreset) -> None:
-    cosine, constant = setup(coreset)[0].rates, setup(coreset, schedule="constant")[0].rates
-    assert cosine[0] == 0.01
-    assert cosine[-1] == pytest.approx(0, abs=1e-12)
-    assert (np.diff(cosine) < 0).all()
-    assert (constant == 0.01).all()
-
-
-def test_history_tells_seconds_epoch_and_psnr_that_rises(setup, coreset) -> None:
-    plan, engine = setup(coreset, epochs=12)
-    reached = TrainingProgress()
-    seen = []
-    assert train(engine, plan, coreset, reached, progress=lambda *step: seen.append(step))
-    assert [point["epoch"] for point in reached.history] == list(range(1, 13))
-    assert all(
-        a["seconds"] < b["seconds"]
-        for a, b in zip(reached.history, reached.history[1:], strict=False)
-    )
-    assert reached.history[-1]["psnr"] > reached.history[0]["psnr"] + 5
-    assert reached.history[-1]["psnr"] > 30
-    assert [done for _, done, _, _ in seen] == list(range(1, 12 * plan.batches + 1))
-
-
-def test_checkpoints_come_by_the_clock_too(setup, coreset) -> None:
-    plan, engine = setup(coreset, epochs=2)
-    saved = []
-    assert train(engine, plan, coreset, TrainingProgress(), save=saved.append, save_seconds=0.0)
-    assert saved
 
 
 def test_training_that_diverges_is_an_error(setup, coreset) -> None:
@@ -310,8 +225,111 @@ def test_a_network_that_died_of_its_rate_is_no_result(setup, coreset, rate, says
         assert train(engine, plan, coreset, TrainingProgress())
 
 
-def test_a_budget_ends_the_training(setup, coreset) -> None:
-    plan, engine = setup(coreset)
-    reached = TrainingProgress()
-    assert not train(engine, plan, coreset, reached, budget_seconds=0.0)
-    assert (reached.epoch, reached.batch, engine.step) == (0, 1, 1)
+CONFIG = EncodeConfig(profile="paper", epochs=1, width=8, batch=20_000)
+
+
+@pytest.fixture
+def architecture(coreset) -> Architecture:
+    return Architecture.for_box(coreset.box.shape, 3, width=8)
+
+
+def test_a_training_that_diverges_at_every_rate_is_an_error(
+    coreset, architecture, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("fhash_codec.paper.train.DIVERGED", 0.0)
+    lowest = CONFIG.learning_rate * LOWER**MAX_RESTARTS
+    with (
+        pytest.warns(FhashWarning, match="begins again at a learning rate of") as told,
+        pytest.raises(TrainingError, match=f"even at a learning rate of {lowest:.3g}"),
+    ):
+        train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
+    assert len(told) == MAX_RESTARTS
+
+
+def test_a_checkpoint_of_another_model_is_refused(coreset, architecture, tmp_path) -> None:
+    path = checkpoint_path(tmp_path / "a.fhz", coreset, CONFIG)
+    save_checkpoint(path, {"step": np.array(3)}, TrainingProgress(epoch=0, batch=1))
+    with pytest.raises(InputError, match="does not fit; delete it to train from the start"):
+        train_model(coreset, architecture, CONFIG, tmp_path / "a.fhz")
+
+
+GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
+
+
+def test_a_round_doubles_the_epochs_and_says_so() -> None:
+    decision = decide(GOAL, 44.0, 20, MIN_STEPS, 10.0, [])
+    assert decision.round == Round(epochs=20, psnr=44.0, seconds=10.0)
+    assert "goes on for 20 epochs: the model has 44.00 dB over the coreset" in decision.message
+    assert "45 dB are promised" in decision.message
+    again = decide(GOAL, 44.8, 40, MIN_STEPS, 20.0, [decision.round])
+    assert again.round == Round(epochs=40, psnr=44.8, seconds=20.0)
+
+
+@pytest.mark.parametrize(("seconds", "epochs"), [(50.0, 40), (51.0, 38), (70.0, 17), (96.0, 1)])
+def test_a_round_fits_into_the_time_that_is_left(seconds, epochs) -> None:
+    before = [Round(epochs=20, psnr=40.0, seconds=0.0)]
+    decision = decide(GOAL, 44.0, 40, MIN_STEPS, seconds, before)
+    assert decision.round == Round(epochs=epochs, psnr=44.0, seconds=seconds)
+
+
+@pytest.mark.parametrize(("gain", "goes_on"), [(2.01, True), (1.99, False), (-1.0, False)])
+def test_a_training_that_hardly_learns_in_two_rounds_ends(gain, goes_on) -> None:
+    psnr = 45.5 - MAX_DOUBLINGS
+    first = Round(epochs=20, psnr=psnr - gain, seconds=1.0)
+    # One round may bring nothing.
+    assert decide(GOAL, psnr - gain, 40, MIN_STEPS, 2.0, [first]).round is not None
+    last = Round(epochs=40, psnr=psnr, seconds=2.0)
+    assert decide(GOAL, psnr, 80, MIN_STEPS - 1, 4.0, [first, last]).round is not None
+    decision = decide(GOAL, psnr, 80, MIN_STEPS, 4.0, [first, last])
+    assert (decision.round is not None) == goes_on
+    if not goes_on:
+        assert f"the last 2 rounds brought {gain:.2f} dB" in decision.message
+
+
+def test_a_round_has_rates_of_its_own(setup, coreset) -> None:
+    plan, _ = setup(coreset)
+    longer = extended(plan, 3, "cosine")
+    assert longer.epochs == plan.epochs + 3
+    assert len(longer.rates) == longer.epochs * plan.batches + 1
+    np.testing.assert_array_equal(longer.rates[: len(plan.rates)], plan.rates)
+    further = longer.rates[len(plan.rates) :]
+    assert (np.diff(further) < 0).all()
+    assert further[0] < 0.5 * plan.rates[0]
+    assert further[-1] == pytest.approx(0, abs=1e-12)
+    assert (extended(plan, 3, "constant").rates[len(plan.rates) :] == 0.5 * plan.rates[0]).all()
+
+
+def test_a_training_goes_on_to_its_goal(coreset, tmp_path) -> None:
+    config = EncodeConfig(profile="paper", epochs=5, width=16)
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
+    first = train_model(coreset, architecture, config, tmp_path / "a.fhz")
+    psnr = first.history[-1]["psnr"]
+    assert psnr is not None
+    goal = Goal(psnr=psnr + 2.0, promised=psnr + 1.5, seconds=1e6)
+    with pytest.warns(FhashWarning, match="training goes on"):
+        trained = train_model(coreset, architecture, config, tmp_path / "a.fhz", goal=goal)
+    reached = trained.history[-1]["psnr"]
+    assert reached is not None
+    assert reached > goal.psnr - 0.01
+    assert trained.epochs in (10, 20, 40, 80)
+    # The first epochs are those of the training without a goal.
+    assert trained.history[4]["psnr"] == pytest.approx(psnr, abs=0.01)
+    assert [point["epoch"] for point in trained.history] == list(range(1, trained.epochs + 1))
+
+
+CONFIG_FIT_ON_CUDA = EncodeConfig(
+    profile="paper", epochs=2, width=8, batch=20_000, device="cuda", engine="slab"
+)
+
+
+@pytest.mark.parametrize("tables", ["float16", "transform"])
+def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
+    values = np.add.outer(np.sin(np.linspace(0, 3, 3)), np.random.default_rng(0).random((6, 7, 9)))
+    config = replace(CONFIG_FIT_ON_CUDA, epochs=3, batch=0, tables=tables)
+    with pretended_cuda() as pretended, warnings.catch_warnings():
+        warnings.simplefilter("ignore", FhashWarning)  # of the quality of three epochs
+        figures = fhash_codec.encode(values.astype(np.float32), tmp_path / "a.fhz", config)
+    assert pretended.counts["launches"] > 100
+    assert figures["device"] == "cuda"
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert np.isfinite(volume[:]).any()
