@@ -17,19 +17,16 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf import packing
 from fhash_formats.readers.common.file_series import RawLayout, Request
 from fhash_formats.readers.common.layout import Dimension
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.variables import (
-    Listed,
     Variable,
     expand,
     field_reading,
     group_time,
     join,
     leaves,
-    listing,
+    stacked,
     times,
-)
-from fhash_formats.readers.common.variables import (
-    reading as reading_step_groups,
 )
 
 NESTED = np.dtype(
@@ -311,7 +308,7 @@ def test_only_the_steps_that_are_asked_for_are_read() -> None:
 
         return read
 
-    read = reading_step_groups([reader(step) for step in range(5)])
+    read = stacked([reader(step) for step in range(5)])
     got = read((slice(1, 3), slice(0, 2), slice(1, 3)))
     np.testing.assert_array_equal(got, np.stack(frames[1:3])[:, :, 1:])
     assert calls == [1, 2]
