@@ -30,7 +30,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats import list_variables, open_series
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
-from fhash_formats.readers.common.variables import Listed
+from fhash_formats.readers.common.listing import Listed
 from fhash_formats.series import Series, shown_name
 from fhash_formats.support.files import check_output
 from fhash_formats.support.values import json_attributes

@@ -33,7 +33,13 @@ from fhash_formats.readers.common.cf import note_packing, packing, settled
 from fhash_formats.readers.common.file_series import Request, condense
 from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
 from fhash_formats.readers.common.stored_parts import labelled_parts
-from fhash_formats.readers.common.surroundings import Stored, Wanted, metadata_of, warn_left_out
+from fhash_formats.readers.common.surroundings import (
+    Arranged,
+    Stored,
+    Wanted,
+    metadata_of,
+    warn_left_out,
+)
 from fhash_formats.readers.common.variables import MAX_LISTED, MIN_DIMENSIONS
 from fhash_formats.readers.netcdf import NetcdfFile, declared, stored_variable
 from fhash_formats.series import (
@@ -318,9 +324,10 @@ class LabelledSeries(Series):
             path=self._origin,
         )
         of_file = {key: value for key, value in beside.attrs.items() if key != COORDINATES}
-        packed = self._packing
-        layout, time = self._layout, self.coords["t"]
-        return metadata_of(self.name, variables, of_file, layout, request, wanted, packed, time)
+        arranged = Arranged(
+            layout=self._layout, request=request, packed=self._packing, coords=self.coords
+        )
+        return metadata_of(wanted, variables, of_file, arranged)
 
 
 def _as_file(array: Any, beside: Any, name: str, failed: dict[str, str]) -> xr.Dataset:

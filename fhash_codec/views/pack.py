@@ -215,7 +215,8 @@ class Tiles:
 
     def _decode(self, stream: bytes) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
         """The values of a tile, and its mask where it may have one, as a reader decodes them."""
-        coder, data = self.metadata.coder, memoryview(stream)
+        coder, data = self.metadata.tiles, memoryview(stream)
+        assert coder is not None
         return coder.decode_masked(data) if coder.masked else (coder.decode(data), None)
 
     def _look(self, index: Index) -> _Look:
@@ -456,7 +457,8 @@ def _header(
     config: EncodeConfig,
 ) -> dict[str, Any]:
     """The header of a variable. What only the original data could tell is not in it."""
-    settings, facts = tiles.metadata.coder.settings, tiles.facts
+    coder, facts = tiles.metadata.tiles, tiles.facts
+    settings = None if coder is None else coder.settings
     source = describe_source(series, scan.value_range, config)
     weights, head = 0, None
     if settings is not None and settings.head is not None:

@@ -182,6 +182,7 @@ def test_tiles(drawn: tuple[Any, TileSettings, Coding, Any]) -> None:
     mine = decode_tile(coded.data, values.shape, values.dtype, block)
     theirs = decode_tile_mask(coded.data, values.shape, values.dtype, shared)
     assert equal(mine, theirs)
+    assert equal((mine[0], None), (coded.decoded, None))
 
 
 @looking(30, 1000)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -43,18 +43,7 @@ _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 class ChunkCoder(Protocol):
     """A coder of chunks of one number type and full shape. All methods raise DamagedFileError for
     bytes that do not fit, before they allocate for them.
-
-    Attributes:
-        settings: settings that all chunks share (`TileSettings`); None for a coder without any.
-        axes: axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones.
-        masked: whether the chunks say which of their values are occupied.
-        parted: whether a part of a chunk may be had sooner than all of it, by the last two methods.
     """
-
-    settings: Any
-    axes: Any
-    masked: bool
-    parted: bool
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
@@ -68,8 +57,24 @@ class ChunkCoder(Protocol):
         Raises InputError for a level of detail other than 0 of a coder that has none.
         """
 
+
+class TileCoder(ChunkCoder, Protocol):
+    """The coder of `fhash.transform`, whose chunks are tiles.
+
+    Attributes:
+        settings: settings that all chunks share (`TileSettings`); None where each has its own.
+        axes: axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones.
+        masked: whether the chunks say which of their values are occupied.
+        parted: whether a part of a chunk may be had sooner than all of it, by the last two methods.
+    """
+
+    settings: Any
+    axes: Any
+    masked: bool
+    parted: bool
+
     def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk before it is corrected, of a coder that tells both apart."""
+        """The full chunk before it is corrected."""
 
     def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk and its mask, of a coder that is `masked`."""
@@ -88,11 +93,6 @@ class ChunkCoder(Protocol):
 
 class PlainCoder:
     """The coder of ordinary arrays: `bytes` (little-endian, C order), `zstd`, then `crc32c`."""
-
-    settings: Any = None
-    axes: Any = None
-    masked = False
-    parted = False
 
     def __init__(
         self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
@@ -156,22 +156,6 @@ class PlainCoder:
                 raise MemoryError("no memory to decompress a chunk") from error
             raise DamagedFileError(f"zstd data are damaged: {error}") from error
         return values.astype(self._native, copy=False)
-
-    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk, which nothing corrects."""
-        return self.decode(data)
-
-    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-        """Raises NotImplementedError: the chunks have no mask."""
-        raise NotImplementedError
-
-    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
-        """Raises NotImplementedError: nothing is corrected."""
-        raise NotImplementedError
-
-    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Raises NotImplementedError: nothing is corrected."""
-        raise NotImplementedError
 
 
 def _transform_coder(
@@ -598,6 +582,11 @@ class ArrayMetadata:
         """The coder of full inner chunks."""
         codecs = self.codecs if self.sharding is None else self.sharding.codecs
         return chunk_coder(codecs, self.dtype, self.inner_shape)
+
+    @property
+    def tiles(self) -> TileCoder | None:
+        """The coder of an array whose chunks are tiles; None for another one."""
+        return cast(TileCoder, self.coder) if self.coding == TRANSFORM else None
 
     @property
     def coding(self) -> str:

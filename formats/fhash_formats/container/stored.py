@@ -306,7 +306,8 @@ class StoredArray:
         self.chunk_shape = metadata.inner_shape
         self.grid = metadata.inner_grid
         self.shard_shape = None if metadata.sharding is None else metadata.chunk_shape
-        self.masked = metadata.coder.masked
+        self._tiles = metadata.tiles
+        self.masked = self._tiles is not None and self._tiles.masked
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
@@ -410,12 +411,12 @@ class StoredArray:
     @property
     def settings(self) -> Any:
         """Settings that all chunks share, of arrays coded by `fhash.transform`; else None."""
-        return self._metadata.coder.settings
+        return None if self._tiles is None else self._tiles.settings
 
     @property
     def axes(self) -> Any:
         """Axes of tiles along which the array is coded; None for the usual ones."""
-        return self._metadata.coder.axes
+        return None if self._tiles is None else self._tiles.axes
 
     @property
     def coding(self) -> str:
@@ -525,14 +526,13 @@ class StoredArray:
 
     def _part(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
         """A part of a chunk; of one that was not read before, where it can, without the rest."""
-        coder = self._metadata.coder
-        places = (self.name, index, 0), (self.name + UNCORRECTED, index, 0)
+        tiles, places = self._tiles, ((self.name, index, 0), (self.name + UNCORRECTED, index, 0))
         known = any(self._cache.get(place) is not None for place in places)
-        if known or not (keep and coder.parted):
+        if known or not keep or tiles is None or not tiles.parted:
             return self._chunk(index, keep=keep)[part]
         with self._stored_chunk(index) as data:
-            table = coder.uncorrected(data, part)
-            values = coder.decode(data) if table is None else coder.corrected(table, part)
+            table = tiles.uncorrected(data, part)
+            values = tiles.decode(data) if table is None else tiles.corrected(table, part)
         kept = values if table is None else table
         kept.flags.writeable = False
         self._cache.put(places[table is not None], kept)
@@ -554,11 +554,11 @@ class StoredArray:
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk and its mask, decoded and read-only; `keep` puts both into the cache."""
         table = self._cache.get((self.name + UNCORRECTED, index, lod))
-        if table is None:
+        if table is None or self._tiles is None:
             values, mask = self._decode(index, lod)
         else:
             whole = tuple(slice(0, n) for n in table.shape)
-            values, mask = self._metadata.coder.corrected(table, whole), None
+            values, mask = self._tiles.corrected(table, whole), None
         for name, array in ((self.name, values), (self.name + MASK, mask)):
             if array is not None:
                 array.flags.writeable = False
@@ -574,12 +574,12 @@ class StoredArray:
         table: the chunk before its corrections, without its mask.
         """
         with self._stored_chunk(index) as data:
-            coder = self._metadata.coder
-            if table:
-                return coder.decode_table(data, lod), None
-            if self.masked and not lod:
-                return coder.decode_masked(data)
-            return coder.decode(data, lod), None
+            tiles = self._tiles
+            if tiles is not None and table:
+                return tiles.decode_table(data, lod), None
+            if tiles is not None and tiles.masked and not lod:
+                return tiles.decode_masked(data)
+            return self._metadata.coder.decode(data, lod), None
 
     def coded(self, index: Index) -> memoryview:
         """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""

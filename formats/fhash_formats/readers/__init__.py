@@ -7,7 +7,7 @@ variable and of its axes, coordinates, packed values, stored bytes, errors.
 """
 
 from fhash_formats.readers.common.file_series import RawLayout, parse_shape
-from fhash_formats.readers.common.variables import Listed
+from fhash_formats.readers.common.listing import Listed
 from fhash_formats.readers.registry import (
     REGISTRY,
     Mask,

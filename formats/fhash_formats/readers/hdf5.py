@@ -6,7 +6,7 @@ import importlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common import variables as step_groups
 from fhash_formats.readers.common.cf import (
     NAMES,
     SCALING,
@@ -33,13 +32,12 @@ from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
     Read,
-    arrange,
-    shared_roles,
-    with_roles,
 )
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.stored_parts import Hdf5Sources, not_stored, warn_of_column
 from fhash_formats.readers.common.surroundings import (
     MAX_ARRAYS,
+    Arranged,
     Stored,
     Wanted,
     metadata_of,
@@ -48,15 +46,12 @@ from fhash_formats.readers.common.surroundings import (
 )
 from fhash_formats.readers.common.variables import (
     MIN_DIMENSIONS,
-    Listed,
+    FileOfArrays,
     Variable,
-    choose,
     expand,
     field_reading,
-    listing,
     parent,
     plain_name,
-    series_like,
 )
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, SourceMetadata, shown_name
 from fhash_formats.support.values import PACKING, PLUMBING, json_attributes, text_of
@@ -427,36 +422,20 @@ def open_hdf5(path: Path, request: Request) -> FileSeries:
         raise
 
 
-class Hdf5File:
-    """The variables of an open HDF5 file, what their dimensions are, and how they are read."""
+class Hdf5File(FileOfArrays):
+    """The datasets of an open HDF5 file."""
 
     def __init__(self, source: str, path: Path, file: Any, request: Request) -> None:
-        self.source, self.path, self.file, self.request = source, path, file, request
+        self.path, self.file = path, file
         found = walk(file)
         self.tree, self.groups = found.datasets, found.groups
-        self.variables = step_groups.join(expand(variables(found)), self._attributes)
-
-    def dimensions(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of a variable, with what the file says about each."""
-        return with_roles(self._stated(variable), self._roles)
-
-    @cached_property
-    def _roles(self) -> dict[str, str]:
-        return shared_roles(map(self._stated, series_like(self.variables)))
+        super().__init__(source, request, expand(variables(found)))
 
     def _stated(self, variable: Variable) -> list[Dimension]:
-        if variable.members:
-            steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self._stated(variable.members[0])]
         dataset = variable.handle
         stated = openpmd_axes(self._attributes(parent(variable.name)), dataset.attrs, dataset.shape)
         return [
-            *(
-                _dimension(dimension, length, column)
-                for dimension, length, column in zip(
-                    dataset.dims, dataset.shape, stated, strict=True
-                )
-            ),
+            *map(_dimension, dataset.dims, dataset.shape, stated),
             *(Dimension(name=None, length=length) for length in variable.shape[dataset.ndim :]),
         ]
 
@@ -471,17 +450,13 @@ class Hdf5File:
             return None
         return packing_of(self.source, variable.handle)
 
-    def reading(self, variable: Variable) -> Read:
-        """The function that reads the values of a variable."""
-        if variable.members:
-            step_groups.require_one_type(self.source, variable, self.packing)
-            return step_groups.reading([self.reading(member) for member in variable.members])
+    def _reading(self, variable: Variable) -> Read:
         dataset, packed = variable.handle, self.packing(variable)
         if packed is not None:
             return lambda ranges: packed.unpack(dataset[ranges])
         return field_reading(lambda ranges: dataset[ranges], variable, dataset.ndim)
 
-    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes: what the file ties to a dimension, else by name."""
         group = parent((variable.members or (variable,))[0].name)
         places = [columns(self.tree, place) for place in dict.fromkeys([group, ""])]
@@ -510,16 +485,10 @@ class Hdf5File:
             texts = [text for place in (group, "") for text in texts_of(self.tree, place, length)]
             written = written_times("time", texts)
             coords |= {} if written is None else {"t": written}
-        if variable.members and "t" in layout.axes and 0 not in layout.picked:
-            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
-            step_groups.require_positions(
-                self.source,
-                variable,
-                layout,
-                coords,
-                lambda group: columns(self.tree, group),
-            )
         return coords
+
+    def _columns(self, group: str) -> Mapping[str, Column]:
+        return columns(self.tree, group)
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
         attributes: Mapping[str, Any] = (self.groups.get(path) or self.tree[path]).attrs
@@ -540,15 +509,9 @@ def _counts_steps(column: Column) -> bool:
 def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
     found = Hdf5File(source, path, file, request)
     var = own_name(file, found.tree, request.var) if request.var else None
-    variable = choose(
-        source,
-        found.variables,
-        var,
-        booleans=request.booleans,
-        selected=len(request.select),
-    )
+    variable = found.choose(var)
     found.check(variable)
-    layout = arrange(source, variable.name, found.dimensions(variable), request)
+    layout = found.arrange(variable)
     packed = found.packing(variable)
     scaled = request.raw_values and SCALING & set(variable.handle.attrs)
     first = (variable.members or (variable,))[0]
@@ -625,14 +588,10 @@ def _metadata(
     wanted = Wanted(source=found.source, name=flat[variable.name], path=found.path)
     with refusing(f"{found.source} cannot be read as HDF5"):
         return metadata_of(
-            flat[variable.name],
+            wanted,
             {flat[path]: each for path, each in stored.items()},
             json_attributes(found.file.attrs),
-            layout,
-            found.request,
-            wanted,
-            packed,
-            series.coords["t"],
+            Arranged(layout=layout, request=found.request, packed=packed, coords=series.coords),
         )
 
 

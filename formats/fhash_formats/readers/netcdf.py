@@ -6,14 +6,13 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.readers.common import variables as step_groups
 from fhash_formats.readers.common.cf import (
     MAX_LETTERS,
     Column,
@@ -33,19 +32,14 @@ from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
     Read,
-    arrange,
-    shared_roles,
-    with_roles,
 )
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.stored_parts import hdf5_parts, not_stored
-from fhash_formats.readers.common.surroundings import Stored, Wanted, metadata_of
+from fhash_formats.readers.common.surroundings import Arranged, Stored, Wanted, metadata_of
 from fhash_formats.readers.common.variables import (
-    Listed,
+    FileOfArrays,
     Variable,
-    choose,
-    listing,
     plain_name,
-    series_like,
 )
 from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.series import AXES, Coordinate, SourceMetadata, shown_name
@@ -193,48 +187,39 @@ def check_filters(source: str, path: Path, name: str) -> None:
             require_filters(source, name, dataset)
 
 
-def netcdf_metadata(
+def _metadata(
     path: Path,
     handle: tuple[str, str],
     groups: Collection[str],
-    layout: Layout,
-    request: Request,
-    coords: Mapping[str, Coordinate],
-    packed: Packing | None,
+    arranged: Arranged,
     without: Collection[str],
-) -> Callable[[], SourceMetadata]:
-    """A function that reads what belongs to a variable.
+) -> SourceMetadata:
+    """What belongs to a variable.
 
     handle: group and name of the variable. groups: its own group and those around it, the nearest
-        first. coords: positions of the axes. packed: how the values are
-        packed; None where they are read as they are stored. without: attributes that do not hold
-        for the values.
+        first. without: attributes that do not hold for the values.
     """
-
-    def read() -> SourceMetadata:
-        source = str(path)
-        with refusing(f"{source} cannot be read as NetCDF"):
-            with quietly():
-                opened = open_groups(source, path, magic_of(path), decoded=False)
-            try:
-                scope = [opened[group] for group in groups if group in opened]
-                variables = {
-                    str(name): stored_variable(array)
-                    for dataset in reversed(scope)
-                    for name, array in dataset.variables.items()
-                }
-                used = [each.name for each in coords.values()]
-                wanted = Wanted(
-                    source=source, name=handle[1], used=used, without=without, path=path
-                )
-                attributes = scope[0].attrs
-                return metadata_of(
-                    handle[1], variables, attributes, layout, request, wanted, packed, coords["t"]
-                )
-            finally:
-                close_groups(opened)
-
-    return read
+    source = str(path)
+    with refusing(f"{source} cannot be read as NetCDF"):
+        with quietly():
+            opened = open_groups(source, path, magic_of(path), decoded=False)
+        try:
+            scope = [opened[group] for group in groups if group in opened]
+            variables = {
+                str(name): stored_variable(array)
+                for dataset in reversed(scope)
+                for name, array in dataset.variables.items()
+            }
+            wanted = Wanted(
+                source=source,
+                name=handle[1],
+                used=[each.name for each in arranged.coords.values()],
+                without=without,
+                path=path,
+            )
+            return metadata_of(wanted, variables, scope[0].attrs, arranged)
+        finally:
+            close_groups(opened)
 
 
 def stored_variable(array: xr.Variable) -> Stored:
@@ -293,13 +278,13 @@ def open_netcdf(path: Path, request: Request) -> FileSeries:
             raise
 
 
-class NetcdfFile:
-    """The variables of an open NetCDF file, what their dimensions are, and how they are read."""
+class NetcdfFile(FileOfArrays):
+    """The variables of an open NetCDF file."""
 
     def __init__(
         self, source: str, path: Path, groups: Mapping[str, xr.Dataset], request: Request
     ) -> None:
-        self.source, self.path, self.groups, self.request = source, path, groups, request
+        self.path, self.groups = path, groups
         found = [
             Variable(
                 name=f"{group}/{name}".lstrip("/"),
@@ -312,7 +297,7 @@ class NetcdfFile:
             for group, dataset in groups.items()
             for name, array in ((str(name), array) for name, array in dataset.variables.items())
         ]
-        self.variables = step_groups.join(found, self._attributes)
+        super().__init__(source, request, found)
 
     def array(self, variable: Variable) -> xr.Variable:
         """The stored array of a variable; of the first step where it has one array a step."""
@@ -325,41 +310,23 @@ class NetcdfFile:
             self.groups[place] for place in _upwards(variable.handle[0]) if place in self.groups
         ]
 
-    def dimensions(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of a variable, with what the file says about each."""
-        return with_roles(self._stated(variable), self._roles)
-
-    @cached_property
-    def _roles(self) -> dict[str, str]:
-        return shared_roles(map(self._stated, series_like(self.variables)))
-
     def _stated(self, variable: Variable) -> list[Dimension]:
-        scope = self.scope(variable)
-        found = []
-        for name, length in zip(*_named_lengths(self.array(variable)), strict=True):
-            column = _labels(name, length, scope)
-            made_up = name.startswith(MADE_UP)
-            found.append(
-                Dimension(
-                    name=None if made_up else name,
-                    length=length,
-                    role=_role(name, scope),
-                    column=column,
-                )
+        scope, array = self.scope(variable), self.array(variable)
+        return [
+            Dimension(
+                name=None if name.startswith(MADE_UP) else name,
+                length=length,
+                role=_role(name, scope),
+                column=_labels(name, length, scope),
             )
-        if variable.members:
-            return [Dimension(name="step", length=len(variable.members), role="t"), *found]
-        return found
+            for name, length in zip(map(str, array.dims), array.shape, strict=True)
+        ]
 
     def packing(self, variable: Variable) -> Packing | None:
         """The packing of the values, None where the user wants them as stored."""
         return None if self.request.raw_values else declared(self.source, self.array(variable))
 
-    def reading(self, variable: Variable) -> Read:
-        """The function that reads the values of a variable."""
-        if variable.members:
-            step_groups.require_one_type(self.source, variable, self.packing)
-            return step_groups.reading([self.reading(member) for member in variable.members])
+    def _reading(self, variable: Variable) -> Read:
         check_filters(self.source, self.path, variable.name)
         array = self.array(variable)
         exact = None
@@ -373,14 +340,14 @@ class NetcdfFile:
 
         return read
 
-    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes, of what was selected, and of scalars that lie beside."""
         group, name = variable.handle
         names = [str(dimension) for dimension in self.array(variable).dims]
         if variable.members:
             names.insert(0, MADE_UP + "step")
         kept = [name for place, name in enumerate(names) if place not in layout.picked]
-        coords = layout.coordinates(self.source, {}) | _coordinates(
+        return layout.coordinates(self.source, {}) | _coordinates(
             self.source,
             layout.axes,
             kept,
@@ -389,16 +356,9 @@ class NetcdfFile:
             self.groups[group][name],
             self.request.axes is not None,
         )
-        if variable.members and "t" in layout.axes and 0 not in layout.picked:
-            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
-            step_groups.require_positions(
-                self.source,
-                variable,
-                layout,
-                coords,
-                lambda group: _columns(self.groups[f"/{group}"]),
-            )
-        return coords
+
+    def _columns(self, group: str) -> Mapping[str, Column]:
+        return _columns(self.groups[f"/{group}"])
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
         group, _, name = path.rpartition("/")
@@ -413,10 +373,6 @@ class NetcdfFile:
         if array is None or array.size != 1 or array.dtype.kind not in "iuf":
             return None
         return float(array.to_numpy().reshape(-1)[0]), str(array.attrs.get("units", ""))
-
-
-def _named_lengths(array: xr.Variable) -> tuple[list[str], tuple[int, ...]]:
-    return [str(name) for name in array.dims], array.shape
 
 
 def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column | None:
@@ -443,14 +399,8 @@ def _series(
     source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request
 ) -> FileSeries:
     found = NetcdfFile(source, path, groups, request)
-    variable = choose(
-        source,
-        found.variables,
-        request.var,
-        booleans=request.booleans,
-        selected=len(request.select),
-    )
-    layout = arrange(source, variable.name, found.dimensions(variable), request)
+    variable = found.choose(request.var)
+    layout = found.arrange(variable)
     array = found.array(variable)
     packed = declared(source, array)
     without = STORED
@@ -496,15 +446,12 @@ def _series(
         close()
         raise
     if not variable.members and not any(str(name).startswith(MADE_UP) for name in array.dims):
-        scope = _upwards(variable.handle[0])
-        series.metadata = netcdf_metadata(
+        series.metadata = partial(
+            _metadata,
             path,
             variable.handle,
-            scope,
-            layout,
-            request,
-            series.coords,
-            packed,
+            _upwards(variable.handle[0]),
+            Arranged(layout=layout, request=request, packed=packed, coords=series.coords),
             without if request.raw_values else (),
         )
     return series

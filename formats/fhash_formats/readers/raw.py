@@ -20,14 +20,13 @@ from fhash_formats.readers.common.file_series import (
     refusing,
 )
 from fhash_formats.readers.common.layout import Dimension, arrange
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.stored_bytes import FlatArray
 from fhash_formats.readers.common.variables import (
-    Listed,
     Variable,
     choose,
     expand,
     field_reading,
-    listing,
 )
 from fhash_formats.series import AXES
 

@@ -45,8 +45,9 @@ from fhash_formats.readers.common.file_series import (
     refusing,
     selection,
 )
+from fhash_formats.readers.common.listing import Listed, listed_series
 from fhash_formats.readers.common.stored_parts import require_inside
-from fhash_formats.readers.common.variables import Listed, SeveralVariablesError, listed_series
+from fhash_formats.readers.common.variables import SeveralVariablesError
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern, warn_of_gaps
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
 

@@ -17,8 +17,8 @@ from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
 from fhash_formats.readers.common.cf import Packing
 from fhash_formats.readers.common.file_series import FileSeries, Request, condense, refusing
-from fhash_formats.readers.common.layout import Layout, arrange, label
-from fhash_formats.readers.common.variables import Variable, choose
+from fhash_formats.readers.common.layout import Layout, label
+from fhash_formats.readers.common.variables import Variable
 from fhash_formats.readers.zarr_store import ZarrTree, open_tree, series_in
 from fhash_formats.series import AXES
 from fhash_formats.transform.stream import MAX_TILE_VERTICES, NO_AXIS, TILE_AXES, ArrayAxes
@@ -51,11 +51,9 @@ def open_coded(path: Path, request: Request) -> Iterator[tuple[FileSeries, Coded
     store, found = open_tree(path, request)
     try:
         with refusing(f"{path} cannot be read as zarr"):
-            variable = choose(
-                found.source, found.variables, request.var, selected=len(request.select)
-            )
+            variable = found.choose(request.var)
             packed = _require_coded(found, variable)
-            layout = arrange(found.source, variable.name, found.dimensions(variable), request)
+            layout = found.arrange(variable)
             series = series_in(found.root, store, found)
         yield (
             series,

@@ -7,9 +7,9 @@ import binascii
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common import variables as step_groups
 from fhash_formats.readers.common.cf import (
     MAX_LETTERS,
     SCALING,
@@ -44,23 +43,24 @@ from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
     Read,
-    arrange,
-    shared_roles,
-    with_roles,
 )
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.stored_parts import not_stored, warn_of_column, zarr_parts
-from fhash_formats.readers.common.surroundings import Stored, Wanted, metadata_of, named_dimensions
+from fhash_formats.readers.common.surroundings import (
+    Arranged,
+    Stored,
+    Wanted,
+    metadata_of,
+    named_dimensions,
+)
 from fhash_formats.readers.common.variables import (
     MIN_DIMENSIONS,
-    Listed,
+    FileOfArrays,
     Variable,
-    choose,
     expand,
     field_reading,
-    listing,
     parent,
     plain_name,
-    series_like,
 )
 from fhash_formats.readers.hdf5 import sibling
 from fhash_formats.series import Coordinate, SourceMetadata, shown_name
@@ -149,61 +149,41 @@ def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
     return [str(name) if name is not None else None for name in names]
 
 
-def zarr_metadata(
-    root: Path,
-    path: str,
-    arrays: Mapping[str, zarr.Array[Any]],
-    groups: Mapping[str, Mapping[str, Any]],
-    layout: Layout,
-    request: Request,
-    coords: Mapping[str, Coordinate],
-    packed: Packing | None,
-    without: Collection[str],
-) -> Callable[[], SourceMetadata | None]:
-    """A function that reads what belongs to an array.
+def _metadata(
+    found: ZarrTree, path: str, arranged: Arranged, without: Collection[str]
+) -> SourceMetadata | None:
+    """What belongs to an array at a path.
 
-    It gives None where dimensions have no names, and nothing but positions lies beside the array.
+    None where dimensions have no names, and nothing but positions lies beside the array.
 
-    root: of the hierarchy. path: of the array in it. arrays, groups: all of them, and the
-    attributes of groups. The other arguments are those of `netcdf_metadata`.
+    without: attributes that do not hold for the values.
     """
-
-    def read() -> SourceMetadata | None:
-        source = str(root)
-        group, _, name = path.rpartition("/")
-        with refusing(f"{source} cannot be read as zarr"):
-            if not name:
+    group, _, name = path.rpartition("/")
+    layout, coords = arranged.layout, arranged.coords
+    with refusing(f"{found.source} cannot be read as zarr"):
+        if not name:
+            return None
+        variables = {
+            each.rpartition("/")[2]: stored
+            for place in dict.fromkeys(["", group])  # those of the nearest place count
+            for each, stored in _stored_in(found.arrays, place)
+        }
+        taken = {each.name.rpartition("/")[2]: None for each in coords.values()}
+        if None in dimension_names(found.arrays[path]):
+            if not any(
+                each not in (name, *taken) and len(stored.shape) < MIN_DIMENSIONS
+                for each, stored in variables.items()
+            ):
                 return None
-            variables = {
-                each.rpartition("/")[2]: stored
-                for place in dict.fromkeys(["", group])  # those of the nearest place count
-                for each, stored in _stored_in(arrays, place)
-            }
-            if None in dimension_names(arrays[path]):
-                taken = {each.name.rpartition("/")[2] for each in coords.values()}
-                if not any(
-                    each not in (name, *taken) and len(stored.shape) < MIN_DIMENSIONS
-                    for each, stored in variables.items()
-                ):
-                    return None
-                own = tuple(named_dimensions(layout, coords))
-                variables[name] = replace(variables[name], dimensions=own)
-                for each in taken & variables.keys():  # positions have their own dimension
-                    if variables[each].shape in [(length,) for length in layout.shape]:
-                        variables[each] = replace(variables[each], dimensions=(each,))
-            wanted = Wanted(
-                source=source,
-                name=name,
-                used=[each.name.rpartition("/")[2] for each in coords.values()],
-                without=without,
-                path=root,
-            )
-            attributes = groups.get(group, {})
-            return metadata_of(
-                name, variables, attributes, layout, request, wanted, packed, coords["t"]
-            )
-
-    return read
+            own = tuple(named_dimensions(layout, coords))
+            variables[name] = replace(variables[name], dimensions=own)
+            for each in taken.keys() & variables.keys():  # positions have their own dimension
+                if variables[each].shape in [(length,) for length in layout.shape]:
+                    variables[each] = replace(variables[each], dimensions=(each,))
+        wanted = Wanted(
+            source=found.source, name=name, used=[*taken], without=without, path=found.root
+        )
+        return metadata_of(wanted, variables, found.groups.get(group, {}), arranged)
 
 
 def _stored_in(arrays: Mapping[str, zarr.Array[Any]], group: str) -> Sequence[tuple[str, Stored]]:
@@ -327,8 +307,8 @@ def open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
         raise
 
 
-class ZarrTree:
-    """The variables of an open hierarchy, what their dimensions are, and how they are read."""
+class ZarrTree(FileOfArrays):
+    """The arrays of an open hierarchy."""
 
     def __init__(
         self,
@@ -338,24 +318,10 @@ class ZarrTree:
         failed: Mapping[str, str],
         request: Request,
     ) -> None:
-        self.source, self.root, self.request = str(root), root, request
-        self.arrays, self.groups = arrays, groups
-        self.variables = step_groups.join(
-            expand(_variables(root, arrays, failed)), self._attributes
-        )
-
-    def dimensions(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of a variable, with what the store says about each."""
-        return with_roles(self._stated(variable), self._roles)
-
-    @cached_property
-    def _roles(self) -> dict[str, str]:
-        return shared_roles(map(self._stated, series_like(self.variables)))
+        self.root, self.arrays, self.groups = root, arrays, groups
+        super().__init__(str(root), request, expand(_variables(root, arrays, failed)))
 
     def _stated(self, variable: Variable) -> list[Dimension]:
-        if variable.members:
-            steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self._stated(variable.members[0])]
         path, array = variable.handle
         columns = self._places(path)
         stored = zip(dimension_names(array), array.shape, strict=True)
@@ -372,15 +338,11 @@ class ZarrTree:
         """The packing of the values, None where the user wants them as stored."""
         return None if variable.field else self.values(variable).packing
 
-    def reading(self, variable: Variable) -> Read:
-        """The function that reads the values of a variable."""
-        if variable.members:
-            step_groups.require_one_type(self.source, variable, self.packing)
-            return step_groups.reading([self.reading(member) for member in variable.members])
+    def _reading(self, variable: Variable) -> Read:
         values = self.values(variable)
         return field_reading(values.read, variable, values.array.ndim)
 
-    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes: those along a dimension by its name, else by their own name."""
         columns = self._places(variable.handle[0])
         lower = [{name.lower(): column for name, column in place.items()} for place in columns]
@@ -414,9 +376,6 @@ class ZarrTree:
             texts = self._texts(variable.handle[0], str(dimension.name), dimension.length)
             written = written_times(str(dimension.name), texts)
             coords |= {} if written is None else {"t": written}
-        if variable.members and "t" in layout.axes and 0 not in layout.picked:
-            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
-            step_groups.require_positions(self.source, variable, layout, coords, self._own_columns)
         return coords
 
     def _places(self, path: str) -> list[dict[str, Column]]:
@@ -437,7 +396,7 @@ class ZarrTree:
                 rows = [b"".join(row) for row in found.tolist()] if letters else found
                 yield name, np.asarray(rows), dict(array.attrs)
 
-    def _own_columns(self, group: str) -> dict[str, Column]:
+    def _columns(self, group: str) -> dict[str, Column]:
         columns = _columns(self.source, self.arrays, group)
         return {name.lower(): column for name, column in columns.items()}
 
@@ -465,14 +424,8 @@ def _dimension(columns: Sequence[Mapping[str, Column]], name: str | None, length
 def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     """The series of the wanted variable of an open hierarchy, which closes its store."""
     request = found.request
-    variable = choose(
-        found.source,
-        found.variables,
-        request.var,
-        booleans=request.booleans,
-        selected=len(request.select),
-    )
-    layout = arrange(found.source, variable.name, found.dimensions(variable), request)
+    variable = found.choose(request.var)
+    layout = found.arrange(variable)
     path, array = variable.handle
     packed = found.packing(variable)
     scaled = request.raw_values and SCALING & set(array.attrs)
@@ -507,17 +460,9 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
         ),
     )
     if not variable.members and not variable.field:
-        series.metadata = zarr_metadata(
-            root,
-            path,
-            found.arrays,
-            found.groups,
-            layout,
-            request,
-            series.coords,
-            packed,
-            without if request.raw_values else (),
-        )
+        arranged = Arranged(layout=layout, request=request, packed=packed, coords=series.coords)
+        unfit = without if request.raw_values else ()
+        series.metadata = partial(_metadata, found, path, arranged, unfit)
     return series
 
 

@@ -18,7 +18,6 @@ from fhash_formats.transform.decoding import (
     decode_tile_table,
     uncorrected,
 )
-from fhash_formats.transform.encoding import encode_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings, parse_stream
 
 KEY = "axes"
@@ -179,9 +178,10 @@ class TransformCoder:
                 "fhash.transform without settings only decodes here; "
                 "fhash_formats.transform.zarr_codec chooses them"
             )
-        if self.axes is not None:
-            return encode_tile(self.axes.to_tile(chunk), self.settings).data
-        return encode_tile(chunk.reshape(self._tile_shape), self.settings).data
+        from fhash_formats.transform.encoding import encode_tile  # which a decoder does without
+
+        tile = chunk.reshape(self._tile_shape) if self.axes is None else self.axes.to_tile(chunk)
+        return encode_tile(tile, self.settings).data
 
     def check(self, data: memoryview | bytes) -> None:
         """Raises DamagedFileError for a stream that is damaged."""

@@ -39,21 +39,6 @@ def memory():
     return fs
 
 
-def test_a_range_is_one_request(range_server) -> None:
-    file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
-    assert file.size == len(DATA)
-    assert range_server.taken() == (1, 0)
-    assert file.fetch(300, 700) == DATA[300:700]
-    assert range_server.taken() == (1, 400)
-
-
-def test_ranges_of_several_threads(range_server) -> None:
-    file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
-    with ThreadPoolExecutor(8) as pool:
-        got = list(pool.map(lambda start: file.fetch(start, start + 99), range(0, 6400, 100)))
-    assert got == [DATA[start : start + 99] for start in range(0, 6400, 100)]
-
-
 @pytest.mark.parametrize("failure", [503, 500, 429, 408, "drop"])
 def test_a_failure_that_may_pass_is_tried_again(range_server, pauses, failure) -> None:
     file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
@@ -71,13 +56,6 @@ def test_a_failure_that_stays_is_told(range_server, pauses) -> None:
         file.fetch(5, 9)
     assert pauses == list(PAUSES)
     assert file.fetch(5, 9) == DATA[5:9]
-
-
-def test_opening_is_tried_again(range_server, pauses) -> None:
-    url = range_server.put("run.fhz", DATA)
-    range_server.failures = [503] * 4
-    assert FsspecFile.open(url, {}).size == len(DATA)
-    assert pauses == list(PAUSES)[:2]  # each trial asks by HEAD and by GET
 
 
 def test_nobody_listens(range_server, pauses) -> None:
@@ -130,13 +108,6 @@ def test_a_large_file_is_not_read_whole(range_server, monkeypatch) -> None:
     file = FsspecFile.open(range_server.put("run.fhz", DATA), {})
     with pytest.raises(InputError, match=r"no range requests.*download it first"):
         file.fetch(300, 700)
-
-
-def test_a_server_that_does_not_say_a_size(range_server) -> None:
-    range_server.sized = False
-    url = range_server.put("run.fhz", DATA)
-    # HEAD tells none; the GET that fsspec asks next does.
-    assert FsspecFile.open(url, {}).size == len(DATA)
 
 
 def test_no_size_at_all(memory, monkeypatch) -> None:

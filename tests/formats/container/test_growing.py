@@ -107,18 +107,6 @@ def test_an_end_that_later_ones_took_the_place_of_is_changed_rather_than_damaged
         np.testing.assert_array_equal(late.coordinate("time").values, np.arange(6.0) ** 2)
 
 
-def test_zarr_reads_every_state(tmp_path) -> None:
-    zarr = pytest.importorskip("zarr")
-    pytest.importorskip("fhash_formats.transform.zarr_codec")
-    path = tmp_path / "a.fhz"
-    with GrowingContainer(path) as growing:
-        for number in range(2):
-            add_layer(growing, number)
-            with zarr.storage.ZipStore(path, mode="r") as store:
-                array = zarr.open_array(store, path="values", mode="r")
-                assert array.shape[0] == 2 * number + 2
-
-
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
 def test_killed_at_one_line_of_five_it_leaves_a_complete_file(tmp_path) -> None:
     result = subprocess.run(
@@ -232,30 +220,6 @@ def test_a_header_that_does_not_fit_changes_nothing(tmp_path) -> None:
     assert check_layers(path) == 1
 
 
-def test_the_grown_file_is_that_of_a_plain_writer_but_for_the_order_of_its_members(
-    tmp_path,
-) -> None:
-    with GrowingContainer(tmp_path / "a.fhz") as growing:
-        add_layer(growing, 0)
-        add_layer(growing, 1)
-    array = growing_array()
-    with ContainerWriter(tmp_path / "b.fhz") as writer, Container.open(tmp_path / "a.fhz") as grown:
-        table = grown.arrays["tables/level_1"]
-        writer.add_sharded(
-            "tables/level_1",
-            shape=table.shape,
-            dtype=table.dtype,
-            chunk_shape=table.chunk_shape,
-            shard_shape=array.chunk_shape,
-            chunks=(bytes(table.coded(index)) for index in np.ndindex(*table.grid)),
-            dimension_names=table.dimension_names,
-            codecs=array.codecs,
-        )
-        writer.commit(growing_header(4))
-        size = grown.size
-    assert (tmp_path / "b.fhz").stat().st_size == size
-
-
 def test_an_interrupt_while_the_hidden_file_is_made_leaves_none(tmp_path, monkeypatch) -> None:
     """A signal may come after the file was made, and before anything knows of it."""
 
@@ -274,18 +238,6 @@ def test_an_interrupt_while_the_hidden_file_is_made_leaves_none(tmp_path, monkey
     with pytest.raises(KeyboardInterrupt), GrowingContainer(tmp_path / "b.fhz") as growing:
         add_layer(growing, 0)
     assert os.listdir(tmp_path) == ["a.fhz"]
-
-
-def test_a_full_disk_before_the_check_of_the_end_is_explained(tmp_path, monkeypatch) -> None:
-    def full(self, tail):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with GrowingContainer(tmp_path / "a.fhz") as growing:
-        add_layer(growing, 0)
-        monkeypatch.setattr(GrowingContainer, "_open", full)
-        with pytest.raises(OutputError, match=r"a\.fhz: no space left.*the layers before"):
-            add_layer(growing, 1)
-    assert check_layers(tmp_path / "a.fhz") == 1
 
 
 @pytest.mark.parametrize("most", [1, 200])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -27,7 +26,6 @@ from fhash_formats.container.header import (
     describe_positions,
     positions,
 )
-from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.series import Coordinate, index_coordinate
 
@@ -142,10 +140,6 @@ def test_random_positions_come_back() -> None:
         there_and_back(values)
 
 
-def test_a_rule_that_leaves_float64_gives_infinities() -> None:
-    assert positions({"start": 1e308, "step": 1e308}, 3)[1:].tolist() == [np.inf, np.inf]
-
-
 def coords():
     return {
         "t": Coordinate(
@@ -200,13 +194,6 @@ def test_ulps_need_a_rule(tmp_path, samples) -> None:
         write(tmp_path / "b.fhz", header)
 
 
-def test_an_axis_without_positions_is_refused(tmp_path, samples) -> None:
-    header = samples.compact_header()
-    del header["coordinates"]["y"]
-    with pytest.raises(InputError, match="array coords/y is missing"):
-        write(tmp_path / "a.fhz", header)
-
-
 WRONG_ARRAYS = {
     "another length": (np.zeros(1), {}, "coords/time is float64 [(]1,[)]"),
     "another type": (np.zeros(4, np.float32), {}, "coords/time is float32"),
@@ -218,21 +205,6 @@ def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, cas
     values, attributes, message = WRONG_ARRAYS[case]
     with pytest.raises(InputError, match=message):
         write(tmp_path / "a.fhz", samples.compact_header(), [("coords/time", values, attributes)])
-
-
-def test_the_profile_paper_has_positions_in_the_header_too(sample, samples) -> None:
-    header = samples.header()
-    arrays = samples.arrays(header)
-    with Container.open(sample) as container:
-        np.testing.assert_array_equal(container.coordinate("x").values, arrays["coords/x"])
-    header["coordinates"] = {"x": {"step": 0.5}}
-    del arrays["coords/x"]
-    samples.write(sample, header, arrays, force=True)
-    with Container.open(sample) as container:
-        np.testing.assert_array_equal(container.coordinate("x").values, np.arange(6) * 0.5)
-    header["coordinates"] = {"x": {"step": None}}
-    with pytest.raises(InputError, match=r"coordinates\.x\.step"):
-        samples.write(sample, header, arrays, force=True)
 
 
 @pytest.mark.parametrize(
@@ -558,51 +530,3 @@ def test_values_of_another_form_stay() -> None:
     assert complete({})["config"] == CONFIG_DEFAULTS
     complete({})["config"]["without"].append("ssim")
     assert CONFIG_DEFAULTS["without"] == DEFAULTS["config"]["without"] == []
-
-
-VALUES = {
-    "object": {"inner": 1.5},
-    "objects": [{"n": 1}, {"n": "x"}],
-    "text": "abc",
-    "texts": ["a", "b"],
-    "integer": 7,
-    "integers": [1, 2],
-    "number": -0.5,
-    "numbers": [1, 2.5],
-    "null": None,
-    "huge": 10**400,
-}
-
-
-def test_values_come_back() -> None:
-    record = Record(VALUES, "key ")
-    assert record.record("object").number("inner") == 1.5
-    assert [entry.get("n") for entry in record.records("objects")] == [1, "x"]
-    assert (record.text("text"), record.texts("texts")) == ("abc", ["a", "b"])
-    assert (record.integer("integer", 7, 7), record.integers("integers", 2, 1, 2)) == (7, [1, 2])
-    assert (record.number("number"), record.numbers("numbers", 2)) == (-0.5, [1.0, 2.5])
-    assert record.number_or_null("null") is record.number_or_null("none") is None
-    assert record.choice("text", ("abc", "d")) == "abc"
-    assert record.has("null")
-    assert not record.has("none")
-
-
-@pytest.mark.parametrize(
-    ("take", "message"),
-    [
-        (lambda r: r.get("none"), "key none is missing"),
-        (lambda r: r.record("text"), "key text is 'abc'; needed: an object"),
-        (lambda r: r.record("object").text("inner"), "key object.inner is 1.5; needed: a string"),
-        (lambda r: r.records("objects")[1].number("n"), "key objects.1.n is 'x'; needed: a finite"),
-        (lambda r: r.integer("integer", 8, 9), "key integer is 7; needed: a whole number from 8"),
-        (lambda r: r.integer("number", -1, 1), "key number is -0.5; needed: a whole number"),
-        (lambda r: r.integers("integers", 3, 1, 2), "needed: 3 whole numbers from 1 to 2"),
-        (lambda r: r.number("huge"), "key huge is 1000.*; needed: a finite number"),
-        (lambda r: r.numbers("numbers", 1), "key numbers is .*; needed: 1 finite numbers"),
-        (lambda r: r.choice("text", ("d", "e")), "needed: d or e"),
-        (lambda r: r.texts("numbers"), "needed: a list of strings"),
-    ],
-)
-def test_another_value_is_named(take: Callable[[Record], object], message: str) -> None:
-    with pytest.raises(DamagedFileError, match=message):
-        take(Record(VALUES, "key "))

@@ -206,17 +206,6 @@ def test_one_variable_has_the_names_of_its_source(tmp_path, samples) -> None:
         assert container.header["dimensions"] == ["time", "z", "lat", "lat_2"]
 
 
-def test_other_arrays_lie_with_the_parts(tmp_path, samples) -> None:
-    header = samples.header()
-    samples.write(tmp_path / "a.fhz", header, samples.arrays(header))
-    with Container.open(tmp_path / "a.fhz") as container:
-        paths = {name: array.name for name, array in container.arrays.items()}
-    assert paths["tables/level_1"] == "parts/0.tables.level_1"
-    assert paths["occupancy/bits"] == "parts/0.occupancy.bits"
-    assert paths["coords/x"] == "x"
-    assert "array" not in container.header
-
-
 def test_an_array_at_the_root_never_stands_for_one_of_the_format(tmp_path, samples) -> None:
     """Its path is the name of another one, and it is of another shape."""
     path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts())

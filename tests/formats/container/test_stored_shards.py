@@ -282,18 +282,6 @@ def test_one_region_of_a_file_elsewhere_is_one_request(tmp_path, samples, range_
         assert container.verify() == 2
 
 
-def test_many_indices_are_read_together(tmp_path, samples, range_server) -> None:
-    values = random_values((16, 40, 40))
-    path = write_sharded(tmp_path / "a.fhz", samples, values, (1, 20, 20), (1, 40, 40))
-    with remote(range_server, path) as container:
-        array = container.arrays[NAME]
-        np.testing.assert_array_equal(
-            array.read((slice(0, 16), slice(0, 20), slice(0, 20))), values[:, :20, :20]
-        )
-        # Indices and chunks of 16 shards: all lie together, and some ends beside them.
-        assert range_server.taken()[0] <= 3
-
-
 def test_a_large_index_is_read_by_entries(tmp_path, samples, range_server) -> None:
     values = random_values((2, 2400, 4))
     path = write_sharded(tmp_path / "a.fhz", samples, values, (2, 1, 4), (2, 2400, 4))

@@ -114,18 +114,6 @@ def test_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, samples, monk
         assert list(tmp_path.iterdir()) == []
 
 
-def test_existing_output_needs_force(sample, samples) -> None:
-    header = samples.header()
-    with pytest.raises(OutputExistsError, match="force"):
-        samples.write(sample, header, samples.arrays(header))
-    samples.write(sample, header, samples.arrays(header), force=True)
-
-
-def test_missing_folder(tmp_path, samples) -> None:
-    with pytest.raises(OutputError, match="folder"):
-        samples.write(tmp_path / "none" / "a.fhz", samples.header(), {})
-
-
 GOOD = {
     "shape": (4,),
     "dtype": "int16",

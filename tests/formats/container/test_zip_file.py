@@ -22,7 +22,6 @@ from hostile_files import FLAGS, FULL_SIZE, METHOD, OFFSET, ROOT, SIZE, read_eve
 
 from fhash_formats.container import Container
 from fhash_formats.container.zip_file import (
-    CountedSource,
     FileSource,
     Member,
     OpenFileSource,
@@ -78,13 +77,6 @@ def test_a_file_is_damaged_rather_than_changed_if_nobody_wrote_to_it_since(tmp_p
     assert not source.changed()
 
 
-def test_closed_container(sample) -> None:
-    with Container.open(sample) as container:
-        pass
-    with pytest.raises(InputError, match="closed"):
-        container.arrays["mlp/weight_1"].read()
-
-
 def test_a_preview_is_the_file_followed_by_its_tail(tmp_path) -> None:
     (tmp_path / "a").write_bytes(b"abcdefgh")
     preview = PreviewSource(FileSource(tmp_path / "a"), 5, b"XYZ")
@@ -97,17 +89,6 @@ def test_a_preview_is_the_file_followed_by_its_tail(tmp_path) -> None:
         with pytest.raises(DamagedFileError, match="outside the file of 8 bytes"):
             preview.read(offset, size)
     preview.close()
-
-
-def test_bytes_that_were_read_are_counted(tmp_path) -> None:
-    (tmp_path / "a").write_bytes(b"abcdefgh")
-    source = CountedSource(FileSource(tmp_path / "a"))
-    assert source.read(2, 3) + source.read(0, 0) + source.read(7, 1) == b"cdeh"
-    assert source.bytes_read == 4
-    with pytest.raises(DamagedFileError, match="outside the file"):
-        source.read(7, 2)
-    assert source.bytes_read == 4
-    source.close()
 
 
 @pytest.mark.skipif(not hasattr(os, "pread"), reason="one thread at a time without os.pread")
@@ -173,15 +154,6 @@ def test_neighbours_are_one_request() -> None:
 def test_a_request_of_several_ranges_has_a_limit() -> None:
     assert places(merged([(0, 6), (6, 6), (12, 6)], gap=0, most=12)) == [(0, 12), (12, 18)]
     assert places(merged([(0, 60), (60, 6)], gap=0, most=12)) == [(0, 60), (60, 66)]
-
-
-def test_a_range_within_another() -> None:
-    (request,) = merged([(0, 50), (10, 5), (10, 5)], gap=0, most=100)
-    assert (request.place, request.size, request.ranges) == ((0, 50), 50, ((0, 50), (10, 5)))
-
-
-def test_nothing() -> None:
-    assert merged([], gap=5, most=5) == []
 
 
 def test_every_range_lies_in_one_request() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -22,12 +20,6 @@ def built_copy(tmp_path: Path) -> Path:
     """A folder with a copy of the native library."""
     shutil.copy(SOURCES / "_core.so", tmp_path)
     return tmp_path
-
-
-def test_every_thread_gets_the_same_library() -> None:
-    with ThreadPoolExecutor(4) as pool:
-        libraries = list(pool.map(lambda _: native.library(), range(16)))
-    assert all(library is libraries[0] for library in libraries)
 
 
 def test_a_folder_without_a_build_is_a_plain_error(tmp_path: Path) -> None:
@@ -57,14 +49,6 @@ def test_a_library_that_lacks_a_function_is_a_plain_error(
 ) -> None:
     with pytest.raises(MissingDependencyError, match=r"cannot be used .*fhash_nothing"):
         load_library(built_copy, "_core", ABI_VERSION, prototypes, version_symbol=version_symbol)
-
-
-def test_arguments_of_another_type_are_refused() -> None:
-    library = native.library()
-    assert library is not None
-    assert library.fhash_abi_version() == ABI_VERSION
-    with pytest.raises(ctypes.ArgumentError):
-        library.fhash_clip_f32(None, 0.5, 0.0, 0.0, 0.0)
 
 
 def test_the_sources_and_the_loader_agree_on_the_abi() -> None:

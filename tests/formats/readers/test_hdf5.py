@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
 import subprocess
@@ -83,18 +82,6 @@ def test_filters_of_hdf5plugin_are_loaded_when_needed(tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-c", script, str(tmp_path / "a.h5")], check=True)
 
 
-def test_a_virtual_dataset_without_its_source_is_refused(tmp_path: Path) -> None:
-    write_hdf5(tmp_path / "part.h5", v=VALUES)
-    layout = h5py.VirtualLayout(shape=VALUES.shape, dtype="f4")
-    layout[:] = h5py.VirtualSource("part.h5", "v", shape=VALUES.shape)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_virtual_dataset("v", layout)
-    assert_frames(tmp_path / "a.h5", VALUES)
-    (tmp_path / "part.h5").unlink()
-    with pytest.raises(InputError, match=r"draws on part.h5, which is not there"):
-        open_series(tmp_path / "a.h5")
-
-
 def test_a_source_of_a_virtual_dataset_that_changes_is_refused(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "part.h5", v=VALUES)
     layout = h5py.VirtualLayout(shape=VALUES.shape, dtype="f4")
@@ -165,15 +152,6 @@ def test_every_frame_of_every_type_and_chunking(
     assert_frames(tmp_path / "a.h5", values)
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations("tzyx"))[::3])
-@pytest.mark.parametrize("chunked", [False, True])
-def test_any_order_of_axes(tmp_path: Path, order: tuple[str, ...], chunked: bool) -> None:
-    stored = VALUES.transpose(["tzyx".index(axis) for axis in order])
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("v", data=stored, chunks=(2, 2, 2, 2) if chunked else None)
-    assert_frames(tmp_path / "a.h5", VALUES, axes=",".join(order))
-
-
 @pytest.mark.parametrize(
     ("axes", "shape"),
     [
@@ -192,12 +170,6 @@ def test_axes_left_out_have_length_1(tmp_path: Path, axes: str, shape: tuple[int
             VALUES[:, 0].transpose([axes.split(",").index(axis) for axis in letters]).reshape(shape)
         )
         np.testing.assert_array_equal(np.stack(list(series.frames())), expected)
-
-
-def test_3_dimensions_are_one_step(tmp_path: Path) -> None:
-    with open_series(write_hdf5(tmp_path / "a.h5", v=VALUES[0])) as series:
-        assert series.shape == (1, 3, 5, 6)
-        np.testing.assert_array_equal(series.read(0), VALUES[0])
 
 
 def test_attributes_and_units(tmp_path: Path) -> None:
@@ -372,13 +344,6 @@ def test_fields_of_compound_types_are_variables(tmp_path: Path) -> None:
         open_series(path)
 
 
-def test_parts_of_complex_numbers_are_variables(tmp_path: Path) -> None:
-    wave = VALUES + 1j * VALUES[::-1]
-    path = write_hdf5(tmp_path / "a.h5", psi=wave)
-    assert_frames(path, wave.real, var="psi.real")
-    assert_frames(path, wave.imag, var="imag")
-
-
 def write_steps(path: Path, form: str, attributes: list[dict[str, Any]]) -> Path:
     """One group a step, in an order of names that is not that of the numbers."""
     with h5py.File(path, "w") as file:
@@ -432,13 +397,6 @@ def test_openpmd_axes_positions_and_times(tmp_path: Path) -> None:
         )
         np.testing.assert_allclose(series.coords["z"].values, 0.3e-6 * np.arange(3))
         assert series.coords["x"].attributes == {"units": "m"}
-
-
-def test_levels_and_members_are_no_steps(tmp_path: Path) -> None:
-    path = write_hdf5(tmp_path / "a.h5", level_0__rho=VALUES[0], level_1__rho=VALUES[1])
-    with pytest.raises(InputError, match=r"holds 2 variables: level_0/rho .*, level_1/rho"):
-        open_series(path)
-    assert_frames(path, VALUES[1:2], var="level_1/rho")
 
 
 def test_labels_and_positions_select(tmp_path: Path) -> None:

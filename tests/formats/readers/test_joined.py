@@ -282,13 +282,6 @@ def test_calendars_that_differ_are_not_joined(tmp_path: Path) -> None:
         open_series(tmp_path / "f*.h5")
 
 
-def test_joined_times_must_increase_as_dates(tmp_path: Path) -> None:
-    dated(tmp_path / "f0.h5", VALUES[0], 5, "days since 2001-02-26")
-    dated(tmp_path / "f1.h5", VALUES[1], 6, "days since 2001-02-20")
-    with pytest.raises(InputError, match=r"times do not increase .*: 0 in .*f1.h5 after 5 in"):
-        open_series(tmp_path / "f*.h5")
-
-
 @pytest.mark.parametrize(
     ("names", "told"),
     [

@@ -15,41 +15,8 @@ from stored_series import VALUES, assert_frames, frames, save_netcdf
 
 from fhash_formats import list_variables, open_series
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.netcdf import close_groups, declared, magic_of, open_groups
 
 DIMS = ("time", "lev", "lat", "lon")
-
-
-def test_values_are_unpacked_unless_they_are_wanted_raw(tmp_path: Path) -> None:
-    path = save_netcdf(
-        tmp_path / "a.nc",
-        xr.Dataset({"v": (DIMS, VALUES)}),
-        encoding={"v": {"dtype": "i2", "scale_factor": 0.01, "_FillValue": -9}},
-    )
-    for raw, dtype in ((False, "f8"), (True, "i2")):
-        groups = open_groups(str(path), path, magic_of(path), raw=raw)
-        try:
-            array = groups["/"].variables["v"]
-            assert array.dtype == dtype
-            assert array.attrs.get("scale_factor") == (0.01 if raw else None)
-            packing = declared("a", array)
-            assert packing is not None
-            assert packing.scaled is not raw
-        finally:
-            close_groups(groups)
-
-
-def test_groups_of_a_file_are_all_opened(tmp_path: Path) -> None:
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
-    xr.Dataset({"w": (DIMS, VALUES * 2)}).to_netcdf(
-        path, mode="a", group="inner/most", engine="h5netcdf"
-    )
-    groups = open_groups(str(path), path, magic_of(path))
-    try:
-        assert {"/", "/inner/most"} <= set(groups)
-        np.testing.assert_array_equal(groups["/inner/most"]["w"].to_numpy(), VALUES * 2)
-    finally:
-        close_groups(groups)
 
 
 @pytest.fixture
@@ -180,24 +147,6 @@ def stored_as(path: Path, raw: np.ndarray, attributes: dict[str, object]) -> Pat
     return path
 
 
-@pytest.mark.parametrize(("stored", "expected"), [("i2", "f8"), ("u1", "f8"), ("i4", "f8")])
-def test_packing_is_undone_and_fill_values_are_nan(
-    tmp_path: Path, stored: str, expected: str
-) -> None:
-    fill = 200 if stored == "u1" else -99
-    raw = np.random.default_rng(1).integers(0, 100, VALUES.shape).astype(stored)
-    raw[1, 2, 3, 4] = fill
-    got = frames(
-        stored_as(
-            tmp_path / "a.nc",
-            raw,
-            {"_FillValue": raw.dtype.type(fill), "scale_factor": 0.25, "add_offset": 10.0},
-        )
-    )
-    assert got.dtype == expected
-    np.testing.assert_array_equal(got, np.where(raw == fill, np.nan, raw * 0.25 + 10.0))
-
-
 @pytest.mark.parametrize(
     ("stored", "fill", "packing"),
     [
@@ -219,24 +168,6 @@ def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_value
     )
     expected[0, 0, 0, 0] = np.nan
     np.testing.assert_array_equal(got, expected)
-
-
-def test_fill_values_of_floats(tmp_path: Path) -> None:
-    values = VALUES.copy()
-    values[0, 1, 2, 3] = np.nan
-    path = save_netcdf(
-        tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)}), encoding={"v": {"_FillValue": -1e30}}
-    )
-    got = frames(path)
-    assert got.dtype == np.float32
-    np.testing.assert_array_equal(got, values)
-
-
-def test_plain_integers_stay_integers(tmp_path: Path) -> None:
-    values = np.arange(360, dtype=np.int16).reshape(VALUES.shape)
-    got = frames(save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)})))
-    assert got.dtype == np.int16
-    np.testing.assert_array_equal(got, values)
 
 
 def test_auxiliary_and_scalar_coordinates(tmp_path: Path) -> None:
@@ -320,14 +251,6 @@ def test_a_broken_install_ends_in_one_line_that_names_the_library(
     assert "\n" not in str(caught.value)
 
 
-def test_a_truncated_file_is_one_line(tmp_path: Path) -> None:
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
-    os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(InputError, match="cannot be read") as caught:
-        open_series(path)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
     path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
     with open_series(path) as series:
@@ -369,23 +292,6 @@ def test_ensembles_are_read_by_selection(tmp_path: Path) -> None:
     (entry,) = list_variables(path)
     assert entry.options == (("--select", "realization=0"),)
     assert [axis for _, axis in entry.dimensions] == ["t", "select", "z", "y", "x"]
-
-
-def test_a_member_of_length_1_needs_no_selection(tmp_path: Path) -> None:
-    dims = ("number", "time", "lev", "lat", "lon")
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (dims, VALUES[None])}))
-    assert_frames(path, VALUES)
-
-
-@pytest.mark.parametrize("encoding", [{}, {"dtype": "i2", "scale_factor": 0.01, "_FillValue": -9}])
-def test_raw_values_are_the_stored_ones(tmp_path: Path, encoding: dict[str, object]) -> None:
-    dataset = xr.Dataset({"v": (DIMS, np.rint(VALUES), {"units": "K"})})
-    path = save_netcdf(tmp_path / "a.nc", dataset, encoding={"v": encoding} if encoding else {})
-    with h5py.File(path) as file:
-        stored = file["v"][...]
-    assert_frames(path, stored, raw_values=True)
-    with open_series(path, raw_values=True) as series:
-        assert series.units == ("" if encoding else "K")
 
 
 def test_one_group_a_step(tmp_path: Path) -> None:

@@ -504,12 +504,6 @@ def test_files_that_do_not_fit(tmp_path: Path, options: dict[str, Any], message:
     assert str(path) in str(caught.value)
 
 
-def test_hdf5_without_the_group_stays_hdf5(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["u"] = VALUES_VTKHDF
-    np.testing.assert_array_equal(frames(tmp_path / "a.h5"), VALUES_VTKHDF)
-
-
 def test_cut_files_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtkhdf", {"PointData/u": VALUES_VTKHDF}, times=[0, 1, 2])
     path.write_bytes(path.read_bytes()[:3000])

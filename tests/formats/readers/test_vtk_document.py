@@ -46,14 +46,6 @@ def blocks(*sizes: int, block: int = 16, last: int = 8, data: bytes | None = Non
 ZLIB = "vtkZLibDataCompressor"
 
 
-@pytest.mark.parametrize("encoding", ["raw", "base64"])
-def test_values(tmp_path: Path, encoding: str) -> None:
-    plain = struct.pack("<I", 24) + VALUES.tobytes()
-    np.testing.assert_array_equal(read(arrays(tmp_path, plain, encoding=encoding)), VALUES)
-    found = arrays(tmp_path, blocks(), ZLIB, encoding)
-    np.testing.assert_array_equal(read(found), VALUES)
-
-
 @pytest.mark.parametrize(
     ("stored", "compressor", "message"),
     [

@@ -18,40 +18,6 @@ from stored_series import VALUES, assert_frames, create_zarr, frames, zipped
 
 from fhash_formats import list_variables, open_series
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.zarr_store import (
-    metadata_file,
-    nodes_in_folder,
-    nodes_in_zip,
-    open_arrays,
-)
-
-
-@pytest.mark.parametrize("zarr_format", [2, 3])
-def test_nodes_of_a_folder_and_of_its_zip(tmp_path: Path, zarr_format: int) -> None:
-    folder = tmp_path / "a.zarr"
-    group = zarr.open_group(folder, mode="w", zarr_format=zarr_format)
-    group.create_group("in").attrs["time"] = 2.5
-    create_zarr(folder, VALUES, name="in/v", zarr_format=zarr_format)
-    assert metadata_file(folder) is not None
-    assert metadata_file(tmp_path) is None
-    assert list(nodes_in_folder(folder)) == ["in", "in/v"]
-    for inside in ("", "a.zarr/"):
-        archive = zipped(folder, tmp_path / "a.zip", inside=inside)
-        place, nodes = nodes_in_zip("a", archive)
-        assert (place, nodes) == (inside.rstrip("/"), ["", "in", "in/v"])
-    store = zarr.storage.LocalStore(folder, read_only=True)
-    arrays, groups, failed = open_arrays(store, "", ["", "in", "in/v", "none"])
-    assert list(arrays) == ["in/v"]
-    assert groups["in"] == {"time": 2.5}
-    assert list(failed) == ["none"]
-
-
-def test_a_zip_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "a.txt").write_text("words")
-    archive = zipped(tmp_path / "folder", tmp_path / "a.zip")
-    with pytest.raises(InputError, match="holds no zarr hierarchy"):
-        nodes_in_zip("a", archive)
 
 
 def dataset() -> xr.Dataset:
@@ -234,21 +200,13 @@ def test_what_xarray_writes_is_read_as_xarray_reads_it(
     assert got.dtype == expected.dtype
     np.testing.assert_array_equal(got, expected)
     assert np.isnan(got).sum() == 1
+    stored = zarr.open_group(tmp_path / "a.zarr", mode="r")["q"]
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr", raw_values=True), stored[...])
     with open_series(tmp_path / "a.zarr") as series:
         assert (series.name, series.units, series.attributes) == ("q", "kg", {"units": "kg"})
         np.testing.assert_array_equal(series.coords["t"].values, [0, 6, 24, 31 * 24])
         assert series.coords["t"].attributes["units"] == "hours since 2020-01-01 00:00:00"
         np.testing.assert_array_equal(series.coords["z"].values, [1.5, 2.5, 7.0])
-
-
-def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
-    array = zarr.create_array(
-        tmp_path / "a.zarr", shape=VALUES.shape, dtype="f4", chunks=(1, 3, 5, 6), fill_value=np.nan
-    )
-    array[2] = VALUES[2]
-    got = frames(tmp_path / "a.zarr")
-    np.testing.assert_array_equal(got[2], VALUES[2])
-    assert np.isnan(got[[0, 1, 3]]).all()
 
 
 def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
@@ -380,33 +338,6 @@ def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
     got = frames(path)
     assert got.shape == (5, 3, 5, 6)
     assert (got[4] == 7).all()
-
-
-@pytest.mark.parametrize("zarr_format", [2, 3])
-@pytest.mark.parametrize(
-    "encoding",
-    [
-        {},
-        {"_FillValue": -9.0},
-        {"dtype": "i2", "_FillValue": -99},
-        {"dtype": "i4", "_FillValue": -99, "scale_factor": 0.5},
-        {"dtype": "i2", "scale_factor": 0.5, "add_offset": 2.0, "_FillValue": -99},
-    ],
-)
-def test_values_are_those_of_xarray(
-    tmp_path: Path, zarr_format: int, encoding: dict[str, Any]
-) -> None:
-    values = np.rint(VALUES * 10).astype("f4")
-    if "_FillValue" in encoding:
-        values[0, 1] = np.nan
-    dataset = xr.Dataset({"v": (("time", "lev", "lat", "lon"), values)})
-    path = tmp_path / "a.zarr"
-    dataset.to_zarr(path, zarr_format=zarr_format, encoding={"v": encoding}, consolidated=False)
-    with xr.open_zarr(path, consolidated=False, chunks=None) as opened:
-        expected = opened["v"].to_numpy()
-    np.testing.assert_array_equal(frames(path), expected)
-    stored = zarr.open_group(path, mode="r")["v"]
-    np.testing.assert_array_equal(frames(path, raw_values=True), stored[...])
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])

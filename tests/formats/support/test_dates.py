@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import itertools
 import random
 import re
@@ -47,13 +46,6 @@ def test_day_numbers_are_a_bijection(calendar: str) -> None:
         dates = [date_of_day(number, calendar) for number in range(first, after)]
         assert dates == sorted(set(dates))
         assert all(date[0] == year for date in dates)
-
-
-def test_days_of_datetime() -> None:
-    for ordinal in range(1, 3_000_000, 997):
-        date = datetime.date.fromordinal(ordinal)
-        number = day_number(date.year, date.month, date.day, "proleptic_gregorian")
-        assert number - ordinal == 1_721_425
 
 
 @pytest.mark.parametrize("calendar", USUAL)

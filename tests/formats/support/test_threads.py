@@ -75,23 +75,6 @@ def test_a_forked_process_finds_it_free_although_a_thread_of_its_parent_holds_it
     assert taken
 
 
-@pytest.mark.parametrize(
-    ("shape", "itemsize", "limit", "chunk"),
-    [
-        ((10,), 8, 2**21, (10,)),
-        ((4, 100, 100, 100), 2, 2**21, (1, 100, 100, 100)),
-        ((4, 100, 100, 100), 4, 2**21, (1, 50, 100, 100)),
-        ((1, 1, 2048, 1024), 4, 2**21, (1, 1, 512, 1024)),
-        ((3, 2**30), 1, 2**21, (1, 2**21)),
-        ((5, 5), 8, 1, (1, 1)),
-        ((), 8, 100, ()),
-        ((3, 0, 2), 8, 100, (3, 0, 2)),
-    ],
-)
-def test_slabs(shape: tuple[int, ...], itemsize: int, limit: int, chunk: tuple[int, ...]) -> None:
-    assert slab_shape(shape, itemsize, limit) == chunk
-
-
 @given(
     st.lists(st.integers(1, 10**6), max_size=5),
     st.sampled_from([1, 2, 4, 8]),

@@ -80,14 +80,6 @@ def test_text_without_lone_surrogates() -> None:
     assert (text_of(b"\xc3\xa9"), text_of("x"), text_of(5)) == ("\u00e9", "x", "5")
 
 
-def test_names_are_those_of_numpy_in_native_order() -> None:
-    assert len(DTYPES) == 11
-    for name, dtype in DTYPES.items():
-        assert dtype == np.dtype(name)
-        assert dtype.name == name
-        assert dtype.isnative
-
-
 def test_only_integers_of_64_bits_are_wide() -> None:
     assert {name for name, dtype in DTYPES.items() if is_wide_integer(dtype)} == {
         "int64",

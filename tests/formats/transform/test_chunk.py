@@ -11,17 +11,12 @@ import pytest
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.chunk import (
-    NO_TRANSFORM,
     candidates,
     decode_chunk,
     encode_chunk,
     tile_shape,
 )
 from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED
-
-
-def test_one_vertex_has_nothing_to_transform() -> None:
-    assert candidates((1, 1, 1, 1)) == (NO_TRANSFORM,)
 
 
 @pytest.mark.parametrize("shape", [(8, 16, 32, 48), (1, 1, 1, 3), (1, 5, 40, 40), (2, 1, 1, 1)])
@@ -146,14 +141,6 @@ def test_missing_values_take_no_part_in_range_or_bound() -> None:
     values[:, :5] = np.nan
     values[3, 7] = np.inf
     check(values, 0.01 * float(np.ptp(values[np.isfinite(values)])), max_error_rel=0.01)
-
-
-def test_a_smaller_step_is_a_smaller_error_and_more_bytes() -> None:
-    values = field((4, 8, 16, 16), 1, "f4")
-    data = [encode_chunk(values, step=step) for step in (0.2, 0.02)]
-    errors = [worst(values, decode_chunk(stream, values.shape, "f4")) for stream in data]
-    assert errors[1] < 0.1 < errors[0] * 5
-    assert 2 * len(data[0]) < len(data[1])
 
 
 def test_a_step_beyond_the_range_leaves_the_range() -> None:

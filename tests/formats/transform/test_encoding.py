@@ -9,25 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from specs import spec_of
-from tiles import (
-    SETTINGS as SETTINGS_ENCODING,
-)
-from tiles import (
-    SETTINGS as SETTINGS_INTEGERS,
-)
-from tiles import (
-    SHAPE as SHAPE_ENCODING,
-)
-from tiles import (
-    SHAPE as SHAPE_INTEGERS,
-)
-from tiles import (
-    same,
-    wave,
-)
+from tiles import SETTINGS, SHAPE, same, wave
 
 from fhash_formats.transform.coder import (
-    MaskLevels,
     Table,
     decode_integers,
     encode_integers,
@@ -53,6 +37,7 @@ from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import LARGEST
 
+TRELLIS = replace(SETTINGS, trellis=True, offsets=(17, -10, -5, -3, -2, -1))
 SHAPES = [(1, 1, 1, 1), (3, 5, 7, 11), (4, 6, 17, 33), (1, 1, 30, 40), (9, 1, 1, 5), (1, 2, 3, 300)]
 
 
@@ -90,14 +75,6 @@ def test_coefficients_are_near_their_integers(dtype: Any) -> None:
     assert np.abs(levels - scaled.astype(np.float64)).max() <= 2
 
 
-def test_bits_cost_large_integers() -> None:
-    scaled = coefficients((4, 8, 16, 16), 2.0, np.float32)
-    table = single_band(scaled.shape)
-    dear, free = (choose_levels(scaled, table, weight) for weight in (0.5, 0.0))
-    assert np.count_nonzero(dear) < np.count_nonzero(free)
-    assert np.square(free - scaled).sum() < np.square(dear - scaled).sum()
-
-
 def test_a_path_errs_less_than_any_of_the_two_quantisers() -> None:
     scaled = coefficients((4, 8, 16, 16), 50.0, np.float32)
     levels = choose_levels(scaled, single_band(scaled.shape), 0.0)
@@ -133,11 +110,14 @@ def test_rates_fall_with_the_count() -> None:
     ids=["plain", "weight", "error", "all"],
 )
 @pytest.mark.parametrize("own_settings", [False, True])
-def test_the_encoder_knows_what_is_decoded(dtype: Any, coding: Coding, own_settings: bool) -> None:
+@pytest.mark.parametrize("settings", [SETTINGS, TRELLIS], ids=["plain", "trellis"])
+def test_the_encoder_knows_what_is_decoded(
+    dtype: Any, coding: Coding, own_settings: bool, settings: TileSettings
+) -> None:
     values = wave(dtype=dtype)
-    coded = encode_tile(values, SETTINGS_ENCODING, replace(coding, own_settings=own_settings))
-    settings = None if own_settings else SETTINGS_ENCODING
-    assert same(decode_tile(coded.data, SHAPE_ENCODING, dtype, settings), coded.decoded)
+    coded = encode_tile(values, settings, replace(coding, own_settings=own_settings))
+    known = None if own_settings else settings
+    assert same(decode_tile(coded.data, SHAPE, dtype, known), coded.decoded)
     difference = np.abs(coded.decoded.astype(float) - values.astype(float)).max()
     assert difference <= (0.4 if coding.error is None else coding.error)
 
@@ -146,8 +126,8 @@ def test_values_that_are_not_finite_come_back_as_they_were() -> None:
     values = wave()
     values[0, 1, 2, 3:6] = [np.nan, np.inf, -np.inf]
     values[1, 0] = np.nan
-    data = encode_tile(values, SETTINGS_ENCODING, Coding(error=0.04)).data
-    decoded = decode_tile(data, SHAPE_ENCODING, np.float32, SETTINGS_ENCODING)
+    data = encode_tile(values, SETTINGS, Coding(error=0.04)).data
+    decoded = decode_tile(data, SHAPE, np.float32, SETTINGS)
     finite = np.isfinite(values)
     assert same(decoded[~finite], values[~finite])
     assert np.abs(decoded[finite] - values[finite]).max() <= 0.04
@@ -158,27 +138,25 @@ def test_values_outside_the_coreset_cost_little_and_leave_the_bound() -> None:
     in_coreset[:, :, :, :8] = True
     noise = np.random.default_rng(0).normal(0, 50, values.shape).astype(np.float32)
     noisy = np.where(in_coreset, values, noise)
-    coded = encode_tile(noisy, SETTINGS_ENCODING, Coding(error=0.04), in_coreset=in_coreset)
+    coded = encode_tile(noisy, SETTINGS, Coding(error=0.04), in_coreset=in_coreset)
     assert np.abs(coded.decoded - noisy)[in_coreset].max() <= 0.04
-    assert 2 * len(coded.data) < len(encode_tile(noisy, SETTINGS_ENCODING, Coding(error=0.04)).data)
+    assert 2 * len(coded.data) < len(encode_tile(noisy, SETTINGS, Coding(error=0.04)).data)
 
 
 def test_a_tile_of_missing_values_only() -> None:
-    values = np.full(SHAPE_ENCODING, np.nan, np.float32)
+    values = np.full(SHAPE, np.nan, np.float32)
     values[0, 0, 0, 0] = -np.inf
-    data = encode_tile(values, SETTINGS_ENCODING).data
-    assert same(decode_tile(data, SHAPE_ENCODING, np.float32, SETTINGS_ENCODING), values)
-    dropped = encode_tile(values, SETTINGS_ENCODING, Coding(keep_missing=False))
+    data = encode_tile(values, SETTINGS).data
+    assert same(decode_tile(data, SHAPE, np.float32, SETTINGS), values)
+    dropped = encode_tile(values, SETTINGS, Coding(keep_missing=False))
     assert len(dropped.data) == 5
-    assert (
-        decode_tile(dropped.data, SHAPE_ENCODING, np.float32, SETTINGS_ENCODING) == np.float32(0.5)
-    ).all()
+    assert (decode_tile(dropped.data, SHAPE, np.float32, SETTINGS) == np.float32(0.5)).all()
 
 
 def test_rounds_make_the_ends_of_the_range_cheaper() -> None:
     """A value at an end of the range may decode to any value beyond it: the decoder clips."""
     values = np.clip(3 * wave((2, 4, 16, 16)), -1.0, 1.5)
-    settings = replace(SETTINGS_ENCODING, low=-1.0, high=1.5)
+    settings = replace(SETTINGS, low=-1.0, high=1.5)
     plain, projected = (
         encode_tile(values, settings, Coding(weight=0.09, rounds=rounds)) for rounds in (0, 3)
     )
@@ -190,14 +168,14 @@ def test_rounds_make_the_ends_of_the_range_cheaper() -> None:
 def test_an_exact_tile_is_exact_and_writeable(dtype: str) -> None:
     values = (wave() * 40 + 100).astype(dtype)
     values.flat[0] = 0
-    decoded = decode_tile(exact_tile(values).data, SHAPE_ENCODING, dtype)
+    decoded = decode_tile(exact_tile(values).data, SHAPE, dtype)
     assert same(decoded, values)
     decoded[:] = 0
 
 
 def test_a_bound_too_fine_for_the_quantum_is_kept_by_an_exact_tile() -> None:
     values = wave(dtype=np.float64)
-    coded = encode_tile(values, replace(SETTINGS_ENCODING, quantum=1e-12), Coding(error=1e-17))
+    coded = encode_tile(values, replace(SETTINGS, quantum=1e-12), Coding(error=1e-17))
     assert same(coded.decoded, values)
 
 
@@ -208,7 +186,7 @@ def test_neither_residual_nor_rounding_leaves_the_range(dtype: str) -> None:
     low, high = float(values.min()), float(values.max())
     error = (high - low) * 0.2
     quantum = 1.99 * (error - (0 if dtype[0] == "f" else 0.5))
-    beyond = replace(SETTINGS_ENCODING, low=low, high=high, step=5 * error, quantum=quantum)
+    beyond = replace(SETTINGS, low=low, high=high, step=5 * error, quantum=quantum)
     settings = replace(beyond, clip=True)
     coding = Coding(weight=0.09, error=error)
     free, kept = encode_tile(values, beyond, coding), encode_tile(values, settings, coding)
@@ -218,8 +196,8 @@ def test_neither_residual_nor_rounding_leaves_the_range(dtype: str) -> None:
     errors = [np.abs(coded.decoded.astype(float) - values) for coded in (free, kept)]
     assert (errors[1] <= errors[0]).all()
     for wanted, coded in ((beyond, free), (settings, kept)):
-        assert same(decode_tile(coded.data, SHAPE_ENCODING, dtype, wanted), coded.decoded)
-    coarse = decode_tile(kept.data, SHAPE_ENCODING, dtype, settings, lod=1)
+        assert same(decode_tile(coded.data, SHAPE, dtype, wanted), coded.decoded)
+    coarse = decode_tile(kept.data, SHAPE, dtype, settings, lod=1)
     assert low <= coarse.min() <= coarse.max() <= high
 
 
@@ -228,15 +206,15 @@ def test_ends_that_float32_rounds_outwards_are_kept_in_float64() -> None:
     assert float(np.float32(0.7)) < 0.7
     assert float(np.float32(0.1)) > 0.1
     values = -values
-    settings = replace(SETTINGS_ENCODING, low=-0.7, high=-0.1, quantum=0.0, clip=True)
+    settings = replace(SETTINGS, low=-0.7, high=-0.1, quantum=0.0, clip=True)
     decoded = encode_tile(values, settings, Coding()).decoded
     assert decoded.dtype == np.float64
     assert -0.7 <= decoded.min() <= decoded.max() <= -0.1
 
 
 PLAIN = replace(
-    SETTINGS_ENCODING,
-    transform=spec_of(("none",) * 4, (0,) * 4, SHAPE_ENCODING),
+    SETTINGS,
+    transform=spec_of(("none",) * 4, (0,) * 4, SHAPE),
     step=2.0**-4,
     center=0.0,
     double=True,
@@ -253,43 +231,43 @@ def edge(shape: tuple[int, ...], peak: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("peak", "exact"), [(LARGEST - 1, False), (LARGEST, True)])
 def test_a_tile_is_exact_where_an_integer_does_not_fit(peak: float, exact: bool) -> None:
-    values = edge(SHAPE_ENCODING, peak)
+    values = edge(SHAPE, peak)
     values[0, 0, 0, 0] += PLAIN.step / 3  # which is lost unless the tile is exact
     settings = replace(PLAIN, low=float(values.min()), high=float(values.max()))
     coded = encode_tile(values, settings, Coding())
     assert np.array_equal(coded.decoded, values) == exact
     assert np.abs(coded.decoded - values).max() <= settings.step
-    assert same(decode_tile(coded.data, SHAPE_ENCODING, np.float64, settings), coded.decoded)
+    assert same(decode_tile(coded.data, SHAPE, np.float64, settings), coded.decoded)
 
 
 @pytest.mark.parametrize("peak", [MAX_CHOSEN - 0.7, MAX_CHOSEN + 0.3, MAX_CHOSEN * 16 + 0.7])
 @pytest.mark.parametrize("weight", [0.0, 0.09])
 def test_large_integers_are_the_nearest_ones(peak: float, weight: float) -> None:
-    values = edge(SHAPE_ENCODING, peak)
+    values = edge(SHAPE, peak)
     settings = replace(PLAIN, low=float(values.min()), high=float(values.max()))
     coded = encode_tile(values, settings, Coding(weight=weight))
     error = abs(coded.decoded[0, 1, 2, 3] - values[0, 1, 2, 3]) / settings.step
     assert error <= (0.5 if weight else 0.7) + 1e-6
-    assert same(decode_tile(coded.data, SHAPE_ENCODING, np.float64, settings), coded.decoded)
+    assert same(decode_tile(coded.data, SHAPE, np.float64, settings), coded.decoded)
 
 
-SHAPE = (1, 4, 32, 40)
-SPEC = spec_of(("none", "9/7", "9/7", "9/7"), (0, 1, 3, 3), SHAPE)
-SETTINGS = TileSettings(transform=SPEC, step=0.1, center=0.0, low=-100.0, high=100.0)
+FIELD_SHAPE = (1, 4, 32, 40)
+FIELD_SPEC = spec_of(("none", "9/7", "9/7", "9/7"), (0, 1, 3, 3), FIELD_SHAPE)
+FIELD_SETTINGS = TileSettings(transform=FIELD_SPEC, step=0.1, center=0.0, low=-100.0, high=100.0)
 
 Values = npt.NDArray[np.float32]
 
 
 def field(outside: str) -> tuple[Values, npt.NDArray[np.bool_]]:
     """A smooth field and the ball in which it counted; outside the ball are other values."""
-    _, z, y, x = np.indices(SHAPE)
+    _, z, y, x = np.indices(FIELD_SHAPE)
     values = (np.sin(0.2 * y + 0.1 * z) + np.cos(0.15 * x)).astype(np.float32)
     counted = (y - 16) ** 2 + (x - 20) ** 2 + 4 * z**2 < 150
-    noise = np.random.default_rng(0).normal(0, 20, SHAPE).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 20, FIELD_SHAPE).astype(np.float32)
     around = {
         "the same": values,
         "noise": noise,
-        "far away": np.full(SHAPE, -99, np.float32),
+        "far away": np.full(FIELD_SHAPE, -99, np.float32),
         "rough": values + noise / 50,
     }[outside]
     return np.where(counted, values, around), counted
@@ -300,10 +278,15 @@ def field(outside: str) -> tuple[Values, npt.NDArray[np.bool_]]:
 def test_counted_values_stay_and_the_others_cost_less(outside: str, density: int) -> None:
     values, counted = field(outside)
     result = filled(
-        values, counted, np.ones(SHAPE, bool), transform_for(SETTINGS, SHAPE), SETTINGS, density
+        values,
+        counted,
+        np.ones(FIELD_SHAPE, bool),
+        transform_for(FIELD_SETTINGS, FIELD_SHAPE),
+        FIELD_SETTINGS,
+        density,
     )
     np.testing.assert_array_equal(result[counted], values[counted])
-    before, after = (len(encode_tile(target, SETTINGS).data) for target in (values, result))
+    before, after = (len(encode_tile(target, FIELD_SETTINGS).data) for target in (values, result))
     if outside == "the same":
         assert after <= before
     else:
@@ -313,7 +296,7 @@ def test_counted_values_stay_and_the_others_cost_less(outside: str, density: int
 def test_more_thresholds_find_a_better_filling() -> None:
     values, counted = field("rough")
     sizes = [
-        len(encode_tile(values, SETTINGS, Coding(density=density), in_coreset=counted).data)
+        len(encode_tile(values, FIELD_SETTINGS, Coding(density=density), in_coreset=counted).data)
         for density in RATIOS
     ]
     assert sizes[-1] < sizes[0]
@@ -322,44 +305,9 @@ def test_more_thresholds_find_a_better_filling() -> None:
 def test_missing_values_are_filled_as_well() -> None:
     values, counted = field("noise")
     holes = np.where(counted, values, np.nan)
-    coded = encode_tile(holes, replace(SETTINGS, step=0.05), Coding(keep_missing=False))
+    coded = encode_tile(holes, replace(FIELD_SETTINGS, step=0.05), Coding(keep_missing=False))
     assert np.abs(coded.decoded - values)[counted].max() < 0.1
     assert np.isfinite(coded.decoded).all()
-
-
-TRELLIS = replace(SETTINGS_INTEGERS, trellis=True, offsets=(17, -10, -5, -3, -2, -1))
-CODINGS = [
-    Coding(),
-    Coding(weight=0.27, passes=2),
-    Coding(weight=0.27, error=0.04, rounds=2),
-]
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("coding", CODINGS, ids=["least error", "weight", "bound"])
-@pytest.mark.parametrize("double", [False, True])
-def test_the_encoder_knows_what_is_decoded_from_the_trellis(
-    dtype: Any, coding: Coding, double: bool
-) -> None:
-    values, settings = wave(dtype=dtype), replace(TRELLIS, double=double)
-    coded = encode_tile(values, settings, coding)
-    assert same(decode_tile(coded.data, SHAPE_INTEGERS, dtype, settings), coded.decoded)
-    difference = np.abs(coded.decoded.astype(float) - values.astype(float)).max()
-    assert difference <= (0.4 if coding.error is None else coding.error)
-
-
-def test_a_mask_and_missing_values_go_with_the_trellis() -> None:
-    values, settings = wave(), replace(TRELLIS, mask=MaskLevels(), quantum=0.0)
-    in_coreset = values > 0.2
-    coding = Coding(weight=0.27, rounds=2)
-    coded = encode_tile(values, settings, coding, in_coreset=in_coreset)
-    decoded = decode_tile(coded.data, SHAPE_INTEGERS, np.float32, settings)
-    assert np.array_equal(np.isfinite(decoded), in_coreset)
-    values[0, 1, 2, 3:6] = [np.nan, np.inf, -np.inf]
-    whole = decode_tile(
-        encode_tile(values, TRELLIS, coding).data, SHAPE_INTEGERS, np.float32, TRELLIS
-    )
-    assert same(whole[~np.isfinite(values)], values[~np.isfinite(values)])
 
 
 def test_a_level_of_detail_is_the_same_function_of_the_integers() -> None:
@@ -370,17 +318,17 @@ def test_a_level_of_detail_is_the_same_function_of_the_integers() -> None:
     assert np.abs(half - values[:, ::2, ::2, ::2]).max() < 1.0
 
 
-@pytest.mark.parametrize("settings", [SETTINGS_INTEGERS, TRELLIS], ids=["plain", "trellis"])
+@pytest.mark.parametrize("settings", [SETTINGS, TRELLIS], ids=["plain", "trellis"])
 def test_integers_that_are_too_large_are_refused(settings: TileSettings) -> None:
     settings = replace(settings, double=True)
-    coefficients = np.zeros(SHAPE_INTEGERS)
+    coefficients = np.zeros(SHAPE)
     coefficients[0, 0, 0, 0] = settings.step * LARGEST * 1.1
     assert code_coefficients(coefficients, settings, 0.1, 1) is None
 
 
 def test_large_integers_of_the_trellis_are_near() -> None:
     settings = replace(TRELLIS, double=True, step=1.0)
-    coefficients = np.random.default_rng(3).uniform(-9e8, 9e8, SHAPE_INTEGERS)
+    coefficients = np.random.default_rng(3).uniform(-9e8, 9e8, SHAPE)
     integers = choose_integers(coefficients, settings, 0.27)
     assert integers is not None
     assert np.abs(integers - coefficients).max() <= 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from typing import Any
@@ -12,15 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from specs import (
-    MIXES as MIXES_LIFTING,
-)
-from specs import (
-    MIXES as MIXES_WEIGHTS,
-)
-from specs import (
-    SHAPES as SHAPES_LIFTING,
-)
-from specs import (
+    MIXES,
+    SHAPES,
     TYPES,
     axis_of,
     mixes_and_depths,
@@ -31,11 +23,11 @@ from specs import (
 from fhash_formats.errors import InputError
 from fhash_formats.transform.coder import COLUMNS, KINDS, Table
 from fhash_formats.transform.lifting import MAX_LOD, Transform, axis_norms, band_lengths, band_table
-from fhash_formats.transform.spec import KINDS as KINDS_LIFTING
+from fhash_formats.transform.spec import KINDS as TRANSFORMS
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.values import OFFSET_UNIT, clip_shifted, dequantise
 
-SHAPES = [
+RANDOM_SHAPES = [
     (1, 1, 1, 1),
     (2, 3, 5, 7),
     (4, 9, 17, 33),
@@ -45,7 +37,7 @@ SHAPES = [
     (7, 13, 31, 29),
     (5, 1, 6, 6),
 ]
-MIXES = [
+RANDOM_MIXES = [
     ("none", "none", "none", "none"),
     ("haar", "5/3", "9/7", "9/7"),
     ("haar", "none", "haar", "haar"),
@@ -67,7 +59,7 @@ CASES = [
         shape,
         id=f"{'-'.join(kinds)}-{depth}-{'x'.join(map(str, shape))}",
     )
-    for (kinds, depth), shape in product(mixes_and_depths(MIXES, (1, 2, 10)), SHAPES)
+    for (kinds, depth), shape in product(mixes_and_depths(RANDOM_MIXES, (1, 2, 10)), RANDOM_SHAPES)
 ]
 
 
@@ -159,40 +151,31 @@ def test_a_table_is_made_once_and_read_only() -> None:
         table[0, 0] = 1
 
 
-@pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES_LIFTING, [1, 3, 7]))
-@pytest.mark.parametrize("shape", SHAPES_LIFTING)
-def test_there_and_back(
-    shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any
-) -> None:
-    transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
-    values = noise(shape, dtype)
-    coefficients = transform.forward(values)
-    again = transform.inverse(coefficients)
-    assert coefficients.shape == again.shape == shape
-    assert coefficients.dtype == again.dtype == dtype
-    assert np.abs(again - values).max() < (5e-5 if dtype is np.float32 else 2e-12)
-
-
 @settings(max_examples=60)
 @given(
     shape=st.tuples(*(st.integers(1, 23),) * 4),
-    kinds=st.tuples(*(st.sampled_from(KINDS_LIFTING),) * 4),
+    kinds=st.tuples(*(st.sampled_from(TRANSFORMS),) * 4),
     depths=st.tuples(*(st.integers(1, 6),) * 4),
     seed=st.integers(0, 9),
+    kind=st.sampled_from([(np.float32, 5e-5), (np.float64, 1e-10)]),
 )
 def test_any_mix_comes_back(
-    shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], seed: int
+    shape: tuple[int, ...],
+    kinds: tuple[str, ...],
+    depths: tuple[int, ...],
+    seed: int,
+    kind: tuple[Any, float],
 ) -> None:
-    transform = Transform(spec_of(kinds, depths, shape), shape, np.float64)
-    values = noise(shape, np.float64, seed)
-    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
+    dtype, tolerance = kind
+    transform = Transform(spec_of(kinds, depths, shape), shape, dtype)
+    values = noise(shape, dtype, seed)
+    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < tolerance
 
 
 @pytest.mark.parametrize("center", [3.25, 0.0])
 @pytest.mark.parametrize("offsets", [(5, -9, 2, 2, 2, 2), (5, -9, 2, 1, -3, 7)])
 @pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES_LIFTING, [1, 4]))
+@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES, [1, 4]))
 @pytest.mark.parametrize("shape", [(3, 4, 9, 37), (1, 1, 16, 64), (4, 1, 1, 5)])
 @pytest.mark.parametrize("empty", ["last", "first", "planes", "but one", "all"])
 def test_one_run_gives_the_bits_of_its_three_steps(
@@ -260,8 +243,8 @@ def test_a_ramp_leaves_the_high_bands_empty(kind: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("kinds", [kinds for kinds in MIXES_LIFTING if "klt" not in kinds])
-@pytest.mark.parametrize("shape", SHAPES_LIFTING)
+@pytest.mark.parametrize("kinds", [kinds for kinds in MIXES if "klt" not in kinds])
+@pytest.mark.parametrize("shape", SHAPES)
 def test_a_constant_stays_itself_at_every_resolution(
     shape: tuple[int, ...], kinds: tuple[str, ...], dtype: Any
 ) -> None:
@@ -401,26 +384,6 @@ def test_other_arrays_are_refused() -> None:
         transform.inverse(np.zeros((1, 1, 2, 3), np.float32))
 
 
-def test_the_bits_of_the_transform_are_fixed() -> None:
-    """A file must decode to the same bits for ever: the digests hold for the format version."""
-    shape = (3, 5, 13, 18)
-    integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
-    digests = {}
-    for kinds in (("haar", "5/3", "9/7", "9/7"), ("9/7", "none", "haar", "5/3")):
-        for dtype in TYPES:
-            transform = Transform(spec_of(kinds, (1, 2, 2, 2), shape), shape, dtype)
-            digest = hashlib.sha256(transform.forward(integers.astype(dtype)).tobytes())
-            for lod in (0, 1, 3):
-                digest.update(transform.inverse(integers.astype(dtype), lod).tobytes())
-            digests[kinds[0], np.dtype(dtype).name] = digest.hexdigest()[:16]
-    assert digests == {
-        ("haar", "float32"): "133040732743fa0a",
-        ("haar", "float64"): "8ca439a2a86d2789",
-        ("9/7", "float32"): "ea64a3b5d62271cf",
-        ("9/7", "float64"): "07f0e9ae04a1cccc",
-    }
-
-
 def test_a_low_band_is_half_as_long_rounded_up() -> None:
     assert band_lengths(13, 5) == [13, 7, 4, 2, 1, 1]
     assert band_lengths(4, 0) == [4]
@@ -430,7 +393,7 @@ def test_without_a_transform_all_norms_are_1() -> None:
     assert axis_norms(AxisTransform(kind="none"), 3).tolist() == [1.0, 1.0, 1.0]
 
 
-@pytest.mark.parametrize("kinds", MIXES_WEIGHTS)
+@pytest.mark.parametrize("kinds", MIXES)
 @pytest.mark.parametrize("shape", [(2, 3, 5, 7), (3, 8, 16, 12)])
 def test_norms_are_those_of_the_synthesis_vectors(
     shape: tuple[int, ...], kinds: tuple[str, ...]
@@ -441,18 +404,6 @@ def test_norms_are_those_of_the_synthesis_vectors(
         impulse = np.zeros(shape)
         impulse.flat[place] = 1.0
         assert np.sqrt(np.sum(transform.inverse(impulse) ** 2)) == pytest.approx(1.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("kinds", [("haar",) * 4, ("9/7",) * 4])
-def test_white_noise_in_the_coefficients_is_as_large_in_the_values(kinds: tuple[str, ...]) -> None:
-    shape = (8, 16, 32, 32)
-    transform = Transform(spec_of(kinds, (2, 2, 3, 3), shape), shape, np.float64)
-    assert np.var(transform.inverse(noise(shape, np.float64))) == pytest.approx(1.0, rel=0.05)
-    band = np.zeros(shape)
-    band[4:, :4, 16:, :16] = noise((4, 4, 16, 16), np.float64)
-    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(
-        1.0, rel=0.15
-    )
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1500), (600, 1, 2, 3), (1, 1, 700, 530)])

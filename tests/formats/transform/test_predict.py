@@ -84,11 +84,6 @@ def test_both_ends_of_the_numbers() -> None:
     )
 
 
-def test_a_constant_costs_next_to_nothing() -> None:
-    integers = np.full((8, 16, 32, 32), 7, dtype=np.int32)
-    assert len(encode_predicted(integers, None, predictor_of())[0]) < 60
-
-
 def test_prediction_pays_on_smooth_values() -> None:
     integers = np.rint(_smooth((8, 16, 24, 24), 0.0) + 300 * np.sin(np.arange(24) / 5)).astype(
         np.int32

@@ -12,17 +12,12 @@ from predictors import predictor_of
 from specs import spec_of
 from tiles import (
     SETTINGS,
+    SHAPE,
     damaged_copies,
     resealed,
     same,
     streams,
     wave,
-)
-from tiles import (
-    SHAPE as SHAPE_SECTIONS,
-)
-from tiles import (
-    SHAPE as SHAPE_SETTINGS,
 )
 
 from fhash_formats.errors import DamagedFileError, InputError
@@ -57,7 +52,7 @@ from fhash_formats.transform.tile_format import (
     zero_levels,
 )
 
-SHAPE = (2, 4, 9, 20)
+REGIONS_SHAPE = (2, 4, 9, 20)
 LABELLED = replace(SETTINGS, labels=True, quantum=0.0)
 
 
@@ -68,7 +63,7 @@ def regions(dtype: str) -> np.ndarray:
     number = (
         np.arange(20) // 5 + np.arange(9)[:, None] // 3 + np.arange(2)[:, None, None, None]
     ) % 5
-    return np.broadcast_to(np.array(values, kind)[number], SHAPE).copy()
+    return np.broadcast_to(np.array(values, kind)[number], REGIONS_SHAPE).copy()
 
 
 @pytest.mark.parametrize("dtype", ["i1", "u2", "i4", "u8", "f2", "f4", "f8"])
@@ -79,22 +74,22 @@ def test_every_type_comes_back_bit_by_bit(dtype: str, own: bool) -> None:
     coded = encode_tile(values, LABELLED, coding)
     assert coded.data[4] & KIND == LABELS
     assert coded.decoded.tobytes() == values.tobytes()
-    decoded = decode_tile(coded.data, SHAPE, values.dtype, None if own else LABELLED)
+    decoded = decode_tile(coded.data, REGIONS_SHAPE, values.dtype, None if own else LABELLED)
     assert decoded.tobytes() == values.tobytes()
-    coarse = decode_tile(coded.data, SHAPE, values.dtype, LABELLED, lod=1)
+    coarse = decode_tile(coded.data, REGIONS_SHAPE, values.dtype, LABELLED, lod=1)
     assert same(coarse, values[:, ::2, ::2, ::2])
 
 
 @pytest.mark.parametrize("dtype", ["i1", "f4"])
 def test_a_mask_is_one_more_label(dtype: str) -> None:
-    values, occupied = regions(dtype), np.ones(SHAPE, bool)
+    values, occupied = regions(dtype), np.ones(REGIONS_SHAPE, bool)
     occupied[:, 1, 2:6, 4:11] = False
     if dtype == "f4":
         values[np.isnan(values)] = 9.0
     settings = replace(LABELLED, mask=MaskLevels())
     coded = encode_tile(values, settings, Coding(error=0.0), in_coreset=occupied)
     assert coded.data[4] == LABELS | MASKED
-    decoded, mask = decode_tile_mask(coded.data, SHAPE, values.dtype, settings)
+    decoded, mask = decode_tile_mask(coded.data, REGIONS_SHAPE, values.dtype, settings)
     np.testing.assert_array_equal(mask, occupied)
     assert same(decoded, coded.decoded)
     np.testing.assert_array_equal(decoded[occupied], values[occupied])
@@ -248,13 +243,13 @@ def test_missing_values_come_back_into_floating_values_only() -> None:
     finite = np.where(np.isfinite(values), values, np.float32(0))
     assert same(restore_missing(finite, missing), values)
     with pytest.raises(DamagedFileError, match="integers has missing values"):
-        restore_missing(np.zeros(SHAPE_SECTIONS, np.int16), missing)
+        restore_missing(np.zeros(SHAPE, np.int16), missing)
 
 
 def test_a_mask_comes_back() -> None:
-    mask, levels = wave() > 0, zero_levels(SHAPE_SECTIONS)
+    mask, levels = wave() > 0, zero_levels(SHAPE)
     assert np.array_equal(unpack_mask(pack_mask(mask, levels), levels), mask)
-    assert pack_mask(np.ones(SHAPE_SECTIONS, bool), levels) == b""
+    assert pack_mask(np.ones(SHAPE, bool), levels) == b""
 
 
 CHANGES: list[dict[str, Any]] = [
@@ -266,7 +261,7 @@ CHANGES: list[dict[str, Any]] = [
     {"trellis": True, "offsets": (-5, -1, 0, 0, 1, -127)},
     {"head": random_head((3, 4), cross=True)},
     {"predictor": predictor_of((1, 2, 2, 2), (0, 3, 1, 2), 1, step=0.25)},
-    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), SHAPE_SETTINGS, 0.1)},
+    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), SHAPE, 0.1)},
     {"origin": -(1 << 63), "low": -(1 << 62), "high": (1 << 62) + 1},
     {"origin": (1 << 64) - 1, "low": 0.0, "high": 5.0},
     {"low": -(1 << 63), "high": (1 << 63) - 1},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import signal
 from collections.abc import Iterator
@@ -28,11 +27,9 @@ from fhash_formats.writers.common import (
     coordinate_attributes,
     even_spacing,
     hdf5_value,
-    little_endian,
     safe_name,
     safe_names,
     variable_attributes,
-    write_frame,
 )
 
 
@@ -510,19 +507,3 @@ def test_a_frame_above_the_bound_is_several_chunks(
     with h5py.File(path) as file:
         assert file["theta"].chunks == (1, 2, 5, 6)
         np.testing.assert_array_equal(file["theta"], DATA)
-
-
-@pytest.mark.parametrize("dtype", ["f2", ">f4", "f8", ">i2", "u1"])
-def test_values_are_stored_little_endian_without_loss(dtype: str) -> None:
-    kept = np.dtype(dtype).newbyteorder("<")
-    assert little_endian(np.dtype(dtype), half=True) == kept
-    assert little_endian(np.dtype(dtype)) == (np.dtype("<f4") if dtype == "f2" else kept)
-
-
-def test_a_frame_is_written_with_x_fastest() -> None:
-    frame = np.arange(24, dtype="f8").reshape(4, 3, 2).transpose()
-    handle = io.BytesIO()
-    write_frame(handle, frame, np.dtype("<f4"))
-    np.testing.assert_array_equal(
-        np.frombuffer(handle.getvalue(), "<f4").reshape(frame.shape), frame
-    )

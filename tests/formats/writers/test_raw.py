@@ -24,14 +24,6 @@ def test_the_file_is_the_one_that_numpy_writes(tmp_path: Path, dtype: str) -> No
     assert path.read_bytes() == (tmp_path / "expected.npy").read_bytes()
 
 
-def test_values_of_the_other_byte_order_are_swapped(tmp_path: Path) -> None:
-    values = DATA_NPY.astype(">f4")
-    (path,) = save_region(tmp_path / "out.npy", labelled_region(dtype=values.dtype), iter(values))
-    stored = np.load(path)
-    assert stored.dtype == np.dtype("<f4")
-    np.testing.assert_array_equal(stored, values)
-
-
 POSITIONS = {
     "t": [347921.000277, 347922.0],
     "z": [0.0, 0.25],

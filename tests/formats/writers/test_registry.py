@@ -9,7 +9,6 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from read_back import READ
 
-from fhash_formats import Region, open_series, save_check, save_region
+from fhash_formats import Region, save_check, save_region
 from fhash_formats.errors import (
     FhashError,
     InputError,
@@ -76,26 +75,6 @@ def test_the_values_come_back_exactly(tmp_path: Path, suffix: str, dtype: str) -
         assert np.signbit(read[0, 0, 0, 2])
     assert all(path.exists() for path in paths)
     assert not [name for name in names(tmp_path) if name.startswith(".")]
-
-
-@pytest.mark.parametrize(
-    "name", ["out.npy", "out.h5", "out.nc", "out.zarr", "wind_6x5x4x3_float32.raw"]
-)
-def test_our_own_readers_give_back_the_region(tmp_path: Path, name: str) -> None:
-    made = replace(region(), units="m/s", attributes={"standard_name": "wind_speed"})
-    (path,) = save_region(tmp_path / name, made, values())
-    with open_series(path) as series:
-        assert (series.shape, series.dtype) == (made.shape, made.dtype)
-        np.testing.assert_array_equal(np.stack(list(series.frames())), values())
-        if path.suffix not in (".npy", ".raw"):
-            assert (series.name, series.units, series.attributes["standard_name"]) == (
-                "wind",
-                "m/s",
-                "wind_speed",
-            )
-            for axis, coordinate in made.coords.items():
-                assert series.coords[axis].name == coordinate.name
-                np.testing.assert_array_equal(series.coords[axis].values, coordinate.values)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 3, 1, 2), (2, 1, 4, 1), (1, 2, 3, 4)])

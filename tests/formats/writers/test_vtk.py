@@ -13,15 +13,6 @@ import pytest
 from fhash_formats import Region, save_check, save_region
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import (
-    Region as Region_vtkhdf,
-)
-from fhash_formats.writers import (
-    save_check as save_check_vtkhdf,
-)
-from fhash_formats.writers import (
-    save_region as save_region_vtkhdf,
-)
 from fhash_formats.writers.vtk import Mesh, check_mesh_output, save_mesh
 
 MESH = Mesh(
@@ -305,19 +296,17 @@ EVEN_VTKHDF = {
 DATA_VTKHDF = np.arange(72, dtype="f4").reshape(3, 2, 4, 3)
 
 
-def region_vtkhdf(dtype: str = "f4", name: str = "wind", **axes: list[float]) -> Region_vtkhdf:
+def region_vtkhdf(dtype: str = "f4", name: str = "wind", **axes: list[float]) -> Region:
     positions = {**EVEN_VTKHDF, **axes}
     coords = {
         axis: Coordinate(name=axis, values=np.array(values)) for axis, values in positions.items()
     }
     t, z, y, x = (len(positions[axis]) for axis in "tzyx")
-    return Region_vtkhdf(
-        name=name, units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords
-    )
+    return Region(name=name, units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords)
 
 
 def test_the_structure_of_the_specification(tmp_path: Path) -> None:
-    assert save_region_vtkhdf(tmp_path / "out.vtkhdf", region_vtkhdf(), DATA_VTKHDF) == [
+    assert save_region(tmp_path / "out.vtkhdf", region_vtkhdf(), DATA_VTKHDF) == [
         tmp_path / "out.vtkhdf"
     ]
     with h5py.File(tmp_path / "out.vtkhdf") as file:
@@ -347,7 +336,7 @@ def test_the_structure_of_the_specification(tmp_path: Path) -> None:
 def test_descending_axes_are_turned_round_vtkhdf(tmp_path: Path, turned: str) -> None:
     axes = {axis: values[::-1] for axis, values in EVEN_VTKHDF.items() if axis in turned}
     flipped = DATA_VTKHDF[:, *(slice(None, None, -1 if axis in turned else 1) for axis in "zyx")]
-    save_region_vtkhdf(tmp_path / "out.vtkhdf", region_vtkhdf(**axes), flipped)
+    save_region(tmp_path / "out.vtkhdf", region_vtkhdf(**axes), flipped)
     with h5py.File(tmp_path / "out.vtkhdf") as file:
         np.testing.assert_array_equal(file["VTKHDF/PointData/wind"], DATA_VTKHDF)
         assert file["VTKHDF"].attrs["Origin"].tolist() == [10.0, -1.0, 2.0]
@@ -366,8 +355,8 @@ def test_grids_that_it_cannot_hold(
     tmp_path: Path, axes: dict[str, list[float]], message: str
 ) -> None:
     for act in (
-        lambda: save_region_vtkhdf(tmp_path / "out.vtkhdf", region_vtkhdf(**axes), DATA_VTKHDF),
-        lambda: save_check_vtkhdf(tmp_path / "out.vtkhdf", False, region_vtkhdf(**axes)),
+        lambda: save_region(tmp_path / "out.vtkhdf", region_vtkhdf(**axes), DATA_VTKHDF),
+        lambda: save_check(tmp_path / "out.vtkhdf", False, region_vtkhdf(**axes)),
     ):
         with pytest.raises(InputError, match=message) as caught:
             act()
@@ -383,7 +372,7 @@ def test_vtk_reads_every_step(tmp_path: Path, dtype: str) -> None:
     ).vtkStreamingDemandDrivenPipeline
     arrays = pytest.importorskip("vtkmodules.util.numpy_support")
     data = DATA_VTKHDF.astype(dtype)
-    save_region_vtkhdf(tmp_path / "out.vtkhdf", region_vtkhdf(dtype, name="a/b"), data)
+    save_region(tmp_path / "out.vtkhdf", region_vtkhdf(dtype, name="a/b"), data)
     reader = io.vtkHDFReader()
     reader.SetFileName(str(tmp_path / "out.vtkhdf"))
     reader.UpdateInformation()
@@ -399,21 +388,10 @@ def test_vtk_reads_every_step(tmp_path: Path, dtype: str) -> None:
         np.testing.assert_array_equal(found, data[step].ravel())
 
 
-def test_one_step_of_one_vertex(tmp_path: Path) -> None:
-    save_region_vtkhdf(
-        tmp_path / "out.vtkhdf",
-        region_vtkhdf(t=[1.0], z=[1.0], y=[2.0], x=[3.0]),
-        DATA_VTKHDF[:1, :1, :1, :1],
-    )
-    with h5py.File(tmp_path / "out.vtkhdf") as file:
-        assert file["VTKHDF"].attrs["Spacing"].tolist() == [1, 1, 1]
-        assert file["VTKHDF/PointData/wind"].shape == (1, 1, 1)
-
-
 @pytest.mark.parametrize("dtype", ["f4", "u1", "i8"])
 def test_one_step_is_of_the_first_version(tmp_path: Path, dtype: str) -> None:
     data = DATA_VTKHDF[1:2].astype(dtype)
-    save_region_vtkhdf(tmp_path / "out.vtkhdf", region_vtkhdf(dtype, t=[4.0]), data)
+    save_region(tmp_path / "out.vtkhdf", region_vtkhdf(dtype, t=[4.0]), data)
     with h5py.File(tmp_path / "out.vtkhdf") as file:
         group = file["VTKHDF"]
         assert group.attrs["Version"].tolist() == [1, 0]

@@ -38,6 +38,7 @@ from fhash_formats.support.values import PLUMBING, UnknownValueError, stored_typ
 
 __all__ = [
     "MAX_ARRAYS",
+    "Arranged",
     "Stored",
     "Wanted",
     "digest_of",
@@ -189,22 +190,35 @@ def warn_left_out(what: str, left_out: Mapping[str, str]) -> None:
         warnings.warn(f"{what}: {', '.join(told[:MAX_TOLD])}{rest}", FhashWarning, stacklevel=3)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Arranged:
+    """A variable as it is read.
+
+    Attributes:
+        layout: of its dimensions.
+        request: what the user asked for.
+        packed: how the values are packed; None where they are read as they are stored.
+        coords: positions of the axes; the times may stand for those of the file.
+    """
+
+    layout: Layout
+    request: Request
+    packed: Packing | None
+    coords: Mapping[str, Coordinate]
+
+
 def metadata_of(
-    name: str,
+    wanted: Wanted,
     variables: Mapping[str, Stored],
     attributes: Mapping[str, Any],
-    layout: Layout,
-    request: Request,
-    wanted: Wanted,
-    packed: Packing | None,
-    time: Coordinate,
+    arranged: Arranged,
 ) -> SourceMetadata:
     """All that belongs to a variable as it was arranged; see `surroundings`.
 
-    wanted: without dimensions. packed: how the values are packed; None where they are read as they
-        are stored. time: the times of the steps, which may stand for those of the file.
+    wanted: without dimensions.
     """
-    own = variables[name]
+    name, layout, packed = wanted.name, arranged.layout, arranged.packed
+    own, request = variables[name], arranged.request
     kept, picked = kept_dimensions(wanted.source, name, layout, own.dimensions, request.select)
     wanted = replace(
         wanted,
@@ -214,7 +228,8 @@ def metadata_of(
         digested=request.digested,
     )
     selected = replace(own, attributes={**own.attributes, **layout.attributes()})
-    return with_times(surroundings(wanted, {**variables, name: selected}, attributes), time)
+    found = surroundings(wanted, {**variables, name: selected}, attributes)
+    return with_times(found, arranged.coords["t"])
 
 
 def digest_of(path: Path) -> str | None:

@@ -1,14 +1,13 @@
-"""Variables of a file: choice of one, fields of records, steps in groups, the listing."""
+"""Variables of a file: choice of one, fields of records, steps in groups."""
 
 from __future__ import annotations
 
 import difflib
-import math
 import re
-import shlex
-from collections import Counter
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,15 +21,11 @@ from fhash_formats.readers.common.layout import (
     Layout,
     Read,
     arrange,
-    is_asked,
-    label,
-    must_select,
-    picks,
-    readings,
-    single,
+    shared_roles,
+    with_roles,
 )
-from fhash_formats.series import AXES, Coordinate, Series, empty_selection, meant
-from fhash_formats.support.values import json_attributes, plain_text
+from fhash_formats.series import Coordinate, meant
+from fhash_formats.support.values import json_attributes
 
 MAX_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
@@ -77,9 +72,9 @@ class Variable:
         error: why a library cannot open it, "" if it can.
         handle: whatever the reader needs to find it again.
         units: of the values, "" where unknown.
-        field: path of names in a compound type, () where the array is no such (fields.py).
+        field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
-            (step_groups.py).
+            (`join`).
     """
 
     name: str
@@ -289,242 +284,6 @@ def field_reading(read: Read, variable: Variable, stored: int) -> Read:
     return field
 
 
-@dataclass(frozen=True, kw_only=True)
-class Listed:
-    """One variable of a source.
-
-    Attributes:
-        name: full name, as `--var` takes it.
-        shape: lengths in the file's order.
-        dtype: type of the values, in words.
-        stored: type of the stored numbers, where values are unpacked; "" where it is the same.
-        missing: numbers that stand for missing values in the file, by its attributes.
-        units: of the values, "" where unknown.
-        dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
-            where an index must be selected, and "?" where two readings are likely.
-        options: for each likely reading, the options of `fhash encode` that it needs; none if the
-            variable cannot be encoded.
-        problem: why it cannot be encoded, "" if it can.
-        output: name of a container for it, which no other variable of the source has.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: str
-    stored: str = ""
-    missing: tuple[float, ...] = ()
-    units: str = ""
-    dimensions: tuple[tuple[str, str], ...] = ()
-    options: tuple[tuple[str, ...], ...] = ()
-    problem: str = ""
-    output: str = ""
-
-    def of_steps(self, steps: slice, *, whole: bool) -> Listed:
-        """This variable where some steps are asked for: its commands ask for them, too.
-
-        whole: whether the lengths are those of the whole source, so that an empty selection is
-        a problem.
-        """
-        axes = [axis for _, axis in self.dimensions]
-        count = self.shape[axes.index("t")] if "t" in axes else 1
-        if self.options and whole and not range(*steps.indices(count)):
-            problem = empty_selection(count)
-            return replace(self, options=(), problem=problem)
-        parts = [steps.start, steps.stop] + ([] if steps.step is None else [steps.step])
-        text = ":".join("" if part is None else str(part) for part in parts)
-        return replace(self, options=tuple((*words, "--t", text) for words in self.options))
-
-    def commands(self, path: str) -> list[str]:
-        """The command for each likely reading, for a shell."""
-        output = self.output or f"{self.name}.fhz"
-        return [
-            shlex.join(["fhash", "encode", path, "-o", output, *options])
-            for options in self.options
-        ]
-
-    def as_dict(self, path: str) -> dict[str, Any]:
-        """JSON values: all attributes, and the commands."""
-        return {
-            "name": self.name,
-            "shape": list(self.shape),
-            "dtype": self.dtype,
-            "stored": self.stored,
-            "missing": [value if math.isfinite(value) else str(value) for value in self.missing],
-            "units": self.units,
-            "dimensions": [
-                {"name": name, "length": length, "axis": axis}
-                for (name, axis), length in zip(self.dimensions, self.shape, strict=False)
-            ],
-            "commands": self.commands(path),
-            "problem": self.problem,
-        }
-
-
-def listing(
-    source: str,
-    variables: Sequence[Variable],
-    dimensions: Callable[[Variable], list[Dimension]],
-    request: Request,
-    packed: Callable[[Variable], Packing | None] = lambda variable: None,
-) -> list[Listed]:
-    """The variables of a file; coordinates and the members of joined ones are left out.
-
-    A request that names a variable gets that one alone, whatever it is.
-
-    dimensions, packed: dimensions of a variable that can be read, and the packing that the file
-        declares, whatever the request is.
-    """
-    shown = [variable for variable in variables if not variable.auxiliary]
-    good = [variable for variable in shown if not variable.problem(request.booleans)]
-    several = len(good) > 1
-    found = []
-    plain = Counter(plain_name(variable.name) for variable in shown)
-    if request.var is not None:
-        shown = [named(source, variables, good or shown, request.var)]
-    for variable in shown:
-        name, problem = plain_text(variable.name), variable.problem(request.booleans)
-        entry = Listed(
-            name=name,
-            shape=variable.shape,
-            dtype=kind_of(variable.dtype),
-            units=plain_text(variable.units),
-            problem=problem,
-            output=_output(variable.name, plain[plain_name(variable.name)] > 1),
-        )
-        if not problem:
-            said = ("--var", name) if several or request.var else ()
-            try:
-                entry = (
-                    _as_stored(entry, variable, packed)
-                    if request.raw_values
-                    else _unpacked(entry, packed(variable))
-                )
-                entry = _read(source, entry, dimensions(variable), request, said)
-            except InputError as error:  # of attributes that make no sense
-                entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
-        found.append(entry)
-    return found
-
-
-def _output(name: str, whole: bool) -> str:
-    """A name of a container for a variable, with its groups where the last part is not enough."""
-    text = name.replace("/", "_") if whole else plain_name(name)
-    return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
-
-
-def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
-    """An entry with the type of the values instead of the stored one, and the fill values."""
-    if packed is None:
-        return entry
-    # integers of which some are missing decode to integers again
-    changed = packed.scaled and packed.dtype != packed.stored
-    return replace(
-        entry,
-        dtype=kind_of(packed.dtype if packed.scaled else packed.stored),
-        stored=kind_of(packed.stored) if changed else "",
-        missing=tuple(fill.item() for fill in packed.fills),
-    )
-
-
-def _as_stored(
-    entry: Listed, variable: Variable, packed: Callable[[Variable], Packing | None]
-) -> Listed:
-    """An entry with the stored type; counts have not the unit of the values."""
-    try:
-        declared = packed(variable)
-    except InputError:  # the attributes make no sense, and are not used
-        return entry
-    if declared is None:
-        return entry
-    units = "" if declared.scaled else entry.units
-    return replace(entry, dtype=kind_of(declared.stored), units=units)
-
-
-def _read(
-    source: str,
-    entry: Listed,
-    dimensions: Sequence[Dimension],
-    request: Request,
-    named: tuple[str, ...],
-) -> Listed:
-    """An entry with its dimensions and the options of its readings."""
-    names = [label(place, dimension) for place, dimension in enumerate(dimensions)]
-    said = (*named, *_given(request))
-    axes = ["?"] * len(dimensions)
-    try:
-        picked = picks(source, entry.name, dimensions, request.select)
-        extra: list[int] = []
-        if request.axes is None:
-            picked |= single(dimensions, picked)
-            extra = must_select(dimensions, picked)
-        for place in {**picked, **dict.fromkeys(extra, 0)}:
-            axes[place] = "select"
-        chosen = {**picked, **dict.fromkeys(extra, 0)}
-        select = tuple(("--select", f"{names[place]}=0") for place in extra)
-        options = (*said, *(word for pair in select for word in pair))
-        kept = [place for place in range(len(dimensions)) if place not in chosen]
-        if request.axes is None and is_asked(
-            dimensions, chosen, selected=bool(request.select or extra)
-        ):
-            both = readings(dimensions, [dimensions[place] for place in kept])
-            for place in kept[:-1]:
-                axes[place] = dimensions[place].role or "?"
-            return replace(
-                entry,
-                dimensions=tuple(zip(names, axes, strict=True)),
-                options=tuple((*options, *text.split()) for text in both),
-            )
-        wishes = tuple((names[place], "0") for place in extra)
-        layout = arrange(
-            source, entry.name, dimensions, replace(request, select=(*request.select, *wishes))
-        )
-    except InputError as error:
-        return replace(
-            entry,
-            dimensions=tuple(zip(names, axes, strict=True)),
-            problem=str(error).removeprefix(f"{source}: "),
-        )
-    for place, axis in zip(kept, layout.axes, strict=True):
-        axes[place] = axis
-    return replace(entry, dimensions=tuple(zip(names, axes, strict=True)), options=(options,))
-
-
-def _given(request: Request) -> tuple[str, ...]:
-    """The options that the user gave already, which the commands repeat."""
-    words: list[str] = []
-    if request.axes is not None:
-        words += ["--axes", ",".join(request.axes)]
-    for name, index in request.select:
-        words += ["--select", f"{name}={index}"]
-    if request.raw is not None:
-        raw = request.raw
-        if raw.shape is not None:
-            words += ["--shape", ",".join(f"{axis}={n}" for axis, n in raw.shape.items())]
-        if raw.dtype is not None:
-            words += ["--dtype", raw.dtype]
-        if raw.endian is not None:
-            words += ["--endian", raw.endian]
-    if request.raw_values:
-        words.append("--raw-values")
-    for value in request.missing:
-        words += ["--missing", repr(value)]
-    return tuple(words)
-
-
-def listed_series(series: Series, request: Request) -> Listed:
-    """The only variable of a source that is one series already."""
-    return Listed(
-        name=series.name,
-        shape=series.shape,
-        dtype=kind_of(series.source_dtype or series.dtype),
-        missing=request.missing,
-        units=series.units,
-        dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
-        options=(("--var", request.var, *_given(request)) if request.var else _given(request),),
-        output=_output(series.name, whole=False),
-    )
-
-
 STEP_NAMES = """step steps timestep timesteps time_step ts time times t it iter iteration iterations
 cycle frame snapshot snap output out dump plt chk data state"""
 STEPS = frozenset(STEP_NAMES.split())
@@ -689,49 +448,118 @@ def times(
     )
 
 
-def require_one_type(
-    source: str, variable: Variable, packing: Callable[[Variable], Packing | None]
-) -> None:
-    """Raise InputError if the steps of a variable are unpacked to different types."""
-    types = {
-        member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
-        for member, made in ((member, packing(member)) for member in variable.members)
-    }
-    first = variable.members[0].name
-    for name, dtype in types.items():
-        if dtype != types[first]:
-            raise InputError(
-                f"{source}: {name} has values of type {dtype}, {first} of type {types[first]}; the"
-                " steps of one series must be alike, --raw-values reads the numbers as stored"
-            )
+class FileOfArrays(ABC):
+    """The variables of an open file, what their dimensions are, and how they are read.
 
-
-def require_positions(
-    source: str,
-    variable: Variable,
-    layout: Layout,
-    coords: Mapping[str, Coordinate],
-    columns: Callable[[str], Mapping[str, Column]],
-) -> None:
-    """Raise InputError if a step has positions of its own that differ from those of the first.
-
-    columns: what may be a coordinate in a group, by lower-case name.
+    A format says how one of its arrays is described and read. What holds for arrays with one group
+    a step is said here.
     """
-    for member in variable.members[1:]:
-        place = columns(parent(member.name))
-        own = beside(source, layout.axes, layout.shape, [place], certain=True, tied="t")
-        for axis, coordinate in own.items():
-            if not np.array_equal(coordinate.values, coords[axis].values):
+
+    def __init__(self, source: str, request: Request, arrays: Sequence[Variable]) -> None:
+        """arrays: of the file. What the abstract methods need is there already."""
+        self.source, self.request = source, request
+        self.variables = join(arrays, self._attributes)
+
+    @abstractmethod
+    def packing(self, variable: Variable) -> Packing | None:
+        """The packing of the values, None where the user wants them as stored."""
+
+    @abstractmethod
+    def _stated(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of an array, with what the file says about each."""
+
+    @abstractmethod
+    def _reading(self, variable: Variable) -> Read:
+        """The function that reads the values of an array."""
+
+    @abstractmethod
+    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes of an array."""
+
+    @abstractmethod
+    def _attributes(self, path: str) -> Mapping[str, Any]:
+        """Attributes of a group or an array by its path."""
+
+    @abstractmethod
+    def _scalar(self, path: str) -> tuple[float, str] | None:
+        """Value and unit of a number by its path, None if there is no number."""
+
+    @abstractmethod
+    def _columns(self, group: str) -> Mapping[str, Column]:
+        """What may be a coordinate in a group, by lower-case name."""
+
+    def choose(self, var: str | None) -> Variable:
+        """The variable that is wanted; see `choose`."""
+        request = self.request
+        return choose(
+            self.source,
+            self.variables,
+            var,
+            booleans=request.booleans,
+            selected=len(request.select),
+        )
+
+    def arrange(self, variable: Variable) -> Layout:
+        """The reading of a variable; see `layout.arrange`."""
+        return arrange(self.source, variable.name, self.dimensions(variable), self.request)
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable, with what the file says about each."""
+        return with_roles(self._dimensions(variable), self._roles)
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._dimensions, series_like(self.variables)))
+
+    def _dimensions(self, variable: Variable) -> list[Dimension]:
+        if variable.members:
+            steps = Dimension(name="step", length=len(variable.members), role="t")
+            return [steps, *self._stated(variable.members[0])]
+        return self._stated(variable)
+
+    def reading(self, variable: Variable) -> Read:
+        """The function that reads the values of a variable."""
+        if not variable.members:
+            return self._reading(variable)
+        types = {
+            member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
+            for member, made in ((member, self.packing(member)) for member in variable.members)
+        }
+        first = variable.members[0].name
+        for name, dtype in types.items():
+            if dtype != types[first]:
                 raise InputError(
-                    f"{source}: {member.name} has other coordinates along {axis} than"
-                    f" {variable.members[0].name}; the steps of one series must be alike"
+                    f"{self.source}: {name} has values of type {dtype}, {first} of type"
+                    f" {types[first]}; the steps of one series must be alike, --raw-values reads"
+                    " the numbers as stored"
                 )
+        return stacked([self._reading(member) for member in variable.members])
+
+    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes of a variable.
+
+        Raises InputError if a step has positions of its own that differ from those of the first.
+        """
+        coords = self._positions(variable, layout)
+        if not variable.members or "t" not in layout.axes or 0 in layout.picked:
+            return coords
+        coords["t"] = times(variable.members, self._attributes, self._scalar)
+        for member in variable.members[1:]:
+            place = self._columns(parent(member.name))
+            own = beside(self.source, layout.axes, layout.shape, [place], certain=True, tied="t")
+            for axis, coordinate in own.items():
+                if not np.array_equal(coordinate.values, coords[axis].values):
+                    raise InputError(
+                        f"{self.source}: {member.name} has other coordinates along {axis} than"
+                        f" {variable.members[0].name}; the steps of one series must be alike"
+                    )
+        return coords
 
 
-def reading(reads: Sequence[Read]) -> Read:
+def stacked(reads: Sequence[Read]) -> Read:
     """A read of several arrays as one, with their number as the first dimension."""
 
-    def stacked(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        return np.stack([read(ranges[1:]) for read in reads[ranges[0]]])
+    def read(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        return np.stack([one(ranges[1:]) for one in reads[ranges[0]]])
 
-    return stacked
+    return read

@@ -17,26 +17,6 @@ from fhash_formats.readers.common.cf import join_times, packing
 from fhash_formats.series import Coordinate
 
 
-def test_zarrs_own_fill_value_hides_nothing_unless_xarray_wrote_it(tmp_path: Path) -> None:
-    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
-    create_zarr(tmp_path / "a.zarr", values, zarr_format=2, fill_value=0)
-    np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], values)
-    create_zarr(
-        tmp_path / "b.zarr", values, zarr_format=3, fill_value=0, dimension_names=["z", "y", "x"]
-    )
-    np.testing.assert_array_equal(frames(tmp_path / "b.zarr")[0], values)
-    create_zarr(
-        tmp_path / "c.zarr",
-        values,
-        zarr_format=2,
-        fill_value=0,
-        attributes={"_ARRAY_DIMENSIONS": ["z", "y", "x"]},
-    )
-    np.testing.assert_array_equal(
-        frames(tmp_path / "c.zarr")[0], np.where(values == 0, np.nan, values.astype("f4"))
-    )
-
-
 def test_unsigned_values_stored_as_signed(tmp_path: Path) -> None:
     values = np.array([0, 1, 127, 128, 254, 255], np.uint8).reshape(1, 2, 3)
     attributes = {"_Unsigned": "true", "_FillValue": -1, "missing_value": 300}

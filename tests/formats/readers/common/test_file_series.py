@@ -155,22 +155,6 @@ def test_a_chunk_of_many_steps_is_decompressed_once(
     np.testing.assert_array_equal(np.stack(frames), VALUES)
 
 
-def test_what_is_kept_of_a_chunk_is_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "fhash_formats.readers.common.file_series.SLAB_BYTES", 2 * VALUES[0].nbytes + 1
-    )
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("v", data=VALUES, chunks=(4, 3, 5, 6))
-    with open_series(tmp_path / "a.h5") as series:
-        frame = series.read(1)
-        assert series._slab is not None
-        assert series._slab[1].shape[0] == 2
-        frame[:] = 0  # a frame is the caller's own
-        np.testing.assert_array_equal(np.stack(list(series.frames())), VALUES)
-
-
 def test_time_as_the_fastest_axis_reads_many_steps_at_once(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.ascontiguousarray(VALUES.transpose(1, 2, 3, 0)))
     with open_series(tmp_path / "a.npy", axes="z,y,x,t") as series:

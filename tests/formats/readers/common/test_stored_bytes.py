@@ -23,10 +23,8 @@ from fhash_formats.readers.common import stored_bytes as flat
 from fhash_formats.readers.common.stored_bytes import (
     CompressedFile,
     FlatArray,
-    ManyFiles,
     NumbersInText,
     PlainFile,
-    StoredArray,
     StoredBytes,
     axis_steps,
     component_by_number,
@@ -132,22 +130,6 @@ def test_one_frame_is_read_at_a_time(
         tracemalloc.stop()
     assert count == 2 * values[0].nbytes
     assert peak < 3 * values[0].nbytes
-
-
-def test_a_short_run_among_many_others_is_read_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values = np.random.default_rng(0).integers(0, 9, (2, 5000, 4, 4), np.uint8)  # (z, t, y, x)
-    monkeypatch.setattr(flat, "BLOCK_BYTES", 1000)
-    np.save(tmp_path / "a.npy", values)
-    with open_series(tmp_path / "a.npy", axes="z,t,y,x") as series:
-        series._together = 1  # as for frames above the bound of a slab
-        series.read(0)
-        tracemalloc.start()
-        np.testing.assert_array_equal(series.read(4000), values[:, 4000])
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < values[0].nbytes
 
 
 FLOAT = np.dtype("f4")
@@ -304,18 +286,3 @@ def test_words_that_are_no_numbers(words: list[bytes], dtype: str, message: str)
         numbers_of_words(words, np.dtype(dtype))
     assert numbers_of_words([b"18446744073709551615"], np.dtype("u8"))[0] == 2**64 - 1
     assert numbers_of_words([b"1" * 64], np.dtype("f8"))[0] == float("1" * 64)
-
-
-def test_many_files_follow_each_other(tmp_path: Path) -> None:
-    parts = []
-    for number in range(4):
-        (tmp_path / str(number)).write_bytes(DATA[number * 60 : number * 60 + 60])
-        parts.append(PlainFile(tmp_path / str(number), start=0, size=60))
-    array = StoredArray(tmp_path / "0", (4, 3, 5), np.dtype("<f4"), ManyFiles(parts))
-    expected = np.frombuffer(DATA[:240], "<f4").reshape(4, 3, 5)
-    whole = (slice(0, 4), slice(0, 3), slice(0, 5))
-    np.testing.assert_array_equal(array.read(whole), expected)
-    for place, length in enumerate(array.shape):
-        ranges = tuple(slice(1, length - 1) if i == place else each for i, each in enumerate(whole))
-        np.testing.assert_array_equal(array.read(ranges), expected[ranges])
-    assert part(ManyFiles(parts), 50, 130) == DATA[50:180]

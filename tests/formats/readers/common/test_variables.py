@@ -9,43 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-import xarray as xr
-from stored_series import VALUES, assert_frames, create_zarr, frames, save_netcdf, write_hdf5
+from stored_series import VALUES, assert_frames, write_hdf5
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf import packing
 from fhash_formats.readers.common.file_series import RawLayout, Request
 from fhash_formats.readers.common.layout import Dimension
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.variables import (
-    Listed,
     Variable,
     expand,
     field_reading,
     group_time,
     join,
-    leaves,
-    listing,
     times,
-)
-from fhash_formats.readers.common.variables import (
-    reading as reading_step_groups,
 )
 
 NESTED = np.dtype(
     [("rho", "f4"), ("v", [("x", "f8"), ("y", "f8")], (2,)), ("w", "i2", (3,)), ("c", "c8")]
 )
-
-
-def test_leaves_of_nested_types() -> None:
-    assert [(".".join(path), dtype.str, shape) for path, dtype, shape in leaves(NESTED)] == [
-        ("rho", "<f4", ()),
-        ("v.x", "<f8", (2,)),
-        ("v.y", "<f8", (2,)),
-        ("w", "<i2", (3,)),
-        ("c.real", "<f4", ()),
-        ("c.imag", "<f4", ()),
-    ]
 
 
 def test_every_leaf_reads_as_numpy_reads_it() -> None:
@@ -71,15 +54,6 @@ def test_every_leaf_reads_as_numpy_reads_it() -> None:
         got = read(ranges)
         np.testing.assert_array_equal(got, expected[variable.name][ranges])
         assert got.base is None
-
-
-def test_parts_of_complex_arrays_are_there_by_name_only() -> None:
-    whole = Variable(name="psi", shape=(2, 3, 4), dtype=np.dtype("c16"))
-    assert [(one.name, one.auxiliary) for one in expand([whole])] == [
-        ("psi", False),
-        ("psi.real", True),
-        ("psi.imag", True),
-    ]
 
 
 def variable(name: str, *shape: int, dtype: str = "f4", **rest: object) -> Variable:
@@ -109,13 +83,6 @@ def test_raw_values_have_the_stored_type_and_no_unit_of_others() -> None:
         assert (found.dtype, found.units) == (dtype, units)
         assert found.options == ((("--raw-values",) if raw else ()),)
         assert found.missing == (() if raw else (-9,))
-
-
-def test_one_variable_needs_no_option() -> None:
-    (only,) = listed(variable("group/rho", 4, 12, 13, 14, units="kg"))
-    assert (only.units, only.dtype, only.options) == ("kg", "float32", ((),))
-    assert [axis for _, axis in only.dimensions] == ["t", "z", "y", "x"]
-    assert only.commands("a.h5") == ["fhash encode a.h5 -o rho.fhz"]
 
 
 def test_auxiliary_variables_are_left_out_and_others_are_named() -> None:
@@ -188,12 +155,6 @@ def test_json_of_an_entry() -> None:
         "commands": ["fhash encode a.h5 -o a.fhz"],
         "problem": "",
     }
-
-
-def test_packed_values_are_listed_by_their_own_type() -> None:
-    made = packing("a", np.dtype("i2"), {"scale_factor": 0.5, "_FillValue": -9})
-    (one,) = listing("a", [variable("a", 4, 12, 13, 14)], unnamed, Request(), lambda one: made)
-    assert (one.dtype, one.stored, one.missing) == ("float64", "int16", (-9,))
 
 
 def test_outputs_of_one_source_differ() -> None:
@@ -300,26 +261,6 @@ def test_times_come_from_groups_or_from_numbers_beside() -> None:
     assert (coordinate.name, coordinate.values.tolist()) == ("step", [0, 5])
 
 
-def test_only_the_steps_that_are_asked_for_are_read() -> None:
-    frames = [np.full((2, 3), step) for step in range(5)]
-    calls: list[int] = []
-
-    def reader(step: int) -> Any:
-        def read(ranges: tuple[slice, ...]) -> np.ndarray:
-            calls.append(step)
-            return frames[step][ranges]
-
-        return read
-
-    read = reading_step_groups([reader(step) for step in range(5)])
-    got = read((slice(1, 3), slice(0, 2), slice(1, 3)))
-    np.testing.assert_array_equal(got, np.stack(frames[1:3])[:, :, 1:])
-    assert calls == [1, 2]
-
-
-DIMS = ("time", "lev", "lat", "lon")
-
-
 def test_several_datasets_need_a_choice(tmp_path: Path) -> None:
     path = write_hdf5(
         tmp_path / "a.h5", density=VALUES, gas__pressure=VALUES * 2, time=np.arange(4.0)
@@ -365,44 +306,3 @@ def test_unsuitable_datasets_are_described(tmp_path: Path, array: Any, words: st
 def test_a_file_without_datasets(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no array at all"):
         open_series(write_hdf5(tmp_path / "a.h5"))
-
-
-def test_several_variables_need_a_choice(tmp_path: Path) -> None:
-    path = save_netcdf(
-        tmp_path / "a.nc", xr.Dataset({"u": (DIMS, VALUES), "w": (DIMS, VALUES * 2)})
-    )
-    with pytest.raises(InputError, match=r"holds 2 variables: u \(4, 3, 5, 6\), w \(4, 3, 5, 6\)"):
-        open_series(path)
-    np.testing.assert_array_equal(frames(path, var="w"), VALUES * 2)
-    with pytest.raises(InputError, match="no variable 'ww'; it holds w"):
-        open_series(path, var="ww")
-
-
-def test_one_dimension_only(tmp_path: Path) -> None:
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": ("time", np.zeros(4))}))
-    with pytest.raises(InputError, match=r"no variable of 3 or 4 dimensions.*v: 1 dimensions"):
-        open_series(path)
-
-
-def test_boolean_variables_are_refused(tmp_path: Path) -> None:
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES > 0)}))
-    with pytest.raises(InputError, match="boolean values"):
-        open_series(path)
-
-
-@pytest.mark.parametrize(
-    ("array", "words"),
-    [
-        (np.zeros(3), "1 dimensions"),
-        (np.zeros((2, 2, 2), complex), "complex128"),
-        (np.zeros((2, 2, 2), bool), "boolean"),
-        (np.zeros((2, 0, 2)), "length 0"),
-    ],
-)
-@pytest.mark.parametrize("zarr_format", [2, 3])
-def test_unsuitable_arrays_are_described(
-    tmp_path: Path, array: np.ndarray, words: str, zarr_format: int
-) -> None:
-    create_zarr(tmp_path / "a.zarr", array, name="odd", zarr_format=zarr_format)
-    with pytest.raises(InputError, match=f"odd: .*{words}"):
-        open_series(tmp_path / "a.zarr")

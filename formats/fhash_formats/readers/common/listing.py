@@ -1,0 +1,264 @@
+"""Listing of a source: what is said of each variable, and the commands that encode it."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf import Packing
+from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    arrange,
+    is_asked,
+    label,
+    must_select,
+    picks,
+    readings,
+    single,
+)
+from fhash_formats.readers.common.variables import Variable, kind_of, named, plain_name
+from fhash_formats.series import AXES, Series, empty_selection
+from fhash_formats.support.values import plain_text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """One variable of a source.
+
+    Attributes:
+        name: full name, as `--var` takes it.
+        shape: lengths in the file's order.
+        dtype: type of the values, in words.
+        stored: type of the stored numbers, where values are unpacked; "" where it is the same.
+        missing: numbers that stand for missing values in the file, by its attributes.
+        units: of the values, "" where unknown.
+        dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
+            where an index must be selected, and "?" where two readings are likely.
+        options: for each likely reading, the options of `fhash encode` that it needs; none if the
+            variable cannot be encoded.
+        problem: why it cannot be encoded, "" if it can.
+        output: name of a container for it, which no other variable of the source has.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    stored: str = ""
+    missing: tuple[float, ...] = ()
+    units: str = ""
+    dimensions: tuple[tuple[str, str], ...] = ()
+    options: tuple[tuple[str, ...], ...] = ()
+    problem: str = ""
+    output: str = ""
+
+    def of_steps(self, steps: slice, *, whole: bool) -> Listed:
+        """This variable where some steps are asked for: its commands ask for them, too.
+
+        whole: whether the lengths are those of the whole source, so that an empty selection is
+        a problem.
+        """
+        axes = [axis for _, axis in self.dimensions]
+        count = self.shape[axes.index("t")] if "t" in axes else 1
+        if self.options and whole and not range(*steps.indices(count)):
+            problem = empty_selection(count)
+            return replace(self, options=(), problem=problem)
+        parts = [steps.start, steps.stop] + ([] if steps.step is None else [steps.step])
+        text = ":".join("" if part is None else str(part) for part in parts)
+        return replace(self, options=tuple((*words, "--t", text) for words in self.options))
+
+    def commands(self, path: str) -> list[str]:
+        """The command for each likely reading, for a shell."""
+        output = self.output or f"{self.name}.fhz"
+        return [
+            shlex.join(["fhash", "encode", path, "-o", output, *options])
+            for options in self.options
+        ]
+
+    def as_dict(self, path: str) -> dict[str, Any]:
+        """JSON values: all attributes, and the commands."""
+        return {
+            "name": self.name,
+            "shape": list(self.shape),
+            "dtype": self.dtype,
+            "stored": self.stored,
+            "missing": [value if math.isfinite(value) else str(value) for value in self.missing],
+            "units": self.units,
+            "dimensions": [
+                {"name": name, "length": length, "axis": axis}
+                for (name, axis), length in zip(self.dimensions, self.shape, strict=False)
+            ],
+            "commands": self.commands(path),
+            "problem": self.problem,
+        }
+
+
+def listing(
+    source: str,
+    variables: Sequence[Variable],
+    dimensions: Callable[[Variable], list[Dimension]],
+    request: Request,
+    packed: Callable[[Variable], Packing | None] = lambda variable: None,
+) -> list[Listed]:
+    """The variables of a file; coordinates and the members of joined ones are left out.
+
+    A request that names a variable gets that one alone, whatever it is.
+
+    dimensions, packed: dimensions of a variable that can be read, and the packing that the file
+        declares, whatever the request is.
+    """
+    shown = [variable for variable in variables if not variable.auxiliary]
+    good = [variable for variable in shown if not variable.problem(request.booleans)]
+    several = len(good) > 1
+    found = []
+    plain = Counter(plain_name(variable.name) for variable in shown)
+    if request.var is not None:
+        shown = [named(source, variables, good or shown, request.var)]
+    for variable in shown:
+        name, problem = plain_text(variable.name), variable.problem(request.booleans)
+        entry = Listed(
+            name=name,
+            shape=variable.shape,
+            dtype=kind_of(variable.dtype),
+            units=plain_text(variable.units),
+            problem=problem,
+            output=_output(variable.name, plain[plain_name(variable.name)] > 1),
+        )
+        if not problem:
+            said = ("--var", name) if several or request.var else ()
+            try:
+                entry = (
+                    _as_stored(entry, variable, packed)
+                    if request.raw_values
+                    else _unpacked(entry, packed(variable))
+                )
+                entry = _read(source, entry, dimensions(variable), request, said)
+            except InputError as error:  # of attributes that make no sense
+                entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
+        found.append(entry)
+    return found
+
+
+def _output(name: str, whole: bool) -> str:
+    """A name of a container for a variable, with its groups where the last part is not enough."""
+    text = name.replace("/", "_") if whole else plain_name(name)
+    return re.sub(r"[*#\s]+", "", "".join(filter(str.isprintable, text))).strip("._") + ".fhz"
+
+
+def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
+    """An entry with the type of the values instead of the stored one, and the fill values."""
+    if packed is None:
+        return entry
+    # integers of which some are missing decode to integers again
+    changed = packed.scaled and packed.dtype != packed.stored
+    return replace(
+        entry,
+        dtype=kind_of(packed.dtype if packed.scaled else packed.stored),
+        stored=kind_of(packed.stored) if changed else "",
+        missing=tuple(fill.item() for fill in packed.fills),
+    )
+
+
+def _as_stored(
+    entry: Listed, variable: Variable, packed: Callable[[Variable], Packing | None]
+) -> Listed:
+    """An entry with the stored type; counts have not the unit of the values."""
+    try:
+        declared = packed(variable)
+    except InputError:  # the attributes make no sense, and are not used
+        return entry
+    if declared is None:
+        return entry
+    units = "" if declared.scaled else entry.units
+    return replace(entry, dtype=kind_of(declared.stored), units=units)
+
+
+def _read(
+    source: str,
+    entry: Listed,
+    dimensions: Sequence[Dimension],
+    request: Request,
+    named: tuple[str, ...],
+) -> Listed:
+    """An entry with its dimensions and the options of its readings."""
+    names = [label(place, dimension) for place, dimension in enumerate(dimensions)]
+    said = (*named, *_given(request))
+    axes = ["?"] * len(dimensions)
+    try:
+        picked = picks(source, entry.name, dimensions, request.select)
+        extra: list[int] = []
+        if request.axes is None:
+            picked |= single(dimensions, picked)
+            extra = must_select(dimensions, picked)
+        for place in {**picked, **dict.fromkeys(extra, 0)}:
+            axes[place] = "select"
+        chosen = {**picked, **dict.fromkeys(extra, 0)}
+        select = tuple(("--select", f"{names[place]}=0") for place in extra)
+        options = (*said, *(word for pair in select for word in pair))
+        kept = [place for place in range(len(dimensions)) if place not in chosen]
+        if request.axes is None and is_asked(
+            dimensions, chosen, selected=bool(request.select or extra)
+        ):
+            both = readings(dimensions, [dimensions[place] for place in kept])
+            for place in kept[:-1]:
+                axes[place] = dimensions[place].role or "?"
+            return replace(
+                entry,
+                dimensions=tuple(zip(names, axes, strict=True)),
+                options=tuple((*options, *text.split()) for text in both),
+            )
+        wishes = tuple((names[place], "0") for place in extra)
+        layout = arrange(
+            source, entry.name, dimensions, replace(request, select=(*request.select, *wishes))
+        )
+    except InputError as error:
+        return replace(
+            entry,
+            dimensions=tuple(zip(names, axes, strict=True)),
+            problem=str(error).removeprefix(f"{source}: "),
+        )
+    for place, axis in zip(kept, layout.axes, strict=True):
+        axes[place] = axis
+    return replace(entry, dimensions=tuple(zip(names, axes, strict=True)), options=(options,))
+
+
+def _given(request: Request) -> tuple[str, ...]:
+    """The options that the user gave already, which the commands repeat."""
+    words: list[str] = []
+    if request.axes is not None:
+        words += ["--axes", ",".join(request.axes)]
+    for name, index in request.select:
+        words += ["--select", f"{name}={index}"]
+    if request.raw is not None:
+        raw = request.raw
+        if raw.shape is not None:
+            words += ["--shape", ",".join(f"{axis}={n}" for axis, n in raw.shape.items())]
+        if raw.dtype is not None:
+            words += ["--dtype", raw.dtype]
+        if raw.endian is not None:
+            words += ["--endian", raw.endian]
+    if request.raw_values:
+        words.append("--raw-values")
+    for value in request.missing:
+        words += ["--missing", repr(value)]
+    return tuple(words)
+
+
+def listed_series(series: Series, request: Request) -> Listed:
+    """The only variable of a source that is one series already."""
+    return Listed(
+        name=series.name,
+        shape=series.shape,
+        dtype=kind_of(series.source_dtype or series.dtype),
+        missing=request.missing,
+        units=series.units,
+        dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
+        options=(("--var", request.var, *_given(request)) if request.var else _given(request),),
+        output=_output(series.name, whole=False),
+    )
