@@ -18,9 +18,7 @@ from click.testing import Result
 from PIL import Image
 
 import fhash_codec
-from fhash_cli import gallery
-from fhash_cli.gallery import commands, page
-from fhash_cli.simulating import (
+from fhash_cli.commands.demo import (
     SceneOptions,
     ShapeType,
     describe,
@@ -28,7 +26,8 @@ from fhash_cli.simulating import (
     refuse_scene_options,
     simulation_rows,
 )
-from fhash_codec.gallery import PICTURES
+from fhash_codec import gallery
+from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
 from fhash_codec.simulation.simulate import Simulation, simulate
 from fhash_formats import open_series
