@@ -183,17 +183,21 @@ class DurationType(click.ParamType[float]):
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "Input": ("var", "axes", "t", "shape", "dtype", "endian", "missing", "select"),
+    "Input": (
+        "var", "axes", "t", "shape", "dtype", "endian", "missing", "select", "raw-values",
+        "keep-extremes", "no-external", "components",
+    ),
     "Quality, one of": (
         "psnr", "psnr-bulk", "max-error", "max-error-rel", "ratio", "min-psnr", "target", "bound",
     ),
     "Feature": ("feature", "dilation"),
     "Steps and region": ("time", "roi", "box", "lod"),
     "Values": ("outside", "fill"),
-    "Profile compact": ("profile", "effort", "tile"),
+    "Profile compact": ("profile", "effort", "tile", "access", "without"),
     "Profile paper": (
-        "key-frames", "fold", "embedding-size", "hidden-layers", "width", "epochs",
-        "learning-rate", "schedule", "batch", "tables", "engine", "engines",
+        "key-frames", "fringe", "fold", "embedding-size", "hidden-layers", "width", "epochs",
+        "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",
+        "engines",
     ),
     "Scene": (
         "scene", "steps", "paper-shape", "gallery", "set", "effect", "size", "background",
@@ -203,21 +207,19 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "view", "azimuth", "elevation", "zoom", "projection", "position", "focal-point", "view-up",
     ),
     "Colour and opacity": (
-        "cmap", "opacity", "range", "density", "isosurface", "volume", "no-volume", "track",
+        "cmap", "opacity", "gradient-opacity", "range", "density", "isosurface", "no-volume",
+        "track",
     ),
-    "Clipping": ("clip", "clip-box", "clip-plane"),
-    "Animation": (
-        "animate", "frames", "fps", "pictures", "evolution", "columns", "part-of", "split",
-    ),
-    "Accuracy and speed": (
-        "march", "device", "step", "threshold", "samples-per-pass", "skipping",
-    ),
+    "Clipping": ("clip-box", "clip-plane"),
+    "Animation": ("animate", "frames", "fps", "pictures", "evolution", "columns"),
+    "Accuracy and speed": ("march", "device", "step"),
+    "Parts and further steps": ("plan", "keep"),
     "Comparison": ("peer", "part", "seconds", "turns", "speed"),
     "Address": ("host", "port"),
     "Cases": ("all", "case", "group"),
     "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
     "Run": (
-        "seed", "timings", "deterministic", "processes", "explain", "json", "q", "quiet", "v",
+        "budget", "time-budget", "seed", "timings", "deterministic", "processes", "explain", "json", "q", "quiet", "v",
         "verbose", "help",
     ),
 }  # fmt: skip
@@ -228,12 +230,12 @@ ELSEWHERE = {
     ("decode", "isosurface"): "Output",
     ("render", "t"): "Steps and region",
     ("encode", "device"): "Run",
+    ("encode", "part"): "Parts and further steps",
     ("train", "device"): "Run",
     ("rate", "device"): "Run",
     ("demo", "shape"): "Scene",
     ("diff", "max-error"): "Quality, gates",
     ("diff", "min-psnr"): "Quality, gates",
-    ("diff", "min-psnr-bulk"): "Quality, gates",
     ("rate", "target"): "Comparison",
     ("rate", "bound"): "Comparison",
     ("rate", "profile"): "Comparison",

@@ -128,14 +128,11 @@ PLACES = {
     "scale": "scale",
     "background": "background",
     "step": "march.step",
-    "threshold": "march.threshold",
     "lod": "march.lod",
     "march": "march.mode",
     "device": "march.device",
-    "samples_per_pass": "march.samples_per_pass",
     "antialiasing": "effects.antialiasing",
     "gradient_opacity": "transfer_function.gradient_opacity",
-    "attenuation": "effects.attenuated_maximum_intensity.attenuation",
     "clip_box": "effects.clip",
     "clip_planes": "effects.clip.planes",
 }
@@ -260,12 +257,6 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         " value range from vertex to vertex.",
     ),
     click.option(
-        "--attenuation",
-        type=float,
-        metavar="X",
-        help="Attenuated maximum intensity, by so much in a vertex spacing.",
-    ),
-    click.option(
         "--clip-box",
         type=IntervalsType(float),
         help="Show only this part, in coordinates; an end may be left out.",
@@ -298,16 +289,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     click.option("--device", metavar="NAME", help="Where a network is marched: auto, cpu or cuda."),
     click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings."),
     click.option(
-        "--threshold", type=float, metavar="X", help="Share of the light at which a ray ends."
-    ),
-    click.option(
         "--lod", type=int, metavar="N", help="Level of detail; by the size of a pixel if left out."
-    ),
-    click.option("--samples-per-pass", type=int, metavar="N", help="N_r of adaptive ray marching."),
-    click.option(
-        "--skipping/--no-skipping",
-        default=None,
-        help="Pass over bricks of which nothing can be seen.",
     ),
     click.option(
         "--set",
@@ -337,8 +319,6 @@ def scene_options(command: Command) -> Command:
             given["effects.buffers"] = buffers
         if values.pop("no_volume"):
             given["transfer_function.nothing"] = True
-        if (skipping := values.pop("skipping")) is not None:
-            given["march.skipping"] = skipping
         if "step" in given and "time" in given:
             raise click.UsageError("--t and --time exclude each other")
         names = [field.name for field in dataclasses.fields(SceneOptions) if field.name != "places"]

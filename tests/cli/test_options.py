@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -197,6 +198,19 @@ def test_options_mean_what_their_command_makes_of_them(
 
 def test_a_new_option_is_shown_without_being_named_here() -> None:
     assert group_of("encode", click.Option(["--never-heard-of"])) == OTHERS
+
+
+def test_options_are_few_and_each_is_named_in_a_document() -> None:
+    root = Path(__file__).resolve().parents[2]
+    text = "".join(path.read_text() for path in [root / "README.md", *root.glob("docs/*.md")])
+    words = set(re.findall(r"--[a-z][a-z-]*", text))
+    names = []
+    for name in COMMANDS:
+        command = program.get_command(click.Context(program), name)
+        if command is not None and not isinstance(command, click.Group):  # all but the benches
+            names += [(*p.opts, *p.secondary_opts) for p in command.params if p.opts[0][0] == "-"]
+    assert len(names) <= 250
+    assert not {word for each in names for word in each if word.startswith("--")} - words
 
 
 def test_no_option_is_in_two_groups() -> None:

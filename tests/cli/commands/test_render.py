@@ -169,9 +169,8 @@ def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
     assert parsed(*words, "--clip-box", ":,-2:0,:5") == {
         "effects": {"clip": {"y": [-2.0, 0.0], "x": [None, 5.0], "planes": planes}}
     }
-    assert parsed("--gradient-opacity", "0:0,0.1:1", "--attenuation", "0.2") == {
-        "transfer_function": {"gradient_opacity": [[0.0, 0.0], [0.1, 1.0]]},
-        "effects": {"attenuated_maximum_intensity": {"attenuation": 0.2}},
+    assert parsed("--gradient-opacity", "0:0,0.1:1") == {
+        "transfer_function": {"gradient_opacity": [[0.0, 0.0], [0.1, 1.0]]}
     }
     assert parsed("--effect", "average-intensity") == {"effects": {"average_intensity": True}}
     with pytest.raises(InputError, match="effect 'clip' is not known"):
@@ -477,7 +476,10 @@ def test_without_a_name_the_picture_is_called_as_the_run(
         (["--clip-box", ":,:,98:99"], "leaves nothing of the volume"),
         (["--clip-plane", "0,0,1"], "neither a normal and an offset"),
         (["--clip-plane", "0,0,0,1"], "the normal has no length"),
-        (["--effect", "minimum-intensity", "--attenuation", "1"], "leave one of them"),
+        (
+            ["--effect", "minimum-intensity", "--set", "effects.maximum_intensity=true"],
+            "leave one of them",
+        ),
         (["--t", "3"], "outside the series"),
         (["--t", "-4"], "step is -1"),
         (["--time", "77"], "77"),
