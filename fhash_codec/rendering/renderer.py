@@ -411,13 +411,10 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
     progress("lighting", 0, 1, "")
     light = light_grid(
         decoded.frame,
-        plan.task.rays.grid,
-        plan.task.table,
+        plan.task,
         shadows=plan.shadows,
         lamp=plan.lamp,
         ambient_occlusion=plan.occlusion,
-        body=plan.task.body,
-        grading=plan.task.grading,
         bricks=decoded.bricks,
     )
     progress("lighting", 1, 1, "")

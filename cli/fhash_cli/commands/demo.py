@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import io
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ from fhash_cli.options import (
     force_option,
     json_option,
     make_folder,
+    option_group,
     quiet_option,
 )
 from fhash_cli.output import (
@@ -126,43 +126,39 @@ class SceneOptions:
         return Simulation(scene, self.seed)
 
 
-def scene_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of SceneOptions; the command gets them as `chosen`."""
-
-    @click.option(
+scene_options = option_group(
+    SceneOptions,
+    "chosen",
+    click.option(
         "--scene",
         default="vortex",
         show_default=True,
         metavar="NAME|FILE",
         help="What to simulate: vortex, front, flame, bubble, shell, or a TOML or JSON file with a"
         " list of effects.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--shape",
         type=ShapeType(),
         help="Vertices along z, y and x, such as 54,172,200 or x=200,y=172,z=54. Default: a small"
         " shape of the scene's own.",
-    )
-    @click.option("--steps", type=click.IntRange(1), metavar="N", help="Number of steps.")
-    @click.option(
+    ),
+    click.option("--steps", type=click.IntRange(1), metavar="N", help="Number of steps."),
+    click.option(
         "--paper-shape",
         is_flag=True,
         help="Shape and steps of the paper's data set that flame, bubble or shell resembles.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--seed",
         type=click.IntRange(0, 2**32 - 1),
         default=0,
         show_default=True,
         metavar="S",
         help="Seed of the scene's random numbers.",
-    )
-    @functools.wraps(command)
-    def collected(**values: Any) -> None:
-        names = ("scene", "shape", "steps", "paper_shape", "seed")
-        command(chosen=SceneOptions(**{name: values.pop(name) for name in names}), **values)
-
-    return collected
+    ),
+)
+"""Options that say what to simulate; the command gets them as `chosen`."""
 
 
 def is_data_file(path: Path) -> bool:

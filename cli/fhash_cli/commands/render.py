@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,12 @@ import click
 
 from fhash_cli.options import (
     BaseCommand,
-    Command,
     RealRange,
     SliceType,
     check_writable,
     force_option,
     json_option,
+    option_group,
     quiet_option,
     run_argument,
     variable_option,
@@ -95,59 +94,55 @@ class AnimationOptions:
         return parse_tracked([] if OWN in self.track else self.track, volume, progress)
 
 
-def add_animation_options(command: Command) -> Command:
-    """Add the options of AnimationOptions; the command gets them as `several`."""
-
-    @click.option(
+add_animation_options = option_group(
+    AnimationOptions,
+    "several",
+    click.option(
         "--animate",
         metavar="SPEC",
         help="steps[=A:B[:EVERY]], time[=A:B[:EVERY]], orbit[=DEGREES], separated by commas,"
         " or a file (TOML, JSON). Times may be dates.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
-    )
-    @click.option(
+    ),
+    click.option(
         "--fps", type=RealRange(0.1, 240), metavar="X", help="Pictures per second of a film."
-    )
-    @click.option(
+    ),
+    click.option(
         "--pictures",
         metavar="NAME.png",
         type=click.Path(),
         help="Keep the pictures of a film too: NAME.0000.png and so on.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--processes",
         type=click.IntRange(1, 256),
         metavar="N",
         help="Processes that render at a time, for films of some hundred pictures or more: one uses"
         " all cores too, and each further one takes a second to start.  [default: 1]",
-    )
-    @click.option(
+    ),
+    click.option(
         "--evolution",
         metavar="A:B:S",
         type=SliceType(),
         help="These steps side by side in one picture.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--columns",
         type=click.IntRange(1, 1000),
         metavar="N",
         help="Pictures beside each other of an evolution.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--track",
         metavar="FEATURE[=#RRGGBB]",
         multiple=True,
         help="Draw interval:LO:HI, isosurface:V or segmentation[:T] in a colour of its own; repeat."
         f" '{OWN}': those of the file.",
-    )
-    @functools.wraps(command)
-    def collected(**values: Any) -> None:
-        names = [field.name for field in dataclasses.fields(AnimationOptions)]
-        command(several=AnimationOptions(**{name: values.pop(name) for name in names}), **values)
-
-    return collected
+    ),
+)
+"""Options of several pictures; the command gets them as `several`."""
 
 
 def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: Progress) -> Scene:
@@ -190,7 +185,7 @@ def _animate(
     progress: Progress,
 ) -> tuple[dict[str, Any], str]:
     """Draw the pictures or the film of `--animate`."""
-    from fhash_codec.rendering.film import animate
+    from fhash_codec.rendering.film import Target, animate
     from fhash_codec.rendering.timeline import Animation
     from fhash_formats.errors import OutputExistsError
 
@@ -207,11 +202,13 @@ def _animate(
             volume,
             shown,
             animation,
-            output,
-            pictures=options.pictures,
-            force=force,
+            Target(
+                output=output,
+                pictures=options.pictures,
+                force=force,
+                processes=options.processes or 1,
+            ),
             progress=progress,
-            processes=options.processes or 1,
         )
     except OutputExistsError as error:
         # Only the command line is wrong so far: exit code 2.
@@ -296,6 +293,16 @@ def _places(followed: list[dict[str, Any]]) -> str:
     return table([header, *rows])
 
 
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """Options of `fhash render` about the files of one picture, and what is said of it."""
+
+    output: str | None
+    save_scene: str | None
+    explain: bool
+    force: bool
+
+
 @click.command("render", cls=BaseCommand)
 @run_argument
 @variable_option
@@ -319,15 +326,13 @@ def _places(followed: list[dict[str, Any]]) -> str:
 @force_option
 @json_option
 @quiet_option
+@option_group(PictureOptions, "picture")
 def command(
     run: str,
     variable: str | None,
-    output: str | None,
     options: SceneOptions,
     several: AnimationOptions,
-    save_scene: str | None,
-    explain: bool,
-    force: bool,
+    picture: PictureOptions,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -341,27 +346,28 @@ def command(
     from fhash_codec.times import time_text
     from fhash_codec.volume import open as open_volume
 
-    path = Path(output) if output is not None else Path(Path(file_name(run)).stem + ".png")
+    output = picture.output if picture.output is not None else Path(file_name(run)).stem + ".png"
+    path = Path(output)
     with open_volume(run, variable=variable) as volume, Progress(quiet=quiet) as progress:
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):
-            if explain or save_scene is not None:
+            if picture.explain or picture.save_scene is not None:
                 raise click.UsageError(
                     "--explain and --save-scene are for one picture;"
                     " leave them out of an animation or evolution"
                 )
             result, text = run_animation(
-                volume, scene, several, str(path), force=force, progress=progress
+                volume, scene, several, str(path), force=picture.force, progress=progress
             )
             emit(result, text, as_json)
             return
         scene = tracking(volume, scene, several, progress)
-        _check_outputs(path, save_scene, scene, force, run)
+        _check_outputs(path, picture, scene, run)
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
         image = renderer.render(plan=plan, progress=progress)
         time = time_text(volume.coords["t"], plan.time)
-    paths = [str(written) for written in _save(image, path, save_scene, force)]
+    paths = [str(written) for written in _save(image, path, picture)]
     result = {
         "paths": paths,
         "size": list(scene.size),
@@ -372,35 +378,36 @@ def command(
         "counters": dict(image.counters),
         "seconds": image.seconds,
     }
-    if explain:
+    if picture.explain:
         result["plan"] = plan.to_dict()
-    emit(result, _text(plan, image, time, paths, explain), as_json)
+    emit(result, _text(plan, image, time, paths, picture.explain), as_json)
 
 
-def _check_outputs(path: Path, save_scene: str | None, scene: Scene, force: bool, run: str) -> None:
+def _check_outputs(path: Path, picture: PictureOptions, scene: Scene, run: str) -> None:
     """Refuse outputs before any work."""
     from fhash_codec.rendering.image import check_picture_name
 
     check_picture_name(path, scene.background)
     outputs = [path, *(path.with_name(f"{path.stem}.{name}.npy") for name in scene.effects.buffers)]
-    if save_scene is not None:
-        if Path(save_scene).suffix.lower() != ".json":
-            raise InputError(f"{save_scene}: scenes are written as .json; use such a name")
-        outputs.append(Path(save_scene))
+    if (scene_file := picture.save_scene) is not None:
+        if Path(scene_file).suffix.lower() != ".json":
+            raise InputError(f"{scene_file}: scenes are written as .json; use such a name")
+        outputs.append(Path(scene_file))
     for output in outputs:
-        check_writable(output, force, sources=[run])
+        check_writable(output, picture.force, sources=[run])
 
 
-def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list[Path]:
+def _save(image: Image, path: Path, picture: PictureOptions) -> list[Path]:
     """Write the picture, after its scene where one is asked for; the paths written."""
     from fhash_formats.support.files import replacing
 
-    if save_scene is None:
-        return image.save(path, force=force)
-    with replacing(Path(save_scene), force=force) as temporary:
+    if picture.save_scene is None:
+        return image.save(path, force=picture.force)
+    scene = Path(picture.save_scene)
+    with replacing(scene, force=picture.force) as temporary:
         temporary.write_text(json.dumps(dict(image.scene), indent=2) + "\n", encoding="utf-8")
-        paths = image.save(path, force=force)
-    return [Path(save_scene), *paths]
+        paths = image.save(path, force=picture.force)
+    return [scene, *paths]
 
 
 def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) -> str:
