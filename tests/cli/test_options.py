@@ -17,14 +17,10 @@ from fhash_cli.commands.encode import command as encode
 from fhash_cli.main import COMMANDS, program
 from fhash_cli.options import (
     GROUPS,
-    LAST,
-    OTHERS,
     BaseCommand,
     DurationType,
     IntervalsType,
-    RealRange,
     SliceType,
-    group_of,
     parse_slice,
     written,
 )
@@ -166,19 +162,6 @@ def test_every_command_is_of_this_kind_and_names_each_option_once(command: click
     assert sorted(lines) == sorted(min(option.opts, key=len) for option in options)
 
 
-def test_the_help_of_encode_has_the_groups_of_its_options(fhash: Fhash) -> None:
-    groups = sections(fhash, "encode")
-    order = ["Input", "Quality, one of", "Feature", "Profile compact", "Profile paper"]
-    assert [title for title in groups if title in order] == order
-    assert tuple(groups)[-2:] == LAST
-    for title, option in {
-        "Input": "--var", "Quality, one of": "--max-error", "Feature": "--feature",
-        "Profile compact": "--effort", "Profile paper": "--epochs", "Output": "-o",
-        "Run": "--quiet",
-    }.items():  # fmt: skip
-        assert f"{option} " in groups[title], option
-
-
 @pytest.mark.parametrize(
     ("command", "title", "option"),
     [
@@ -194,10 +177,6 @@ def test_options_mean_what_their_command_makes_of_them(
     fhash: Fhash, command: str, title: str, option: str
 ) -> None:
     assert option in sections(fhash, command)[title]
-
-
-def test_a_new_option_is_shown_without_being_named_here() -> None:
-    assert group_of("encode", click.Option(["--never-heard-of"])) == OTHERS
 
 
 def test_options_are_few_and_each_is_named_in_a_document() -> None:
@@ -296,13 +275,6 @@ def test_settings_reach_the_encoding_as_a_config() -> None:
         EncodeConfig(),
         EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, effort=2),
     ]
-
-
-@pytest.mark.parametrize("text", ["nan", "NaN", "-1", "0.05", "3601", "-inf", "inf"])
-def test_numbers_are_within_their_limits(text: str) -> None:
-    assert RealRange(0.1, 3600).convert("12", None, None) == 12
-    with pytest.raises(click.BadParameter):
-        RealRange(0.1, 3600).convert(text, None, None)
 
 
 @pytest.mark.parametrize("flag", ["--psnr", "--learning-rate"])

@@ -91,10 +91,6 @@ def scene(
     return options.scene(VOLUME)
 
 
-def test_without_options_it_is_the_default_scene() -> None:
-    assert scene() == Scene()
-
-
 @pytest.mark.parametrize("place", sorted(set(PLACES.values()) - {"step"}))
 def test_every_option_sets_a_place_that_a_scene_has(place: str) -> None:
     with pytest.raises(InputError) as refused:
@@ -117,18 +113,6 @@ def test_a_setting_that_is_refused_is_named_with_what_it_takes(setting: str, mes
         scene(settings=(setting,))
 
 
-def test_a_negative_step_counts_from_the_end() -> None:
-    assert scene(places={"step": -1.0}).step == 4
-
-
-def test_options_replace_parts_of_the_scene_of_a_file(tmp_path: Path) -> None:
-    file = tmp_path / "scene.json"
-    file.write_text(json.dumps({"time": 2.0, "camera": {"view": "xy", "zoom": 3.0}}))
-    changed = scene(file=str(file), places={"step": 1.0, "camera.zoom": 2.0})
-    assert (changed.step, changed.time) == (1.0, None)
-    assert (changed.camera.view, changed.camera.zoom) == ("xy", 2.0)
-
-
 def test_effects_surfaces_and_settings_add_up() -> None:
     shown = scene(
         effects=("ambient-occlusion", "shading"),
@@ -140,11 +124,6 @@ def test_effects_surfaces_and_settings_add_up() -> None:
     assert shown.effects.shading.ambient == 0.3
     surfaces = shown.effects.isosurfaces
     assert [(surface.value, surface.opacity) for surface in surfaces] == [(1.5, 0.5), (2.0, 1.0)]
-
-
-def test_an_unknown_effect_names_the_nearest() -> None:
-    with pytest.raises(InputError, match="did you mean 'shadows'"):
-        scene(effects=("shadow",))
 
 
 def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
@@ -178,11 +157,6 @@ def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
 
 
 SMALL = Scene(size=(24, 18))
-
-
-@click.group(cls=Program)
-def program() -> None:
-    """A stand-in for fhash."""
 
 
 @click.command("render")
@@ -286,12 +260,6 @@ def test_an_evolution_with_features(run: Path, tmp_path: Path) -> None:
     assert "interval:6:8" in found["text"]
 
 
-def test_a_single_picture_of_the_features_of_the_file(run: Path, tmp_path: Path) -> None:
-    scene = Scene.from_dict(done(run, "-o", tmp_path / "a.png", "--track", "own")["result"])
-    assert {colour for _, colour in scene.transfer_function.colours} == {"#d55e00"}  # type: ignore[misc, str-unpack]
-    assert Scene.from_dict(done(run, "-o", tmp_path / "a.png")["result"]) == SMALL
-
-
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -320,17 +288,6 @@ def test_one_line_and_nothing_written(
     assert part in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_output_that_is_there_is_refused(run: Path, tmp_path: Path) -> None:
-    (tmp_path / "a.gif").write_bytes(b"mine")
-    words = (run, "-o", tmp_path / "a.gif", "--animate", "orbit", "--frames", "2")
-    refused = invoke(*words)
-    assert refused.exit_code == 2
-    assert "--force" in refused.stderr
-    assert (tmp_path / "a.gif").read_bytes() == b"mine"
-    done(*words, "--force")
-    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF")
 
 
 Fhash = Callable[..., Result]
@@ -505,45 +462,6 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(
     refused: Callable[..., str], run: Path, tmp_path: Path, words: list[str], said: str
 ) -> None:
     assert said in refused(2, "render", run, "-o", tmp_path / "view.png", *words)
-
-
-def test_outputs_are_checked_before_any_work(
-    refused: Callable[..., str], run: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "view.png").write_bytes(b"mine")
-    assert "--force" in refused(2, "render", run, "-o", tmp_path / "view.png")
-    assert ".png" in refused(2, "render", run, "-o", tmp_path / "view.gif")
-    assert "does not exist" in refused(2, "render", run, "-o", tmp_path / "no" / "view.png")
-    (tmp_path / "v.depth.npy").write_bytes(b"mine")
-    assert "--force" in refused(2, "render", run, "-o", tmp_path / "v.png", "--depth")
-    (tmp_path / "run.png").write_bytes(run.read_bytes())
-    assert "input itself" in refused(
-        2, "render", tmp_path / "run.png", "-o", tmp_path / "run.png", "--force"
-    )
-
-
-def test_a_file_that_is_missing_or_damaged_keeps_its_exit_code(
-    refused: Callable[..., str], tmp_path: Path
-) -> None:
-    assert "no such" in refused(2, "render", tmp_path / "none.fhz", "-o", tmp_path / "v.png")
-    (tmp_path / "bad.fhz").write_bytes(b"not a container")
-    refused(4, "render", tmp_path / "bad.fhz", "-o", tmp_path / "v.png")
-
-
-def test_an_evolution_is_replayed_from_its_picture(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    first, second, single = (tmp_path / name for name in ("a.png", "b.png", "c.png"))
-    for words in (
-        ["-o", first, "--size", "32", "--evolution", ":", "--columns", "2"],
-        ["-o", second, "--scene", first],
-        ["-o", single, "--scene", first, "--t", "1"],
-    ):
-        assert fhash("render", run, *words).exit_code == 0
-    assert first.read_bytes() == second.read_bytes()
-    with Pictures.open(first) as whole, Pictures.open(single) as one:
-        assert (whole.size, one.size) == ((65, 65), (32, 32))
-    refused = fhash("render", run, "-o", tmp_path / "d.png", "--scene", first, "--explain")
-    assert refused.exit_code == 2
-    assert "--explain" in refused.stderr
 
 
 def test_a_jpeg_says_where_its_scene_may_stay(fhash: Fhash, run: Path, tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -13,42 +11,14 @@ from fhash_codec.rendering.bricks import (
     FARTHEST,
     SIDE,
     Bricks,
-    Palette,
     cells_of,
     limits_of,
     smoothed,
 )
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
-from fhash_codec.rendering.light import DEVIATIONS
 from fhash_codec.rendering.march_task import Frame, Surface, Table, Task
 from fhash_codec.rendering.scenes import Camera
-
-ENTRIES = np.array([0.0, 0.0, 2.0, 0.0, 0.0])
-TABLE = Table(
-    low=1.0,
-    high=3.0,
-    colours=np.random.default_rng(1).uniform(size=(5, 3)).astype(np.float32),
-    extinctions=ENTRIES,
-)
-
-
-def test_values_are_interpolated_between_the_entries_and_clamped_to_them() -> None:
-    palette, values = Palette.of(TABLE), np.linspace(0, 4, 33)
-    places = np.linspace(1, 3, 5)
-    np.testing.assert_allclose(palette.extinction(values), np.interp(values, places, ENTRIES))
-    for channel in range(3):
-        np.testing.assert_allclose(
-            palette.colour(values)[:, channel],
-            np.interp(values, places, TABLE.colours[:, channel]),
-        )
-
-
-def test_an_interval_is_visible_if_a_value_in_it_has_an_extinction() -> None:
-    visible = Palette.of(TABLE).visible
-    low = np.array([1.6, 1.0, 2.5, 1.0, 0.0, 2.4, np.nan, 2.2])
-    high = np.array([1.7, 1.5, 9.0, 3.0, 0.9, 2.6, 2.0, 1.8])
-    assert visible(low, high).tolist() == [True, False, False, True, False, True, False, False]
 
 
 def bricks_of(values):
@@ -111,16 +81,6 @@ def test_bricks_matter_where_something_can_be_seen(way) -> None:
     assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
 
 
-def test_a_table_of_denormal_width_is_one() -> None:
-    values = np.zeros((6, 6, 6), dtype=np.float32)
-    values[1, 1, 1] = 1.0
-    colours = np.ones((4097, 3), dtype=np.float32)
-    task = task_of(values.shape, [0.0, 1.0])
-    for extinctions, expected in ((np.ones(4097), True), (np.zeros(4097), False)):
-        table = Table(low=0.0, high=5e-324, colours=colours, extinctions=extinctions)
-        assert np.all(bricks_of(values).matters(replace(task, table=table)) == expected)
-
-
 def test_the_distance_is_that_to_the_nearest_brick_that_matters(way) -> None:
     values = np.zeros((60, 50, 90))
     for z, y, x in ((4, 4, 4), (50, 20, 60), (33, 44, 85)):
@@ -135,23 +95,6 @@ def test_the_distance_is_that_to_the_nearest_brick_that_matters(way) -> None:
 
 def values(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random(shape, dtype=np.float32)
-
-
-@pytest.mark.parametrize("deviation", DEVIATIONS)
-def test_linear_values_stay_up_to_the_faces(deviation: float) -> None:
-    z, y, x = np.mgrid[:9, :8, :17].astype(np.float32)
-    linear = np.ascontiguousarray(z - 2 * y + 0.5 * x)
-    np.testing.assert_allclose(smoothed(linear, deviation), linear, atol=1e-5)
-
-
-def test_noise_falls_and_missing_values_stay_missing() -> None:
-    noise = values((24, 24, 24))
-    noise[3:5, 7, 9] = np.nan
-    found = smoothed(noise, 2.0)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(noise))
-    inner = (slice(6, -6),) * 3
-    assert np.nanstd(np.diff(found[inner], axis=0)) < 0.05 * np.nanstd(np.diff(noise, axis=0))
-    assert np.nanmean(found) == pytest.approx(float(np.nanmean(noise)), abs=0.02)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.01, 0.2])
@@ -177,15 +120,6 @@ def test_errors_cancel_and_what_is_larger_than_they_are_stays() -> None:
     heights = found[4:-4, 4:-4, 8] - found[4:-4, 4:-4, 7]
     assert heights.min() > 0.95
     assert (free[..., 8] - free[..., 7]).max() < 0.5
-
-
-def test_values_near_the_largest_float_stay_finite() -> None:
-    given = np.float32(3.2e38) * values((9, 10, 24), 3)
-    found = smoothed(given, 1.3)
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(
-        found / np.float32(1e38), smoothed(given / np.float32(1e38), 1.3), rtol=1e-5
-    )
 
 
 def task_of_cells(shape, extinctions, surfaces=(), low=0.0, high=1.0):

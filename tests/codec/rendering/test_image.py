@@ -11,7 +11,7 @@ import pytest
 from PIL import Image as Pictures
 
 from fhash_codec.rendering.image import Image
-from fhash_codec.rendering.scenes import Camera, Scene, scene_in_png
+from fhash_codec.rendering.scenes import Camera, Scene
 from fhash_formats.errors import InputError, OutputExistsError
 
 SCENE = Scene(
@@ -35,13 +35,6 @@ def test_pixels_over_a_background() -> None:
     assert image().to_uint8("white")[0, 0].tolist() == [255, 128, 128]
 
 
-def test_pixels_over_nothing_keep_their_colour() -> None:
-    pixels = image().to_uint8("transparent")
-    assert pixels[0, 0].tolist() == [255, 0, 0, 128]
-    assert pixels[0, 1].tolist() == [0, 0, 0, 0]
-    assert image(scene=Scene(background="transparent").to_dict()).to_uint8().shape == (2, 3, 4)
-
-
 @pytest.mark.parametrize("background", ["white", "transparent"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3.0, -1.0])
 def test_no_value_gives_a_pixel_that_is_none(background: str, value: float) -> None:
@@ -51,42 +44,6 @@ def test_no_value_gives_a_pixel_that_is_none(background: str, value: float) -> N
     if not np.isfinite(value):
         assert pixels[0, 0].tolist() == ([255] * 3 if background == "white" else [0] * 4)
     assert pixels[0, 1].tolist() == ([255] * 3 if background == "white" else [255, 255, 255, 64])
-
-
-def test_saved_pictures_hold_their_scene(tmp_path: Path) -> None:
-    path = tmp_path / "view.png"
-    assert image().save(path) == [path]
-    with Pictures.open(path) as found:
-        np.testing.assert_array_equal(np.asarray(found), image().to_uint8())
-        assert found.text["fhash.source"] == "run.fhz"
-    assert scene_in_png(path) == Scene.load(path) == SCENE
-    assert [each.name for each in tmp_path.iterdir()] == ["view.png"]
-
-
-def test_buffers_lie_beside_the_picture(tmp_path: Path) -> None:
-    depth = np.full((2, 3), np.inf, dtype=np.float32)
-    normal = np.ones((2, 3, 3), dtype=np.float32)
-    paths = image(depth=depth, normal=normal).save(tmp_path / "view.png")
-    assert [path.name for path in paths] == ["view.depth.npy", "view.normal.npy", "view.png"]
-    np.testing.assert_array_equal(np.load(paths[0]), depth)
-    np.testing.assert_array_equal(np.load(paths[1]), normal)
-    assert [path.name for path in image(normal=normal).outputs(Path("a.png"))] == [
-        "a.normal.npy",
-        "a.png",
-    ]
-
-
-@pytest.mark.parametrize("existing", ["view.png", "view.depth.npy"])
-def test_an_older_picture_stays_unless_forced(tmp_path: Path, existing: str) -> None:
-    (tmp_path / existing).write_text("old")
-    new = image(depth=np.zeros((2, 3), dtype=np.float32))
-    with pytest.raises(OutputExistsError, match=existing):
-        new.save(tmp_path / "view.png")
-    assert [path.name for path in tmp_path.iterdir()] == [existing]
-    new.save(tmp_path / "view.png", force=True)
-    assert scene_in_png(tmp_path / "view.png") == SCENE
-    with pytest.raises(InputError, match=r"written as \.png"):
-        new.save(tmp_path / "view.gif")
 
 
 def test_a_notebook_shows_the_picture() -> None:

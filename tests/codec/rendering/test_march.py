@@ -12,10 +12,9 @@ from frame_field import by_stream, streamed
 
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
-from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Lighting, Surface, Table, Task
-from fhash_codec.rendering.scenes import AmbientOcclusion, Camera, Shadows
+from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
 
 Shape = tuple[int, ...]
@@ -90,14 +89,6 @@ def test_a_constant_slab_has_its_closed_form_at_every_step(
     np.testing.assert_allclose(
         rgba, exact * np.array([0.8, 0.4, 0.2, 1.0]), rtol=1e-3 if exact < 1e-6 else 1e-5
     )
-
-
-def test_thin_fog_holds_down_to_tiny_steps(way: str) -> None:
-    table = table_of([0.0, 1e-4])
-    ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None], (11, 6, 6))
-    for step in (1.0, 0.1, 0.02):
-        rgba = march(frame_of(ramp), task_of(ramp.shape, table, step=step, size=(1, 1))).rgba[0, 0]
-        assert rgba[3] == pytest.approx(-np.expm1(-1e-4 * 5), rel=1e-3)
 
 
 def test_a_linear_ramp_in_front_of_colours_has_its_integral(way: str) -> None:
@@ -245,16 +236,6 @@ def test_a_camera_may_be_inside_and_rays_may_run_along_faces(way: str) -> None:
     assert march(frame_of(values), beside).rgba[0, 0, 3] == 0
 
 
-@pytest.mark.parametrize("shape", [(1, 6, 6), (6, 1, 6), (1, 1, 1), (2, 2, 2)])
-def test_volumes_of_one_vertex_are_drawn(way: str, shape: tuple[int, int, int]) -> None:
-    rgba = march(
-        frame_of(np.full(shape, 0.5)), task_of(shape, table_of([0.5, 0.5]), shaded=True)
-    ).rgba
-    thickness = 1 if shape[0] == 1 else shape[0] - 1
-    assert rgba[4, 4, 3] == pytest.approx(-np.expm1(-0.5 * thickness), rel=1e-5)
-    assert np.all(np.isfinite(rgba))
-
-
 def test_what_has_no_value_never_reaches_a_pixel(way: str) -> None:
     values = waves()
     values[5:9, 4:8, 3:20] = np.nan
@@ -277,39 +258,6 @@ def test_what_has_no_value_never_reaches_a_pixel(way: str) -> None:
         assert marched.normal is not None
         assert np.all(np.isfinite(marched.normal))
     assert not march(frame_of(np.full((5, 5, 5), np.nan)), task_of((5, 5, 5), table)).rgba.any()
-
-
-def test_a_face_of_vertices_with_values_is_seen_though_what_lies_behind_has_none(way: str) -> None:
-    values = np.full((3, 5, 5), 0.5)
-    values[0] = np.nan
-    camera = Camera(view="xz", projection="parallel")
-    task = task_of(values.shape, table_of([0.1, 0.1]), camera=camera, size=(1, 1))
-    task = replace(
-        task,
-        rays=replace(task.rays, eye=np.array([2.0, -9.0, 1.0]), right=np.zeros(3), up=np.zeros(3)),
-    )
-    assert march(frame_of(values), task).rgba[0, 0, 3] == pytest.approx(-np.expm1(-0.4), rel=1e-5)
-
-
-def test_the_maximum_is_that_of_the_samples(way: str) -> None:
-    values = waves()
-    n = 1000
-    table = Table(
-        low=0.0,
-        high=1.0,
-        colours=np.linspace([0, 0, 0], [1, 1, 1], n, dtype=np.float32),
-        extinctions=np.ones(n),
-    )
-    task = task_of(values.shape, table, size=(17, 17), projection="maximum", step=0.25, depth=True)
-    marched = march(frame_of(values), task)
-    everything = march(frame_of(values), replace(task, skipping=False))
-    np.testing.assert_array_equal(marched.rgba, everything.rgba)
-    np.testing.assert_array_equal(marched.depth, everything.depth)
-    hit = marched.rgba[..., 3] > 0
-    assert set(np.unique(marched.rgba[..., 3])) <= {0.0, 1.0}
-    assert hit.any()
-    assert marched.rgba[hit].max() <= values.max() + 1e-3 or values.max() > 1
-    assert marched.counters["gradients"] == 0
 
 
 CASES = {
@@ -454,26 +402,6 @@ def test_shading_is_stable_where_the_gradient_vanishes(way: str) -> None:
     np.testing.assert_allclose(rgba[..., :3], 0.2 * rgba[..., 3:] * np.ones(3), atol=0.15)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6])
-def test_light_has_a_direction_where_one_axis_is_much_shorter_than_the_others(
-    way: str, unit: float
-) -> None:
-    """The derivative along the short axis is large, and its square may not leave float32."""
-    values = np.broadcast_to(np.linspace(0, 1, 12)[:, None, None], (12, 12, 12))
-    table = table_of([50 / unit, 50 / unit], low=0.5, high=0.5 + 1e-14)
-    task = task_of(
-        values.shape,
-        table,
-        size=(8, 8),
-        step=0.5 * unit,
-        spacing=(1 / unit, 1 / unit, unit),
-        shaded=True,
-    )
-    np.testing.assert_allclose(
-        march(frame_of(values), task).rgba[4, 4], [1.3, 1.3, 1.3, 1.0], rtol=1e-3
-    )
-
-
 def test_counters_show_that_nothing_is_done_unasked(way: str) -> None:
     values = waves()
     task = task_of(values.shape, table_of([0.1, 0.3]), size=(20, 20), depth=True)
@@ -481,29 +409,6 @@ def test_counters_show_that_nothing_is_done_unasked(way: str) -> None:
     assert counters["gradients"] == counters["secondary_rays"] == counters["evaluations"] == 0
     shaded = march(frame_of(values), replace(task, shaded=True)).counters
     assert shaded["samples"] == counters["samples"] >= shaded["gradients"] > 0
-
-
-def test_a_light_grid_darkens(way: str) -> None:
-    values = waves()
-    grid, frame = grid_of(values.shape), frame_of(values)
-    table = table_of([0.1, 0.5])
-    light = light_grid(
-        frame,
-        grid,
-        table,
-        shadows=Shadows(),
-        lamp=np.array([0, 0, 1.0]),
-        ambient_occlusion=AmbientOcclusion(),
-    )
-    for shading in (False, True):
-        task = task_of(values.shape, table, size=(20, 20), shaded=shading)
-        plain, lit = march(frame, task).rgba, march(frame, replace(task, light=light)).rgba
-        np.testing.assert_allclose(lit[..., 3], plain[..., 3], atol=1e-6)
-        assert np.all(lit[..., :3] <= plain[..., :3] + 1e-6)
-        assert lit[..., 0].sum() < 0.9 * plain[..., 0].sum()
-        np.testing.assert_allclose(
-            streamed(frame_of(values), replace(task, light=light)).rgba, lit, atol=2e-4
-        )
 
 
 def test_threads_make_the_same_picture() -> None:

@@ -115,12 +115,6 @@ def test_the_mean_counts_the_last_step_by_its_length_and_leaves_out_what_is_miss
         assert not empty.rgba.any()
 
 
-def test_an_attenuated_maximum_shows_nothing_where_no_value_is_above_the_colours(way: str) -> None:
-    values = np.full((9, 9, 9), -0.5)
-    task = task_of(values.shape, projection="attenuated", attenuation=0.1)
-    assert not marched(values, task).rgba.any()
-
-
 def test_an_attenuated_maximum_ends_where_no_later_value_can_be_larger(way: str) -> None:
     values = rough((60, 9, 9))
     task = task_of(values.shape, projection="attenuated")
@@ -204,21 +198,6 @@ def test_a_clip_box_has_the_picture_of_its_region(way: str, shaded: bool) -> Non
     assert part.counters["samples"] < 0.5 * everything.counters["samples"]
 
 
-def test_isosurfaces_are_cut(way: str) -> None:
-    ramp = np.broadcast_to(np.linspace(0, 1, 13)[:, None, None], (13, 9, 9))
-    surface = Surface(value=0.5, colour=WHITE, opacity=1.0)
-    task = replace(task_of(ramp.shape, surfaces=(surface,)), table=None)
-    whole = np.array([[0.0, 8], [0, 8], [0, 12]])
-    for planes, seen in (
-        ([[0, 0, -1.0, -5.9]], False),
-        ([[0, 0, -1.0, -6.1]], True),
-        ([[0, 0, 1.0, 6.1]], False),
-    ):
-        body = Body(bounds=whole, planes=np.array(planes))
-        rgba = marched(ramp, replace(task, body=body)).rgba
-        np.testing.assert_array_equal(rgba[..., 3] > 0, np.full((8, 8), seen))
-
-
 @pytest.mark.parametrize("shaded", [False, True])
 @pytest.mark.parametrize("step", [0.4, 7.0])
 def test_a_ramp_is_as_opaque_as_the_factor_of_its_gradient_says(
@@ -268,15 +247,6 @@ def test_a_bounded_file_is_as_bright_as_its_source_and_without_grain(
     assert drawn.mean() == pytest.approx(exact.mean(), rel=0.04)
     inner = exact > 0.5 * exact.max()
     assert np.abs(drawn - exact)[inner].mean() < 0.5 * np.abs(grained - exact)[inner].mean()
-
-
-def test_the_opacity_by_gradient_of_a_bounded_file_is_that_of_its_values() -> None:
-    _, coded = bounded(noise=0.1)
-    grading = Grading(factors=np.linspace(0.0, 1.0, 1025), top=0.1)
-    task = task_of(coded.shape, camera=Camera(), size=(24, 24), fog=0.1, grading=grading)
-    opacity = marched(coded, replace(task, shaded=True)).rgba[..., 3]
-    noisy = marched(coded, replace(task, shaded=True, noise=0.1)).rgba[..., 3]
-    np.testing.assert_allclose(noisy, opacity, atol=1e-5)
 
 
 @pytest.mark.parametrize("central", [False, True])

@@ -22,7 +22,6 @@ from fhash_codec.rendering.march import (
     TILE,
     March,
     MarchInput,
-    empty_table,
     march_native,
     numbers,
 )
@@ -110,18 +109,6 @@ def test_values_are_scaled_to_what_float32_can_compute_with(low: float, high: fl
     scaled = (given.values - given.low) / (given.high - given.low)
     np.testing.assert_allclose(scaled, shares, atol=1e-5)
     assert given.levels[0] == pytest.approx((given.low + given.high) / 2)
-
-
-def test_ordinary_values_are_not_copied() -> None:
-    values = np.linspace(0, 1, 27, dtype=np.float32).reshape(3, 3, 3)
-    assert input_of(values, 0.0, 1.0, 0.5, first=(0, 0, 0)).values is not None
-    assert np.shares_memory(input_of(values, 0.0, 1.0, 0.5, first=(0, 0, 0)).values, values)
-
-
-def test_an_empty_table_shows_nothing() -> None:
-    table = empty_table(1.0, 2.0)
-    assert not table.extinctions.any()
-    assert (table.low, table.high) == (1.0, 2.0)
 
 
 CENTRAL = Lighting(
@@ -278,24 +265,6 @@ def test_a_volume_is_lit_by_central_differences(path, missing) -> None:
     assert found.counters == cell.counters
 
 
-def test_a_sphere_is_lit_by_central_differences(path) -> None:
-    axis = np.linspace(-1, 1, 21)
-    values = np.sqrt(sum(part**2 for part in np.meshgrid(axis, axis, axis))).astype(np.float32)
-    surface = Surface(value=0.5, colour=np.array([1.0, 0.5, 0.25]), opacity=1.0)
-    task = task_of(values.shape, None, surfaces=(surface,), depth=True, normal=True, size=(33, 33))
-    found, cell = marched(values, task, path), marched(values, replace(task, lighting=CELL), path)
-    np.testing.assert_array_equal(found.normal, cell.normal)
-    np.testing.assert_array_equal(found.depth, cell.depth)
-    origin, along = task.rays.pixels()
-    along = np.broadcast_to(along / np.linalg.norm(along, axis=-1, keepdims=True), (33, 33, 3))
-    hit = np.isfinite(found.depth)
-    assert hit.sum() > 50
-    places = (origin + found.depth[..., None] * along)[hit]
-    exact = lit(surface.colour, slopes(values, places), along[hit], CENTRAL)
-    np.testing.assert_allclose(found.rgba[hit][:, :3], exact, atol=1e-3)
-    assert np.abs(found.rgba - cell.rgba).max() > 0.02
-
-
 CASES = {
     "fog": {},
     "shaded": {"shaded": True, "lighting": CELL, "depth": True, "normal": True},
@@ -341,33 +310,11 @@ def test_all_paths_make_one_picture_in_a_grid_of_light(path) -> None:
     for shaded in (False, True):
         task = task_of(values.shape, np.linspace(0, 0.4, 100), shaded=shaded)
         frame = Frame(values=values, first=(0, 0, 0))
-        light = light_grid(
-            frame, task.rays.grid, task.table, shadows=Shadows(), lamp=np.array([0, 0, 1.0])
-        )
+        light = light_grid(frame, task, shadows=Shadows(), lamp=np.array([0, 0, 1.0]))
         task = replace(task, light=light)
         np.testing.assert_allclose(
             marched(values, task, path).rgba, marched(values, task).rgba, atol=2e-5
         )
-
-
-@pytest.mark.parametrize("step", [0.3, 0.5, 1.9])
-def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step) -> None:
-    values = waves((40, 41, 43))
-    task = task_of(values.shape, [0.0] * 50 + [0.5] * 2 + [0.0] * 50, size=(50, 40), step=step)
-    found, everything = (
-        marched(values, task, path),
-        marched(values, replace(task, skipping=False), path),
-    )
-    np.testing.assert_allclose(found.rgba, everything.rgba, atol=1e-6)
-    corners = np.lib.stride_tricks.sliding_window_view(values, (2, 2, 2)).reshape(39, 40, 42, 8)
-    low, high = (end / 101 for end in (49, 52))
-    seen = (corners.max(-1) > low) & (corners.min(-1) < high)
-    inside = 0
-    for _, places, _, _ in places_of(task, values.shape):
-        x, y, z = np.clip(places.T.astype(np.int64), 0, np.array([[41], [39], [38]]))
-        inside += seen[z, y, x].sum()
-    assert 0 < inside < 0.3 * everything.counters["samples"]
-    assert found.counters["samples"] <= 1.1 * inside
 
 
 @pytest.mark.parametrize("step", [0.3, 0.5, 0.9, 2.5, 3.9, 7.0])

@@ -14,7 +14,7 @@ from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.layout import Bar, Label, Layout, lay_out, strips
 from fhash_codec.rendering.overlay import DARK, LIGHT, Pen, overlay, surrounded, time_text
 from fhash_codec.rendering.scenes import Camera, Effects, LegendEntry, Scene
-from fhash_codec.rendering.view import Edge, edges
+from fhash_codec.rendering.view import edges
 from fhash_formats.series import Coordinate
 
 
@@ -42,34 +42,6 @@ def test_a_label_is_written_where_it_says() -> None:
         assert top - 1 <= rows.min() < rows.max() <= bottom + 1
         assert bool(np.ptp(rows) > np.ptp(columns)) is upright
         assert 0 < letters.sum() < halo.sum()
-
-
-def test_a_text_begins_at_its_place() -> None:
-    pen = Pen(96, 96, "white")
-    pen.text((20.0, 48.0), "x = 3", 12)
-    rows, columns = np.nonzero(pen.written()[1][1])
-    assert 20 <= columns.min() <= 24
-    assert rows.mean() == pytest.approx(48, abs=2)
-
-
-def test_lines_stay_in_their_view() -> None:
-    pen = Pen(40, 30, "white")
-    assert not pen.lines([], (0, 0, 40, 30)).any()
-    edge = Edge(axis=0, ends=np.array([[-50.0, 5.0], [90.0, 5.0]]), fronts=1, uncut=True)
-    drawn = pen.lines([edge], (10, 8, 20, 15))
-    assert drawn.shape == (30, 40)
-    rows, columns = np.nonzero(drawn)
-    assert (columns.min(), columns.max()) == (10, 29)
-    assert set(rows) <= {12, 13, 14}
-
-
-@pytest.mark.parametrize("text", ["step 3   t = 1 s", "step 3   t = 1234567 seconds since 2001"])
-def test_a_time_label_stays_in_its_strip(text: str) -> None:
-    pen = Pen(130, 130, "white")
-    pen.time_label((0.0, 0.0, 130.0, 20.0), text)
-    rows, columns = np.nonzero(pen.written()[0][1])
-    assert columns.max() < 129
-    assert rows.max() <= 20
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 9])
@@ -184,17 +156,6 @@ def test_from_inside_the_volume_the_overlay_is_finite() -> None:
         everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
     )
     assert np.all(np.isfinite(inside.rgba))
-
-
-def test_the_colour_bar_shows_the_colours_from_bottom_to_top() -> None:
-    pixels = drawn(Effects(colour_bar=True)).to_uint8().astype(int)
-    low, high = (np.rint(np.array(named_map("plasma")(end)) * 255) for end in (0.0, 1.0))
-    rows_low = np.flatnonzero((np.abs(pixels - low).max(axis=-1) < 6).any(axis=1))
-    rows_high = np.flatnonzero((np.abs(pixels - high).max(axis=-1) < 6).any(axis=1))
-    assert len(rows_low)
-    assert len(rows_high)
-    assert rows_low.mean() > 180
-    assert rows_high.mean() < 80
 
 
 def test_panels_get_their_bar_and_legend_outside() -> None:

@@ -82,8 +82,7 @@ def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
         if plan.lights:
             light = light_grid(
                 frame,
-                grid,
-                task.table,
+                task,
                 shadows=plan.shadows,
                 lamp=plan.lamp,
                 ambient_occlusion=plan.occlusion,

@@ -18,7 +18,7 @@ from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Marched, Surface, Task
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import Field
-from fhash_codec.rendering.stream_march import Projection, crossings, stream
+from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.stream_rays import Beams
 from fhash_formats.errors import InputError
 
@@ -97,17 +97,6 @@ def test_counters_prove_that_nothing_else_is_done(frame_picture: FramePicture, m
     assert depth == plain
 
 
-def test_bricks_that_cannot_be_seen_cost_nothing(frame_picture: FramePicture) -> None:
-    narrow: dict[str, Any] = {"transfer_function": {"opacity": [[6, 0], [7, 0.5], [8, 0]]}}
-    skipping, marching = (
-        frame_picture("arm", {**narrow, "march": {"skipping": on}}) for on in (True, False)
-    )
-    np.testing.assert_array_equal(skipping.rgba, marching.rgba)
-    assert skipping.counters["skipped_bricks"] > 0
-    assert marching.counters["skipped_bricks"] == 0
-    assert skipping.counters["samples"] < marching.counters["samples"] / 3
-
-
 def test_only_samples_in_visible_cells_are_evaluated(
     frame_picture: FramePicture, planned: Planned, volume: Volume
 ) -> None:
@@ -130,16 +119,6 @@ def test_only_samples_in_visible_cells_are_evaluated(
     x, y, z = np.minimum(beams.places(row, column).astype(int), np.array(visible.shape[::-1]) - 1).T
     inside = int(visible[z, y, x].sum())
     assert inside <= found.counters["evaluations"] <= 1.1 * inside
-
-
-def test_rays_end_where_no_light_is_left(frame_picture: FramePicture) -> None:
-    opaque: dict[str, Any] = {"transfer_function": {"opacity": "opaque"}}
-    ending, going = (
-        frame_picture("stream", {**opaque, "march": {"threshold": threshold}})
-        for threshold in (1 / 1024, 0.0)
-    )
-    assert ending.counters["samples"] < going.counters["samples"] / 4
-    np.testing.assert_allclose(ending.rgba, going.rgba, atol=1 / 1024)
 
 
 NETWORK: dict[str, Any] = {
@@ -181,16 +160,6 @@ def test_the_picture_of_a_network_is_near_that_of_its_vertices(
     assert np.mean(np.abs(streamed - cache)) < 0.02
 
 
-@pytest.mark.parametrize("fog", [1e-9, 1e-3, 0.3])
-@pytest.mark.parametrize("step", [0.02, 0.37, 5.0])
-def test_a_slab_of_fog_is_as_opaque_as_its_length(
-    frame_task: FrameTask, fog: float, step: float
-) -> None:
-    field, task = frame_task(np.full((9, 7, 7), 0.5), step=step, fog=fog)
-    rgba = stream(field, task, adaptive=True).rgba
-    np.testing.assert_allclose(rgba, -np.expm1(-fog * 8), rtol=1e-6)
-
-
 @pytest.mark.parametrize("budget", [1, 10**6])
 @pytest.mark.parametrize("value", [0.381, 0.395, 0.405, 0.81, 0.795, 0.99])
 @pytest.mark.parametrize(("count", "step"), [(11, 0.5), (10, 3.9)])
@@ -204,90 +173,6 @@ def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
     for skipping in (True, False):
         found = stream(field, replace(task, skipping=skipping), adaptive=True, budget=budget)
         np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
-
-
-@pytest.mark.parametrize("budget", [1, 10**6])
-@pytest.mark.parametrize("level", [0.0625, 0.3, 0.6, 0.9375])
-def test_every_crossing_of_a_wave_is_seen(frame_task: FrameTask, level: float, budget: int) -> None:
-    wave = np.abs((np.arange(97) + 12) % 24 - 12.0) / 12
-    field, task = frame_task(
-        np.broadcast_to(wave[:, None, None], (97, 7, 7)),
-        step=0.9,
-        surfaces=(Surface(value=level, colour=np.ones(3), opacity=0.1),),
-    )
-    np.testing.assert_allclose(
-        stream(field, task, adaptive=True, budget=budget).rgba, 1 - 0.9**8, atol=1e-6
-    )
-
-
-def test_nothing_is_seen_of_what_has_no_value(frame_task: FrameTask) -> None:
-    field, task = frame_task(np.full((9, 7, 7), np.nan), fog=1.0)
-    found = stream(field, task, adaptive=False)
-    assert not found.rgba.any()
-    assert found.counters["samples"] == 0
-
-
-VALUES = np.array([[0.2, 0.9, np.nan, 0.4], [np.nan, 0.1, 0.6, 0.6], [np.nan] * 4])
-LENGTHS = np.array([[1.0, 1.0, 1.0, 0.5]] * 3)
-OPACITIES = np.where(np.isnan(VALUES), 0.0, 0.5 * np.nan_to_num(VALUES))
-
-
-@pytest.mark.parametrize("pace", [1, 3, 4])
-@pytest.mark.parametrize(
-    ("kind", "values", "at"),
-    [
-        ("maximum", [0.9, 0.6], [1, 2]),
-        ("minimum", [0.2, 0.1], [0, 1]),
-        ("average", [1.3 / 2.5, 1.0 / 2.5], [0, 1]),
-        ("attenuated", [0.9 * 0.9, 0.6 * 0.95], [1, 2]),
-    ],
-)
-def test_values_and_places(kind: str, values: list[float], at: list[int], pace: int) -> None:
-    projection = Projection(kind, (0.0, 1.0), 3, NUMPY)
-    alive = np.arange(3)
-    for first in range(0, 4, pace):
-        part = slice(first, min(first + pace, 4))
-        sample = np.broadcast_to(np.arange(4)[part], VALUES[:, part].shape)
-        projection.add(alive, sample, VALUES[:, part], LENGTHS[:, part], OPACITIES[:, part])
-    np.testing.assert_allclose(projection.values[:2], values, rtol=1e-14)
-    assert not np.isfinite(projection.values[2])
-    np.testing.assert_array_equal(projection.at[:2], at)
-
-
-def test_only_an_attenuated_maximum_can_be_finished_early() -> None:
-    for kind in ("maximum", "minimum", "average", "attenuated"):
-        projection = Projection(kind, (0.0, 1.0), 1, NUMPY)
-        projection.add(
-            np.array([0]), np.array([[0]]), np.array([[0.7]]), np.ones((1, 1)), np.full((1, 1), 0.5)
-        )
-        assert projection.finished(np.array([0]))[0] == (kind == "attenuated")
-
-
-def test_roots_are_exact() -> None:
-    sample = np.arange(6.0)[None]
-    found = crossings(
-        lambda row, at, counted: (at - 2.3) ** 3,
-        sample,
-        (sample - 2.3) ** 3,
-        (
-            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
-            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
-        ),
-    )
-    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
-    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
-    assert found.which[0, 1:3, 0].tolist() == [1, 0]
-
-
-def test_nothing_is_crossed_where_a_value_is_missing() -> None:
-    """Neither between samples of which one has no value, nor where the search meets none."""
-    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
-    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
-    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
-    assert not missing.opacity.any()
-    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
-    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
-    assert there.at[0, 2, 0] == 2.5
 
 
 Planned_stream_torch = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
