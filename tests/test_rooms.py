@@ -84,7 +84,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("options", "output"),
         ("selection",),
-        ("peer_options", "scene_options", "variables"),
+        ("peer_options", "variables"),
         ("commands",),
         ("main",),
     ),

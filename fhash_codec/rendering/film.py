@@ -330,7 +330,7 @@ class _Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """Where the pictures of an animation go, and how they are made.
+    """Files that an animation is written to, and how they are made.
 
     Attributes:
         output: NAME.png for pictures NAME.0000.png and so on, NAME.mp4 or NAME.gif for a film.
