@@ -16,12 +16,11 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
-from fhash_codec.rendering.image import Draw, Image
+from fhash_codec.rendering.image import Draw, Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Marched, Task, Units, complete, warped
-from fhash_codec.rendering.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.plan import Plan, arrays_on, plan_at, plan_picture
 from fhash_codec.rendering.scenes import MAX_SIDE, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_field import frame_of, table_of, task_of
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering import light as light_module
 from fhash_codec.rendering.bricks import Bricks
-from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.light import (
     DEVIATIONS,
@@ -25,9 +25,9 @@ from fhash_codec.rendering.light import (
     slope_scale,
     smoothing,
 )
-from fhash_codec.rendering.march_task import GRADES, Frame, Grading, Table, Task
+from fhash_codec.rendering.march_task import GRADES, Grading
 from fhash_codec.rendering.plan import plan_picture
-from fhash_codec.rendering.scenes import AmbientOcclusion, Camera, Shadows
+from fhash_codec.rendering.scenes import AmbientOcclusion, Shadows
 from fhash_formats.errors import InputError
 
 
@@ -114,25 +114,6 @@ def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(volume: Volu
 
 
 UP = np.array([0.0, 0.0, 1.0])
-
-
-def frame_of(values, stride=1):
-    return Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0), stride=stride)
-
-
-def task_of(shape, table, spacing=(1.0, 1.0, 1.0), **more):
-    grid = Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.array(spacing))
-    rays = Rays.of(Camera(), grid, (2, 2))
-    return Task(rays=rays, step=1.0, threshold=0.0, table=table, **more)
-
-
-def table_of(extinctions):
-    return Table(
-        low=0.0,
-        high=1.0,
-        colours=np.ones((len(extinctions), 3), dtype=np.float32),
-        extinctions=np.array(extinctions),
-    )
 
 
 @pytest.mark.parametrize("resolution", [1.0, 2.0])

@@ -1,4 +1,4 @@
-"""Streamed marches, with numpy and torch."""
+"""Streamed rays and marches, with numpy and torch."""
 
 from __future__ import annotations
 
@@ -13,17 +13,101 @@ from frame_field import FrameField
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering.bricks import Palette
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Marched, Surface, Task
 from fhash_codec.rendering.plan import arrays_on
-from fhash_codec.rendering.stream_fields import Field
-from fhash_codec.rendering.stream_march import stream
-from fhash_codec.rendering.stream_rays import Beams
+from fhash_codec.rendering.stream_fields import Beams, Field, Leaping, shares
+from fhash_codec.rendering.stream_march import Canvas, Events, stream
 from fhash_formats.errors import InputError
 
 FrameTask = Callable[..., tuple[FrameField, Task]]
-Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Any, Task]]
+
+
+def test_shares_are_spread_evenly_and_belong_to_the_number() -> None:
+    found = shares(np.arange(10_000), NUMPY)
+    assert 0 < found.min() < found.max() < 1
+    counts = np.histogram(found, bins=10, range=(0, 1))[0]
+    assert np.abs(counts - 1000).max() < 150
+    np.testing.assert_array_equal(shares(np.array([7, 3]), NUMPY), found[[7, 3]])
+
+
+def test_rows_of_a_picture_are_those_of_the_whole(frame_task: FrameTask) -> None:
+    field, task = frame_task(np.zeros((9, 7, 7)), fog=1.0)
+    task = replace(task, jitter=True, antialiasing=2)
+    whole = Beams.of(task, field.bounds, range(8))
+    part = Beams.of(task, field.bounds, range(3, 5))
+    chosen = slice(3 * 32, 5 * 32)
+    np.testing.assert_array_equal(part.origin, whole.origin[chosen])
+    np.testing.assert_array_equal(part.depth, whole.depth[chosen])
+
+
+def test_a_leap_ends_at_the_first_sample_in_a_brick_that_matters(frame_task: FrameTask) -> None:
+    values = np.zeros((60, 9, 9))
+    values[37:41] = 1.0
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    field, task = frame_task(values, step=0.4, surfaces=(surface,))
+    beams = Beams.of(task, field.bounds, range(8))
+    leaping = Leaping.of(field.bricks, task, field.first, NUMPY)
+    rays, every_ray = np.arange(64), np.ones(64, dtype=bool)
+    reached, leaps = leaping.leap(beams.origin, beams.pace, beams.begin, beams.end, every_ray)
+    every = np.arange(beams.end.max())[None]
+    matters = leaping.matters(beams.places(rays, np.broadcast_to(every, (64, every.size))))
+    assert 0 < leaps < 20 * 64
+    np.testing.assert_array_equal(reached, matters.argmax(axis=1))
+    # From a sample in a brick that matters there is no leap.
+    again, none = leaping.leap(beams.origin, beams.pace, reached, beams.end, every_ray)
+    np.testing.assert_array_equal(again, reached)
+    assert none == 0
+
+
+Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
+
+
+@pytest.mark.parametrize("cuts", [(), (1,), (1, 2), (2,)])
+def test_events_are_joined_front_to_back_however_they_are_split(
+    frame_task: FrameTask, cuts: tuple[int, ...]
+) -> None:
+    field, task = frame_task(np.full((9, 7, 7), 0.5), fog=0.1)
+    task = replace(task, depth=True)
+    beams = Beams.of(task, field.bounds, range(8))
+    assert task.table is not None
+    canvas = Canvas(field, task, beams, Palette.of(task.table))
+    rays = np.array([3, 9])
+    opacity = np.array([[0.25, 0.5, 0.5], [0.0, 0.125, 0.0]])
+    at = np.broadcast_to(np.arange(3.0), (2, 3))
+    for part in np.split(np.arange(3), cuts):
+        canvas.add(
+            rays,
+            Events(
+                opacity=opacity[:, part],
+                at=at[:, part],
+                which=np.zeros((2, len(part)), dtype=np.int64),
+                values=np.full((2, len(part)), 0.5),
+            ),
+        )
+    np.testing.assert_array_equal(canvas.clear[rays], [0.1875, 0.875])
+    np.testing.assert_allclose(canvas.colour[rays], np.array([[0.8125], [0.125]]) * np.ones(3))
+    # Less than half of the light is left after the second event of the first ray alone.
+    assert canvas.depth[3] == beams.depth[3] + task.step
+    assert np.isinf(canvas.depth[9])
+
+
+def test_central_shading_differs_from_that_of_cells_and_keeps_the_normals(
+    volume: Volume, planned: Planned, central_scene: dict[str, Any]
+) -> None:
+    effects = {**central_scene["effects"], "shading": {"light": [1, 2, 3]}}
+    cells, central = (
+        stream(*planned(volume, scene, NUMPY), adaptive=True)
+        for scene in ({**central_scene, "effects": effects}, central_scene)
+    )
+    assert 1e-3 < np.abs(cells.rgba - central.rgba)[..., :3].max() < 0.3
+    np.testing.assert_array_equal(cells.rgba[..., 3], central.rgba[..., 3])
+    np.testing.assert_array_equal(cells.normal, central.normal)
+    assert cells.counters == central.counters
+
+
 FramePicture = Callable[[str, dict[str, Any]], Marched]
 
 
@@ -175,9 +259,6 @@ def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
         np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
 
 
-Planned_stream_torch = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
-
-
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:
     """Equal counters, but for the turns of the search for surfaces, which rounding decides."""
     searched = here.counters["evaluations"] - there.counters["evaluations"]
@@ -193,7 +274,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
 
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
-    planned: Planned_stream_torch,
+    planned: Planned,
     volume: Volume,
     tensors: Arrays,
     scene: dict[str, Any],
@@ -213,7 +294,7 @@ def test_torch_makes_the_picture_of_numpy(
 
 
 def test_nothing_leaves_the_device_before_the_picture(
-    planned: Planned_stream_torch, volume: Volume, tensors: Arrays
+    planned: Planned, volume: Volume, tensors: Arrays
 ) -> None:
     import torch
     from torch.overrides import TorchFunctionMode
@@ -253,7 +334,7 @@ def test_nothing_leaves_the_device_before_the_picture(
 
 
 def test_torch_marches_through_a_network_as_numpy_does(
-    planned: Planned_stream_torch,
+    planned: Planned,
     files: dict[str, Path],
     tensors: Arrays,
     network_scene: dict[str, Any],
@@ -275,7 +356,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])
 def test_cuda_makes_the_picture_of_numpy(
-    files: dict[str, Path], planned: Planned_stream_torch, central_scene: dict[str, Any], kind: str
+    files: dict[str, Path], planned: Planned, central_scene: dict[str, Any], kind: str
 ) -> None:
     import torch
 
@@ -293,7 +374,7 @@ def test_cuda_makes_the_picture_of_numpy(
 
 
 def test_a_device_without_enough_memory_says_so(
-    planned: Planned_stream_torch, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
+    planned: Planned, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 
