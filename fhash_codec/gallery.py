@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -341,3 +342,26 @@ def _bar(
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
+
+
+def page(folder: str) -> str:
+    """The page of the gallery in Markdown; folder: of the pictures, beside the page."""
+    lines = [
+        "# Gallery",
+        "",
+        f"`fhash demo --gallery {folder}` simulates these series, encodes and draws them: the",
+        f"pictures into `{folder}`, the series and their files into `{folder}/series`, where the",
+        "commands below give the same again.",
+    ]
+    for picture in PICTURES:
+        lines += ["", f"## {picture.title}", "", f"![{picture.title}]({folder}/{picture.name}.png)"]
+        lines += ["", "```", *commands(picture), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def commands(picture: Picture) -> list[str]:
+    """The two commands of a picture, as they are typed in the folder of the series."""
+    name = picture.series
+    encode = ["fhash", "encode", f"{name}.h5", "-o", f"{name}.fhz", *GALLERY_SERIES[name].options]
+    render = ["fhash", "render", f"{name}.fhz", "-o", f"{picture.name}.png", *picture.options]
+    return [shlex.join(encode), shlex.join(render)]

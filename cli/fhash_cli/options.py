@@ -183,17 +183,21 @@ class DurationType(click.ParamType[float]):
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "Input": ("var", "axes", "t", "shape", "dtype", "endian", "missing", "select"),
+    "Input": (
+        "var", "axes", "t", "shape", "dtype", "endian", "missing", "select", "raw-values",
+        "keep-extremes", "no-external", "components",
+    ),
     "Quality, one of": (
         "psnr", "psnr-bulk", "max-error", "max-error-rel", "ratio", "min-psnr", "target", "bound",
     ),
     "Feature": ("feature", "dilation"),
     "Steps and region": ("time", "roi", "box", "lod"),
     "Values": ("outside", "fill"),
-    "Profile compact": ("profile", "effort", "tile"),
+    "Profile compact": ("profile", "effort", "tile", "access", "without"),
     "Profile paper": (
-        "key-frames", "fold", "embedding-size", "hidden-layers", "width", "epochs",
-        "learning-rate", "schedule", "batch", "tables", "engine", "engines",
+        "key-frames", "fringe", "fold", "embedding-size", "hidden-layers", "width", "epochs",
+        "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",
+        "engines",
     ),
     "Scene": (
         "scene", "steps", "paper-shape", "gallery", "set", "effect", "size", "background",
@@ -203,22 +207,20 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "view", "azimuth", "elevation", "zoom", "projection", "position", "focal-point", "view-up",
     ),
     "Colour and opacity": (
-        "cmap", "opacity", "range", "density", "isosurface", "volume", "no-volume", "track",
+        "cmap", "opacity", "gradient-opacity", "range", "density", "isosurface", "no-volume",
+        "track",
     ),
-    "Clipping": ("clip", "clip-box", "clip-plane"),
-    "Animation": (
-        "animate", "frames", "fps", "pictures", "evolution", "columns", "part-of", "split",
-    ),
-    "Accuracy and speed": (
-        "march", "device", "step", "threshold", "samples-per-pass", "skipping",
-    ),
+    "Clipping": ("clip-box", "clip-plane"),
+    "Animation": ("animate", "frames", "fps", "pictures", "evolution", "columns"),
+    "Accuracy and speed": ("march", "device", "step"),
+    "Parts and further steps": ("plan", "keep"),
     "Comparison": ("peer", "part", "seconds", "turns", "speed"),
     "Address": ("host", "port"),
     "Cases": ("all", "case", "group"),
     "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
     "Run": (
-        "seed", "timings", "deterministic", "processes", "explain", "json", "q", "quiet", "v",
-        "verbose", "help",
+        "budget", "time-budget", "seed", "timings", "deterministic", "processes", "explain",
+        "json", "q", "quiet", "v", "verbose", "help",
     ),
 }  # fmt: skip
 """Names of options by group, in the order of the help; options that none names come last."""
@@ -228,12 +230,12 @@ ELSEWHERE = {
     ("decode", "isosurface"): "Output",
     ("render", "t"): "Steps and region",
     ("encode", "device"): "Run",
+    ("encode", "part"): "Parts and further steps",
     ("train", "device"): "Run",
     ("rate", "device"): "Run",
     ("demo", "shape"): "Scene",
     ("diff", "max-error"): "Quality, gates",
     ("diff", "min-psnr"): "Quality, gates",
-    ("diff", "min-psnr-bulk"): "Quality, gates",
     ("rate", "target"): "Comparison",
     ("rate", "bound"): "Comparison",
     ("rate", "profile"): "Comparison",
@@ -328,6 +330,30 @@ variables_option = click.option(
     help="Which variables of a file of several. Default: all.",
 )
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
+
+
+def option_group(
+    record: type, name: str, *options: Callable[[Command], Command]
+) -> Callable[[Command], Command]:
+    """A decorator that adds options, and gives the command one record in place of their values.
+
+    record: a dataclass whose fields are the options' parameters; those that are not among `options`
+        stand above the decorator. name: of the command's argument.
+    """
+    names = [field.name for field in dataclasses.fields(record)]
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def collected(**values: Any) -> None:
+            given = record(**{field: values.pop(field) for field in names})
+            command(**{name: given}, **values)
+
+        decorated: Command = collected
+        for option in reversed(options):
+            decorated = option(decorated)
+        return decorated
+
+    return decorate
 
 
 def check_writable(
@@ -496,67 +522,63 @@ class SourceOptions:
         }
 
 
-def series_options(command: Command) -> Command:
-    """Add the options of SourceOptions; the command gets them as `source`."""
-
-    @click.option(
+series_options = option_group(
+    SourceOptions,
+    "source",
+    click.option(
         "--var",
         metavar="NAME",
         help="Which variable or dataset of the file; 'state.rho' is a field of a compound type.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--select",
         type=SelectType(),
         multiple=True,
         help="Index along a dimension that is not t, z, y or x, such as member=2; dim3=0 where it"
         " has no name. Repeat for several dimensions.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--missing",
         type=NumberType(),
         multiple=True,
         help="A value that stands for a missing one, such as -9999 or 1e20; repeat for several.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--raw-values",
         is_flag=True,
         help="Read packed numbers as stored: no fill value, scale or offset, and no unit.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--keep-extremes",
         is_flag=True,
         help="An extreme value that repeats, far away from all others, is data.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--no-external",
         is_flag=True,
         help="Read no file outside the folder of DATA, whatever a header or a link in it names.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--axes",
         metavar="t,z,y,x",
         help="What the file's dimensions are, in its own order; letters left out have length 1.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2."
-    )
-    @click.option(
+    ),
+    click.option(
         "--shape",
         metavar="x=64,y=64,z=32,t=10",
         help="Lengths of a raw file, the fastest axis first.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8."
-    )
-    @click.option(
+    ),
+    click.option(
         "--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file."
-    )
-    @functools.wraps(command)
-    def collected(**values: Any) -> None:
-        names = [field.name for field in dataclasses.fields(SourceOptions)]
-        command(source=SourceOptions(**{name: values.pop(name) for name in names}), **values)
-
-    return collected
+    ),
+)
+"""Options of commands that read data; the command gets them as `source`."""
 
 
 def config_options(*names: str, profile: str | None = None) -> Callable[[Command], Command]:

@@ -328,17 +328,32 @@ class _Frame:
     kept: bool
 
 
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """Files that an animation is written to, and how they are made.
+
+    Attributes:
+        output: NAME.png for pictures NAME.0000.png and so on, NAME.mp4 or NAME.gif for a film.
+        pictures: NAME.png; the numbered pictures of a film are written too, and kept.
+        force: whether to replace files.
+        processes: how many render at a time, each with its share of the threads and frames of its
+            own in memory. The files are the same as with one.
+    """
+
+    output: str | Path
+    pictures: str | Path | None = None
+    force: bool = False
+    processes: int = 1
+
+
 def animate(
     volume: Volume,
     scene: Scene,
     animation: Animation,
-    output: str | Path,
+    target: Target,
     *,
-    pictures: str | Path | None = None,
-    force: bool = False,
     progress: Progress = silent,
     draw: Draw | None = None,
-    processes: int = 1,
 ) -> Animated:
     """Render every picture of an animation to numbered files or to a film.
 
@@ -349,29 +364,25 @@ def animate(
         volume: an open container.
         scene: what is shown where the animation changes nothing.
         animation: what changes.
-        output: NAME.png for pictures NAME.0000.png and so on, NAME.mp4 or NAME.gif for a film.
-        pictures: NAME.png; the numbered pictures of a film are written too, and kept.
-        force: whether to replace files.
+        target: the files to write.
         progress: is told about each finished picture.
         draw: renders one picture; `Renderer(volume).render` if None.
-        processes: how many render at a time, each with its share of the threads and frames of its
-            own in memory. The files are the same as with one.
 
     Raises InputError for file names of other kinds, for what `Animation.scenes` refuses and for
     `draw` with several processes, FhashError where one of these ends by itself,
     OutputExistsError before anything is rendered, OutputError for what cannot be written,
     MissingDependencyError without the package for MP4.
     """
-    output = Path(output)
+    output, force, processes = Path(target.output), target.force, target.processes
     if processes < 1 or (draw is not None and processes > 1):
         raise InputError(
             f"processes is {processes}; at least 1 is needed, and 1 where 'draw' is given"
         )
-    _check_names(output, pictures)
+    _check_names(output, target.pictures)
     is_film = output.suffix.lower() != ".png"
     begun = time.perf_counter()
     scenes = animation.scenes(scene, volume)
-    base = pictures if is_film else output
+    base = target.pictures if is_film else output
     paths = [] if base is None else numbered(Path(base), len(scenes))
     clear_leftovers(paths)  # also those beside kept pictures, which are not written anew
     frames = _frames(scenes, paths, volume)

@@ -1,4 +1,4 @@
-"""A finished picture: pixels, buffers, what they cost, and the scene that they show.
+"""A picture: pixels and buffers with the scene that they show, and what is drawn around the volume.
 
 A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the volume's file in
 `fhash.source` and its digest in `fhash.digest`. A JPEG holds the pixels alone.
@@ -6,20 +6,44 @@ A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the vo
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.colours import parse_colour
-from fhash_codec.rendering.scenes import DIGEST_KEY, SCENE_KEY, SOURCE_KEY, Scene
+from fhash_codec import times
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.colours import ColourMap, parse_colour
+from fhash_codec.rendering.layout import (
+    TITLE_GAP,
+    Bar,
+    Label,
+    Layout,
+    Legend,
+    Rectangle,
+    fitted,
+    font,
+    font_size,
+    length,
+    line_height,
+    strips,
+    wrapped,
+)
+from fhash_codec.rendering.scenes import DIGEST_KEY, SCENE_KEY, SOURCE_KEY, Effects, Scene
+from fhash_codec.rendering.view import Body, Edge, edges, outer_edges
 from fhash_formats.errors import InputError
+from fhash_formats.series import Coordinate
 from fhash_formats.support.files import check_output, replacing_all
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as PicturesImage
 
 PICTURES = (".png", ".jpg", ".jpeg")
 """Suffixes of pictures, in lower case."""
@@ -159,3 +183,289 @@ class Image:
         height, width = self.rgba.shape[:2]
         source = Path(self.source).name or "a volume"
         return f"<fhash Image {width}x{height} of {source} in {self.seconds:.3g} s>"
+
+
+Floats = npt.NDArray[np.float64]
+Layer = tuple[Floats, Single]
+"""Colour and opacity."""
+
+DARK = np.array([28, 30, 36]) / 255
+"""Ink on light backgrounds, and the halo of light ink."""
+LIGHT = np.array([240, 241, 244]) / 255
+"""Ink on dark backgrounds, and the halo of dark ink."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Share of red, green and blue in how light a colour looks."""
+LIGHT_BACKGROUND = 0.45
+"""Luminance above which a background takes dark ink."""
+LINE_OPACITY = 0.7
+"""Opacity of the edges."""
+
+
+class Pen:
+    """Writes and draws with the ink that suits a background.
+
+    Attributes:
+        ink: colour (3,) of lines and letters. halo: colour (3,) around the letters.
+    """
+
+    def __init__(self, width: int, height: int, background: str) -> None:
+        """Choose the ink for a picture of `width` x `height` pixels."""
+        from PIL import Image as Pictures
+
+        paper = None if background == "transparent" else np.array(parse_colour(background))
+        light = paper is None or float(paper @ LUMINANCE) > LIGHT_BACKGROUND
+        self.ink, self.halo = (DARK, LIGHT) if light else (LIGHT, DARK)
+        self.width, self.height = width, height
+        self._letters, self._halos = (Pictures.new("L", (width, height)) for _ in range(2))
+
+    def write(self, label: Label) -> None:
+        """Write a label with a halo."""
+        from PIL import Image as Pictures
+        from PIL import ImageChops, ImageDraw
+
+        wide, tall = (math.ceil(side) + 2 for side in replace(label, upright=False).extent)
+        stroke = max(1, label.size // 9)
+        pitch = line_height(label.size)
+        left, top, _, _ = label.box
+        place = round(left) - 1, round(top) - 1
+        for mask, width in ((self._halos, stroke), (self._letters, 0)):
+            text = Pictures.new("L", (wide, tall))
+            draw = ImageDraw.Draw(text)
+            for number, line in enumerate(label.lines):
+                row = tall / 2 + (number - (len(label.lines) - 1) / 2) * pitch
+                draw.text(
+                    (wide / 2, row),
+                    line,
+                    255,
+                    font(label.size),
+                    anchor="mm",
+                    stroke_width=width,
+                    stroke_fill=255,
+                )
+            if label.upright:
+                text = text.transpose(Pictures.Transpose.ROTATE_90)
+            whole = Pictures.new("L", mask.size)
+            whole.paste(text, place)
+            mask.paste(ImageChops.lighter(mask, whole))
+
+    def text(self, place: tuple[float, float], text: str, size: int) -> None:
+        """Write a line to the right of a place, centred on it vertically."""
+        half = Label(lines=(text,), centre=place, size=size).extent[0] / 2
+        self.write(Label(lines=(text,), centre=(place[0] + half, place[1]), size=size))
+
+    def written(self) -> tuple[Layer, Layer]:
+        """The layers of all texts so far, the lower one first."""
+        return (self.halo, _opacity(self._halos)), (self.ink, _opacity(self._letters))
+
+    def lines(self, edges: list[Edge], view: tuple[int, int, int, int]) -> Single:
+        """The opacity (H, W) of edges; they are drawn larger and reduced, to be smooth.
+
+        view: left, top, width and height of the part that the ends of the edges are counted in, and
+        beyond which nothing is drawn.
+        """
+        from PIL import Image as Pictures
+        from PIL import ImageDraw
+
+        opacity = np.zeros((self.height, self.width), dtype=np.float32)
+        left, top, width, height = view
+        if not edges:
+            return opacity
+        finer = 4 if max(width, height) <= 1024 else 2 if max(width, height) <= 4096 else 1
+        mask = Pictures.new("L", (width * finer, height * finer))
+        draw = ImageDraw.Draw(mask)
+        far = 32.0 * max(width, height)  # an edge that passes close by the camera ends anywhere
+        thick = max(1, round(finer * font_size(self.width, self.height) / 11))
+        for edge in edges:
+            ends = np.clip(edge.ends, -far, far) * finer
+            draw.line([*ends[0], *ends[1]], 255, thick)
+        inner = _opacity(mask.reduce(finer)) * np.float32(LINE_OPACITY)
+        opacity[top : top + height, left : left + width] = inner
+        return opacity
+
+    def colour_bar(self, bar: Bar, colours: ColourMap) -> Layer:
+        """Draw a colour bar; its ticks and its name are written as texts.
+
+        Returns the layer of frame, colours and tick marks.
+        """
+        low, high = (float(end) for end in colours.positions[[0, -1]])
+        left, top, right, bottom = bar.box
+        tall = bottom - top
+        canvas = _Canvas(self.width, self.height)
+        canvas.fill((left - 1, top - 1, right + 1, bottom + 1), self.ink)
+        share = (np.arange(tall)[::-1, None] + 0.5) / tall
+        canvas.fill(bar.box, colours(low * (1 - share) + high * share))
+        stroke, pitch = max(1, bar.size // 12), line_height(bar.size)
+        for value, text in bar.marks:
+            row = top + (tall - 1) * (1 - (value - low) / ((high - low) or 1.0))
+            mark = round(row) - stroke // 2
+            canvas.fill((right, mark, right + bar.size // 4, mark + stroke), self.ink)
+            self.text((right + bar.size // 4 + 2, row), text, bar.size)
+        for number, line in enumerate(reversed(bar.title)):
+            self.text((left - 2, top - (number + TITLE_GAP) * pitch), line, bar.size)
+        return canvas.colours, canvas.opacity
+
+    def legend(self, legend: Legend) -> Layer:
+        """Draw a legend; its texts are written. Returns the layer of its squares."""
+        canvas, side = _Canvas(self.width, self.height), legend.size
+        for left, top, entry in legend.entries:
+            box = round(left), round(top), round(left) + side, round(top) + side
+            canvas.fill((box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1), self.ink)
+            canvas.fill(box, np.array(parse_colour(entry.colour)))
+            self.text((left + 1.4 * side, top + side / 2), entry.text, side)
+        return canvas.colours, canvas.opacity
+
+    def time_label(self, strip: Rectangle, text: str) -> None:
+        """Write the time label in its strip: smaller where it is long, in two lines if need be."""
+        size = font_size(self.width, self.height)
+        room = strip[2] - strip[0] - size
+        size = fitted([text], size, room)
+        lines = (text,) if length(text, size) <= room else wrapped(text, size, room)
+        label = Label(lines=lines, centre=(0.0, 0.0), size=size)
+        wide, _ = label.extent
+        left = strip[0] + font_size(self.width, self.height) / 2
+        self.write(replace(label, centre=(left + wide / 2, (strip[1] + strip[3]) / 2)))
+
+
+class _Canvas:
+    """A layer that rectangles are filled in."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.colours: Floats = np.zeros((height, width, 3))
+        self.opacity: Single = np.zeros((height, width), dtype=np.float32)
+
+    def fill(
+        self, rectangle: tuple[int, int, int, int], colour: Floats, opacity: float = 1.0
+    ) -> None:
+        """Fill a rectangle, as far as it lies on the canvas.
+
+        Args:
+            rectangle: left, top, right, bottom in pixels; the last two lie outside.
+            colour: (3,), or a colour for each row of the rectangle (rows, 1, 3).
+            opacity: 0..1.
+        """
+        left, top, right, bottom = rectangle
+        height, width = self.opacity.shape
+        first = max(top, 0)
+        last = max(min(bottom, height), first)  # a rectangle below the canvas has no row on it
+        area = slice(first, last), slice(max(left, 0), max(min(right, width), 0))
+        self.colours[area] = colour[first - top : last - top] if colour.ndim == 3 else colour
+        self.opacity[area] = opacity
+
+
+def _opacity(mask: PicturesImage) -> Single:
+    """The opacity 0..1 of a mask of bytes."""
+    return np.asarray(mask, dtype=np.float32) / np.float32(255)
+
+
+def overlay(
+    image: Image,
+    effects: Effects,
+    rays: Rays,
+    layout: Layout,
+    *,
+    colours: ColourMap,
+    label: str = "",
+    body: Body | None = None,
+) -> Image:
+    """Draw box, axes, colour bar, legend and time label, as far as the effects ask for them.
+
+    Args:
+        image: the picture of the volume; returned itself if no effect asks for anything.
+        effects: of the scene.
+        rays: of the part of the picture that shows the volume.
+        layout: of the picture.
+        colours: of the colour bar.
+        label: text of the time label.
+        body: what a clip leaves of the volume, whose edges are the box; None without one.
+    """
+    if not any((effects.box, effects.axes, effects.colour_bar, effects.time_label, effects.legend)):
+        return image
+    height, width = image.rgba.shape[:2]
+    pen = Pen(width, height, image.background)
+    picture = image.rgba.copy()
+    layers: list[Layer] = []
+    if effects.box or effects.axes:
+        shown = edges(rays, body) if effects.box else outer_edges(rays)
+        if body is not None and effects.box and effects.axes:
+            shown += outer_edges(rays)  # of all of the volume
+        # The volume lies inside the box: an edge between two faces that look away lies behind all
+        # of the volume, any other edge before all of it.
+        behind = pen.lines([edge for edge in shown if edge.fronts == 0], layout.view)
+        _paint_behind(picture, pen.ink, behind)
+        before = pen.lines([edge for edge in shown if edge.fronts > 0], layout.view)
+        layers.append((pen.ink, before))
+    for text in layout.labels:
+        pen.write(text)
+    if layout.time is not None and label:
+        pen.time_label(layout.time, label)
+    layers += _around(pen, layout, colours)
+    for colour, opacity in layers:
+        _paint_before(picture, colour, opacity)
+    return dataclasses.replace(image, rgba=picture)
+
+
+def surrounded(image: Image, effects: Effects, *, colours: ColourMap, quantity: str) -> Image:
+    """Put the colour bar and the legend of a scene beside and below a picture of several panels.
+
+    Args:
+        image: the panels; returned itself if no effect asks for anything.
+        effects: of the scene.
+        colours: of the colour bar.
+        quantity: name of the colour bar, with units.
+    """
+    wanted = Effects(colour_bar=effects.colour_bar, legend=effects.legend)
+    if wanted == Effects():
+        return image
+    height, width = image.rgba.shape[:2]
+    # The strips take their widths from the picture with them: a few rounds settle both.
+    size = (width, height)
+    for _ in range(8):
+        layout = strips(size, wanted, colours, quantity)
+        size = (width + size[0] - layout.view[2], height + size[1] - layout.view[3])
+        if layout.view[2] >= width and layout.view[3] >= height:
+            break
+    layout = strips(size, wanted, colours, quantity)
+    pen = Pen(*size, image.background)
+    picture = np.zeros((size[1], size[0], 4), dtype=np.float32)
+    picture[:height, :width] = image.rgba
+    for colour, opacity in _around(pen, layout, colours):
+        _paint_before(picture, colour, opacity)
+    return dataclasses.replace(image, rgba=picture)
+
+
+def _around(pen: Pen, layout: Layout, colours: ColourMap) -> list[Layer]:
+    """The layers of colour bar and legend, and of all texts of a pen."""
+    layers = []
+    if layout.bar is not None:
+        layers.append(pen.colour_bar(layout.bar, colours))
+    if layout.legend is not None:
+        layers.append(pen.legend(layout.legend))
+    return [*layers, *pen.written()]
+
+
+def time_text(step: float, time: float, coordinate: Coordinate) -> str:
+    """The time label: step and physical time, which is a date where the series has dates."""
+    text = times.time_text(coordinate, time)
+    if times.is_dated(coordinate):
+        return f"step {step:g}   {text.replace('T', ' ')}"
+    return f"step {step:g}   t = {text}"
+
+
+def _paint_before(picture: Single, colour: Floats, opacity: Single) -> None:
+    """Put a layer before a picture (H, W, 4), in place."""
+    where = opacity > 0
+    front = _multiplied(colour if colour.ndim == 1 else colour[where], opacity[where])
+    picture[where] = front + (1 - front[:, 3:]) * picture[where]
+
+
+def _paint_behind(picture: Single, colour: Floats, opacity: Single) -> None:
+    """Put a layer of one colour (3,) behind a picture (H, W, 4), in place."""
+    where = opacity > 0
+    picture[where] += (1 - picture[where][:, 3:]) * _multiplied(colour, opacity[where])
+
+
+def _multiplied(colour: Floats, opacity: Single) -> Single:
+    """Pixels (n, 4): colours (3,) or (n, 3), multiplied by the opacities (n,), and these."""
+    return np.concatenate([opacity[..., None] * colour, opacity[..., None]], axis=-1).astype(
+        np.float32
+    )

@@ -22,6 +22,7 @@ from fhash_codec.rendering.march_task import (
     LightGrid,
     Lighting,
     Table,
+    Task,
     Units,
     extinctions_in,
 )
@@ -199,14 +200,11 @@ SIDES /= np.linalg.norm(SIDES, axis=1, keepdims=True)
 
 def light_grid(
     frame: Frame,
-    grid: Grid,
-    table: Table | None,
+    task: Task,
     *,
     shadows: Shadows | None = None,
     lamp: Floats | None = None,
     ambient_occlusion: AmbientOcclusion | None = None,
-    body: Body | None = None,
-    grading: Grading | None = None,
     bricks: Bricks | None = None,
 ) -> LightGrid:
     """Shares of the light that reach places of a frame, the strengths of both effects included.
@@ -216,14 +214,15 @@ def light_grid(
     The points of the grid lie a whole number of the frame's vertices apart, as near to the
     resolution of the shadows as that allows.
 
+    task: of a marcher, without light. What its clip leaves takes light away, as far as its table
+        and its opacity by gradient let it.
     lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
-    body: what a clip leaves; nothing outside it takes light away. All if None.
-    grading: opacity by gradient; what it leaves of the extinction takes light away.
     bricks: of the frame. They keep what the next picture needs again; None keeps nothing.
     Raises InputError for shadows without a lamp.
     """
     if shadows is not None and lamp is None:
         raise InputError("shadows need the direction towards a lamp")
+    grid, table, body, grading = task.rays.grid, task.table, task.body, task.grading
     resolution = shadows.resolution if shadows is not None else Shadows().resolution
     across = max(1, round(resolution / frame.stride))
     if table is None or not table.extinctions.any():

@@ -16,12 +16,11 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
-from fhash_codec.rendering.image import Draw, Image
+from fhash_codec.rendering.image import Draw, Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Marched, Task, Units, complete, warped
-from fhash_codec.rendering.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.plan import Plan, arrays_on, plan_at, plan_picture
 from fhash_codec.rendering.scenes import MAX_SIDE, Scene
 from fhash_codec.rendering.stream_fields import Field, NetworkField, WarpedField
@@ -411,13 +410,10 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
     progress("lighting", 0, 1, "")
     light = light_grid(
         decoded.frame,
-        plan.task.rays.grid,
-        plan.task.table,
+        plan.task,
         shadows=plan.shadows,
         lamp=plan.lamp,
         ambient_occlusion=plan.occlusion,
-        body=plan.task.body,
-        grading=plan.task.grading,
         bricks=decoded.bricks,
     )
     progress("lighting", 1, 1, "")

@@ -5,7 +5,7 @@ is alive in a pass. Adaptive ray marching takes more samples the fewer rays are 
 clamp(N_r / N_alive, 1, 64) of each ray (paper, algorithm 1).
 
 Both make the same picture, with numpy bit for bit: every number of a sample is computed without the
-other samples of the pass (fields.py).
+other samples of the pass (stream_fields.py).
 
 A pass is computed where the field has its values: by numpy on the host, or by torch on a device.
 From a device only counts come back before the picture is finished. The host waits for a few of them
@@ -17,14 +17,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Palette
-from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Marched, Surface, Task, complete
-from fhash_codec.rendering.stream_fields import Field
-from fhash_codec.rendering.stream_rays import Beams, Canvas, Events, Factors, Leaping
+from fhash_codec.rendering.light import flatness, slope_scale
+from fhash_codec.rendering.march_task import (
+    NUMPY,
+    Array,
+    Arrays,
+    LightGrid,
+    Lighting,
+    Marched,
+    Surface,
+    Task,
+    complete,
+)
+from fhash_codec.rendering.stream_fields import Beams, Factors, Field, Leaping, central_slopes
 
 MAX_SAMPLES = 64
 """Samples of a ray in a pass, at most, as in the paper."""
@@ -522,3 +533,259 @@ def _roots(
             )
         going = going[arrays.nonzero(active)]
     return root
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Events:
+    """Events along the rays of a pass, the nearest first: surfaces, then the sample behind them.
+
+    With s surfaces a ray has s + 1 events for each sample.
+
+    Attributes:
+        opacity: (rays, events), 0 where there is nothing.
+        at: (rays, events), places in samples of the ray.
+        which: int64 (rays, events), number of the surface; s for the volume.
+        values: (rays, samples), values of the samples.
+    """
+
+    opacity: Array
+    at: Array
+    which: Array
+    values: Array
+
+
+class Canvas:
+    """The picture of a band of rays as far as it is marched.
+
+    Attributes:
+        colour: (n, 3), colours, multiplied by the opacity.
+        clear: (n,), share of the light behind that comes through.
+        depth: (n,), distance from the eye; infinity where nothing was seen.
+        normal: (n, 3), unit vectors towards the eye; 0 where nothing was seen.
+        gradients: number of gradients that were evaluated.
+    """
+
+    def __init__(self, field: Field, task: Task, beams: Beams, palette: Palette | None) -> None:
+        self.field, self.task, self.beams, self.palette = field, task, beams, palette
+        self.arrays = field.arrays
+        count = len(beams.end)
+        self.colour, self.clear = self.arrays.full((count, 3), 0.0), self.arrays.full(count, 1.0)
+        self.depth, self.normal = self.arrays.full(count, np.inf), self.arrays.full((count, 3), 0.0)
+        self.gradients = 0
+        self._phong = Phong.of(task, field)
+        self._light = None if task.light is None else LightAt(task.light, self.arrays)
+        self._surfaces = [self.arrays.array(surface.colour, "float64") for surface in task.surfaces]
+        self._spacing = self.arrays.array(task.rays.grid.spacing)
+
+    def add(self, alive: Array, events: Events) -> None:
+        """Join the events of a pass to its rays, front to back. alive: numbers of the rays."""
+        arrays, xp = self.arrays, self.arrays.xp
+        per_sample = len(self._surfaces) + 1
+        # Light behind each event; the first column is what was left before the pass.
+        left = xp.cumprod(
+            xp.concatenate([self.clear[alive][:, None], 1 - events.opacity], axis=1), axis=1
+        )
+        # A ray ends after a sample, never between a surface and the sample behind it.
+        ended = left[:, :-1:per_sample] < self.task.threshold
+        ended[:, 0] = False
+        ended = xp.broadcast_to(ended[..., None], (*ended.shape, per_sample)).reshape(
+            events.opacity.shape
+        )
+        weight = xp.where(ended, 0.0, left[:, :-1] * events.opacity)
+        after = xp.where(ended, np.inf, left[:, 1:])
+        self.clear[alive] = xp.amin(after, axis=1)
+        row, column = arrays.nonzero(weight)
+        if not len(row):
+            return
+        # One event of a ray after the other: so the sum does not depend on the number of passes.
+        arrays.add_rows(
+            self.colour,
+            alive[row],
+            self._colours(alive[row], events, row, column) * weight[row, column][:, None],
+        )
+        if self.task.depth or self.task.normal:
+            behind = after < 0.5
+            (new,) = arrays.nonzero(xp.isinf(self.depth[alive]) & xp.any(behind, axis=1))
+            event = xp.argmax(arrays.to_int64(behind[new]), axis=1)
+            self.see(alive[new], arrays.take_along(events.at[new], event[:, None], 1)[:, 0])
+
+    def see(self, rays: Array, at: Array) -> None:
+        """Set depth and normal of rays (n,) at samples (n,)."""
+        xp = self.arrays.xp
+        self.depth[rays] = self.beams.depth[rays] + at * self.beams.step
+        if not self.task.normal or not len(rays):
+            return
+        self.gradients += len(rays)
+        slopes = self.field.slopes(self.beams.places(rays, at)) / self._spacing
+        # Towards the eye, of unit length.
+        slopes = xp.where(
+            xp.sum(slopes * self.beams.along[rays], axis=1)[:, None] > 0, -slopes, slopes
+        )
+        length = xp.sqrt(xp.sum(slopes * slopes, axis=1))[:, None]
+        self.normal[rays] = slopes / xp.where(length > 0, length, 1.0)
+
+    def show_values(self, values: Array, at: Array) -> None:
+        """Draw one value along each ray, opaque, behind the surfaces that are there.
+
+        values: (n,); rays whose value is not finite show nothing.
+        at: (n,), their places in samples.
+        """
+        assert self.palette is not None
+        (shown,) = self.arrays.nonzero(self.arrays.xp.isfinite(values))
+        if self.task.depth or self.task.normal:
+            # As if surfaces of little opacity were not there.
+            front = shown[self.clear[shown] >= 0.5]
+            self.see(front, at[front])
+        self.colour[shown] += self.clear[shown][:, None] * self.palette.colour(values[shown])
+        self.clear[shown] = 0.0
+
+    def _colours(self, rays: Array, events: Events, row: Array, column: Array) -> Array:
+        """Lit colours (n, 3) of events (row, column) of rays (n,)."""
+        arrays, which = self.arrays, events.which[row, column]
+        colours = self._unlit(events, row, column, which)
+        lit = self._lit(which)
+        if self._light is None and lit is None:
+            return colours
+        places = self.beams.places(rays, events.at[row, column])
+        lamp, around = (
+            (arrays.full(len(rays), 1.0),) * 2 if self._light is None else self._light(places)
+        )
+        result = colours * (lamp * around)[:, None]
+        if lit is not None:
+            assert self._phong is not None
+            self.gradients += len(places[lit])
+            slopes = self._phong.slopes(places[lit])
+            result[lit] = self._phong(
+                colours[lit], slopes, self.beams.along[rays[lit]], lamp[lit], around[lit]
+            )
+        return result
+
+    def _lit(self, which: Array) -> Array | None:
+        """Index of the events that are lit by their gradient; None where none is."""
+        if self.task.shaded:
+            return slice(None)
+        if not self._surfaces:
+            return None
+        (lit,) = self.arrays.nonzero(which < len(self._surfaces))
+        return lit if len(lit) else None
+
+    def _unlit(self, events: Events, row: Array, column: Array, which: Array) -> Array:
+        """Colours (n, 3) of events without light."""
+        arrays, surfaces = self.arrays, len(self._surfaces)
+        if self.palette is not None and not surfaces:
+            return self.palette.colour(events.values[row, column])
+        colours = arrays.full((len(row), 3), 0.0)
+        if self.palette is not None:
+            of_volume = which == surfaces
+            some = arrays.candidates(of_volume)
+            values = events.values[row[some], column[some] // (surfaces + 1)]
+            values = arrays.kept(of_volume, values, self.palette.low)
+            colours[some] = self.palette.colour(values)
+        for number, colour in enumerate(self._surfaces):
+            colours = arrays.xp.where((which == number)[:, None], colour, colours)
+        return colours
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Phong:
+    """Phong's model, two-sided, with the vector halfway between light and eye (Blinn).
+
+    Attributes:
+        lamp: (3,), unit vector towards the light, or None for a light at the eye.
+        scale: (3,), factors from derivatives by x, y, z per vertex to gradients, which are shares
+            of the table's range per vertex spacing.
+        floor: gradient at which the light from a direction has faded by half, so that the noise of
+            rounding is not lit.
+        field: whose gradients are taken.
+        central: whether by central differences.
+    """
+
+    arrays: Arrays
+    lighting: Lighting
+    lamp: Array | None
+    scale: Array
+    floor: float
+    field: Field
+    central: bool
+
+    @classmethod
+    def of(cls, task: Task, field: Field) -> Phong | None:
+        """The model of a task, with the same scales as the native marcher's; None without light."""
+        lighting, arrays = task.lighting, field.arrays
+        if lighting is None:
+            return None
+        least, most = field.bricks.value_range
+        low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
+        span, floor = flatness(low, high, least, most, task.noise)
+        return cls(
+            arrays=arrays,
+            lighting=lighting,
+            lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
+            scale=arrays.array(slope_scale(task.rays.grid, span, least, most)),
+            floor=floor,
+            field=field,
+            central=lighting.central,
+        )
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives (n, 3) by x, y and z per vertex, for shading."""
+        return central_slopes(self.field, places) if self.central else self.field.slopes(places)
+
+    def __call__(
+        self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array
+    ) -> Array:
+        """Lit colours (n, 3): ambient and scattered light in the colour, mirrored light in white.
+
+        Where the gradient vanishes, only the ambient light is left.
+
+        slopes: derivatives (n, 3) by x, y, z per vertex.
+        along: unit vectors (n, 3) of the rays.
+        lamp, around: shares (n,) of the light that arrive from the lamp and from around.
+        """
+        xp, lighting = self.arrays.xp, self.lighting
+        gradient = slopes * self.scale
+        normal = gradient / xp.sqrt(xp.sum(gradient * gradient, axis=1) + self.floor**2)[:, None]
+        towards = -along if self.lamp is None else xp.broadcast_to(self.lamp, along.shape)
+        half = towards - along
+        length = xp.sqrt(xp.sum(half * half, axis=1))[:, None]
+        # Light from straight behind has no highlight.
+        half = xp.where(length > 1e-6, half / xp.where(length > 1e-6, length, 1.0), 0.0)
+        scattered = xp.clip(xp.abs(xp.sum(normal * towards, axis=1)), None, 1.0)
+        mirrored = (
+            xp.clip(xp.abs(xp.sum(normal * half, axis=1)), None, 1.0) ** lighting.specular_power
+        )
+        share = around * lighting.ambient + lamp * scattered * lighting.diffuse
+        return colours * share[:, None] + (lamp * mirrored * lighting.specular)[:, None]
+
+
+class LightAt:
+    """A `LightGrid` in arrays of `arrays`, as a function of places."""
+
+    def __init__(self, grid: LightGrid, arrays: Arrays) -> None:
+        self._arrays, self._cell = arrays, float(grid.cell)
+        self._shares = arrays.array(grid.shares, "float64")
+        self._first = arrays.array(grid.first, "float64")
+        self._last = arrays.array([count - 1.0 for count in grid.shares.shape[2::-1]])
+
+    def __call__(self, places: Array) -> tuple[Array, Array]:
+        """Shares (n,) of the light from the lamp and from around that reach places (n, 3).
+
+        places: x, y, z in vertices of the domain. Shares are trilinear, clamped beyond the grid.
+        """
+        arrays, xp, last = self._arrays, self._arrays.xp, self._last
+        at = xp.clip((places - self._first) / self._cell, 0 * last, last)
+        before = xp.minimum(xp.floor(at), xp.clip(last - 1, 0.0, None))
+        x, y, z = (at - before).T
+        low, high = arrays.to_int64(before), arrays.to_int64(xp.minimum(before + 1, last))
+        shares = arrays.full((len(places), 2), 0.0)
+        for corner in product((0, 1), repeat=3):
+            k, j, i = (
+                (high if up else low)[:, axis] for up, axis in zip(corner, (2, 1, 0), strict=True)
+            )
+            weight = (
+                (z if corner[0] else 1 - z)
+                * (y if corner[1] else 1 - y)
+                * (x if corner[2] else 1 - x)
+            )
+            shares += weight[:, None] * self._shares[k, j, i]
+        return shares[:, 0], shares[:, 1]

@@ -13,11 +13,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from click.testing import Result
 
 from fhash_formats.container import ContainerWriter
 
-Fhash = Callable[..., Result]
 Refused = Callable[..., str]
 SMALL = ["--effort", "1", "--quiet"]
 PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
@@ -269,14 +267,6 @@ def test_output_in_a_missing_folder(
 
 
 @pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
-def test_output_in_a_folder_that_is_a_file(
-    refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
-) -> None:
-    (tmp_path / "file").write_text("")
-    refused(2, *outputs(data, run, tmp_path / "file")[kind])
-
-
-@pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
 def test_existing_output(
     refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -301,13 +291,6 @@ def test_output_is_checked_before_the_input_is_read(refused: Refused, tmp_path: 
     assert "missing-folder" in refused(
         2, "decode", tmp_path / "no.fhz", "-o", tmp_path / "missing-folder" / "out.npy"
     )
-
-
-@pytest.mark.parametrize("name", ["out", "out.xyz"])
-def test_output_of_an_unknown_format_lists_the_formats(
-    refused: Refused, run: Path, tmp_path: Path, name: str
-) -> None:
-    assert ".npy" in refused(2, "decode", run, "-o", tmp_path / name)
 
 
 def test_full_disk_while_encoding(

@@ -76,27 +76,3 @@ def test_names_forge_no_line(tmp_path: Path, fhash: Fhash) -> None:
             assert "\r" not in text
             for line in text.splitlines():
                 assert not line.startswith(("forged", "size  1 B")), (words, line)
-
-
-def test_many_scalars_are_listed_at_once(tmp_path: Path, fhash: Fhash) -> None:
-    opened = h5py.h5o.open
-    source = tmp_path / "a.h5"
-    with h5py.File(source, "w") as file:
-        file["u"] = VALUES
-        for number in range(300):
-            file[f"p/s{number}"] = float(number)
-    calls = 0
-
-    def counted(*words: object, **options: object) -> object:
-        nonlocal calls
-        calls += 1
-        return opened(*words, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(h5py.h5o, "open", counted)
-        result = fhash("info", source)
-    assert calls <= 310
-    assert "301" not in result.stdout
-    assert "300 in all" in result.stdout
-    with h5py.File(source) as file:
-        assert len(file["p"]) == 300

@@ -3,35 +3,22 @@
 from __future__ import annotations
 
 import errno
-import threading
 
 import click
 import pytest
 
 from fhash_cli import output as progress_bar
 from fhash_cli.output import (
-    BEAT_SECONDS,
     Progress,
-    apart,
-    clock,
     compared,
     describe_error,
     duration,
-    emit,
     factor,
-    listed,
-    number,
     quality_rows,
     say,
     size,
-    table,
 )
 from fhash_formats.errors import DamagedFileError, InputError, QualityError
-
-
-def test_table_aligns_its_columns() -> None:
-    assert table([("a", "one"), ("long", "two")]) == "a     one\nlong  two"
-    assert table([("a", "1", "22"), ("b", "333", "4")]) == "a    1  22\nb  333   4"
 
 
 @pytest.mark.parametrize(
@@ -54,15 +41,6 @@ def test_table_aligns_its_columns() -> None:
 )
 def test_size(count: float, text: str) -> None:
     assert size(count) == text
-
-
-def test_number_has_its_unit_or_is_a_dash() -> None:
-    assert [number(45.218, "dB"), number(None, "dB"), number(0.5), number(0.5, "1")] == [
-        "45.22 dB",
-        "-",
-        "0.5",
-        "0.5",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -108,26 +86,6 @@ def test_compared_says_larger_where_it_is() -> None:
         compared({"bytes": 11_800, "raw_bytes": 480, "ratio": 480 / 11_800})
         == "11.8 kB: 24.6x larger than the array (480 B)"
     )
-
-
-def test_compared_has_the_source_as_it_lies_on_disk_too() -> None:
-    on_disk = {**FIGURES, "source_bytes": 2_000_000, "source_ratio": 20.0}
-    array = "100 kB: 47.2x smaller than the array (4.72 MB)"
-    assert compared(on_disk) == f"{array}, 20.0x smaller than the source on disk (2.00 MB)"
-    assert compared(on_disk, part=True) == (
-        f"{array}, 20.0x smaller than the whole source on disk (2.00 MB)"
-    )
-    assert compared({**FIGURES, "source_bytes": None, "source_ratio": None}) == array
-
-
-def test_listed_leaves_out_the_middle() -> None:
-    assert listed(["1", "2"]) == "1, 2"
-    assert listed([str(n) for n in range(20)]) == "0, 1, 2, 3, 4, 5, ..., 19"
-
-
-def test_json_holds_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
-    emit({"psnr": float("nan"), "range": [float("inf"), 1.5]}, "", as_json=True)
-    assert capsys.readouterr().out == '{"psnr": null, "range": [null, 1.5]}\n'
 
 
 class OutOfMemoryError(RuntimeError):
@@ -179,13 +137,6 @@ def test_every_error_is_one_line_with_an_exit_code(error: Exception, line: str, 
     assert text.startswith(line)
     assert "\n" not in text
     assert got == code
-
-
-def test_numbers_have_as_many_digits_as_tell_them_apart() -> None:
-    assert apart(0.0, 4.0) == ["0", "4"]
-    assert apart(347921.0, 347921.002) == ["347921", "347921.002"]
-    assert apart(7.0, 7.0) == ["7", "7"]
-    assert apart(1.0, 1.0 + 1e-15) == ["1", "1"]
 
 
 @pytest.mark.parametrize(
@@ -240,27 +191,11 @@ def reports(
     return screen.text
 
 
-def test_short_stages_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert reports(monkeypatch, seconds=0.02) == ""
-    assert reports(monkeypatch, seconds=0.02, terminal=True) == ""
-
-
-@pytest.mark.parametrize("terminal", [False, True])
-def test_quiet_is_silent(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
-    assert reports(monkeypatch, seconds=9.0, terminal=terminal, quiet=True) == ""
-
-
 def test_without_a_terminal_there_is_a_line_every_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = reports(monkeypatch, seconds=1.0).splitlines()
     assert len(lines) == 10
     assert lines[0] == "fhash: training 10%, 4 dB, 0:36 left"
     assert lines[-1] == "fhash: training 100%, 40 dB"
-
-
-def test_what_passed_before_the_first_report_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = reports(monkeypatch, seconds=120.0).splitlines()
-    assert lines[0] == "fhash: training 2%, 1 dB, 1:18:00 left"
-    assert lines[3] == "fhash: training 10%, 4 dB, 1:12:00 left"
 
 
 def test_on_a_terminal_a_bar_is_drawn_in_place_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,19 +238,6 @@ def test_a_terminal_sees_time_pass_while_no_report_comes(monkeypatch: pytest.Mon
     bar.progress.erase()
 
 
-def test_a_stage_of_one_part_has_no_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    bar = Watched(monkeypatch, terminal=True)
-    assert bar.after(2.0, "opening", 0, 1, "run_*.raw").startswith("\ropening    run_*.raw [0:02]")
-    bar.progress.erase()
-
-
-def test_planning_foretells_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    bar = Watched(monkeypatch, terminal=True)
-    assert "left" not in bar.after(5.0, "planning", 3, 6, "head")
-    assert "left" in bar.after(5.0, "coding", 3, 6)
-    bar.progress.erase()
-
-
 def test_many_reports_draw_ten_times_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     bar = Watched(monkeypatch, terminal=True)
     bar.after(2.0, "training", 1, 100)
@@ -344,15 +266,6 @@ def test_a_long_stage_without_reports_prints_a_line_now_and_then(
     assert log.after(10.0, "planning", 2, 6, "tiles, 9 tiles tried").endswith("9 tiles tried\n")
 
 
-def test_the_thread_beats_without_any_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    beaten = threading.Event()
-    monkeypatch.setattr(Progress, "beat", lambda self: beaten.set())
-    monkeypatch.setattr(progress_bar, "BEAT_SECONDS", 0.001)
-    with Progress(quiet=False):
-        assert beaten.wait(30)
-    assert all(thread.name != "fhash-progress" for thread in threading.enumerate())
-
-
 @pytest.mark.parametrize("error", [OSError, ValueError])
 def test_a_closed_stderr_ends_the_beats(
     monkeypatch: pytest.MonkeyPatch, error: type[Exception]
@@ -367,15 +280,3 @@ def test_a_closed_stderr_ends_the_beats(
         assert thread is not None
         thread.join(30)
         assert not thread.is_alive()
-
-
-def test_the_pause_between_two_beats_is_short() -> None:
-    assert BEAT_SECONDS <= 1
-    assert progress_bar.QUIET_SECONDS + BEAT_SECONDS < 2
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (140, "2:20"), (3740, "1:02:20")]
-)
-def test_clock(seconds: float, text: str) -> None:
-    assert clock(seconds) == text

@@ -37,20 +37,6 @@ def test_decode(fhash: Fhash, run: Path, url: str, tmp_path: Path) -> None:
     assert told(fhash("decode", url, "--t", "1", "--json", "--quiet"))["paths"] == []
 
 
-def test_verify(fhash: Fhash, url: str) -> None:
-    assert told(fhash("verify", url, "--json", "--quiet"))["path"] == url
-
-
-def test_render(fhash: Fhash, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    told(fhash("render", f"{url}?signature=1.2", "--size", "16x16", "--json", "--quiet"))
-    assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
-
-
-def test_diff(fhash: Fhash, data: Path, url: str) -> None:
-    assert told(fhash("diff", data, url, "--json", "--quiet"))["path"] == url
-
-
 def test_a_local_url_is_not_overwritten(fhash: Fhash, run: Path) -> None:
     before = run.read_bytes()
     result = fhash("export", f"file://{run}", "--plain", "-o", run, "--force")

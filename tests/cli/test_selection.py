@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_cli.selection import coordinates, region_of, region_of_box, steps_of
+from fhash_cli.selection import coordinates, region_of_box, steps_of
 from fhash_formats.errors import RegionError
 from fhash_formats.series import Coordinate
 
@@ -26,19 +26,6 @@ VOLUME = cast(
 )
 def test_steps_are_those_of_a_python_slice(chosen: slice | None, steps: list[float]) -> None:
     assert steps_of(VOLUME, chosen) == steps
-
-
-@pytest.mark.parametrize("chosen", [slice(0, 5), slice(2, 2), slice(-5, None)])
-def test_steps_outside_the_series_are_refused_not_clipped(chosen: slice) -> None:
-    with pytest.raises(RegionError, match="the series has steps 0 to 3"):
-        steps_of(VOLUME, chosen)
-
-
-def test_a_region_fills_left_out_ends_with_those_of_the_domain() -> None:
-    assert region_of(VOLUME, None) == ((0, 4), (0, 4), (0, 4))
-    assert region_of(VOLUME, [(1, None), (None, -1), (0, 2)]) == ((1, 4), (0, 3), (0, 2))
-    with pytest.raises(RegionError, match="along y"):
-        region_of(VOLUME, [(None, None), (3, 5), (None, None)])
 
 
 def test_coordinates_of_steps_between_two_are_interpolated() -> None:

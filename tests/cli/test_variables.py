@@ -13,7 +13,7 @@ import xarray
 from click.testing import Result
 
 import fhash_codec
-from fhash_cli.variables import config_of, configs_of, info_table, report_table
+from fhash_cli.variables import config_of, configs_of
 from fhash_formats.errors import InputError
 
 Fhash = Callable[..., Result]
@@ -163,11 +163,6 @@ def test_decode_writes_all_or_those_that_are_named_into_one_output(
             np.testing.assert_array_equal(found.reshape(expected.shape), expected)
 
 
-def test_decode_tells_of_every_variable(fhash: Fhash, run: Path) -> None:
-    rows = [line.split() for line in fhash("decode", run).stdout.splitlines() if line]
-    assert [row[1] for row in rows if row[0] == "variable"] == ["u", "v"]
-
-
 def test_decode_refuses_what_one_output_cannot_hold(
     refused: Callable[..., str], run: Path, tmp_path: Path
 ) -> None:
@@ -190,12 +185,6 @@ def test_a_variable_must_be_named(
     if command != "export":
         message = refused(2, command, *words.get(command, [run]), "--var", "w")
         assert "has no variable 'w'; it holds u" in message
-
-
-def test_options_of_encodings_are_refused_for_what_is_encoded(
-    refused: Callable[..., str], run: Path
-) -> None:
-    assert "--axes is for data" in refused(2, "info", run, "--axes", "t,z,y,x", "--var", "u")
 
 
 BAD = {
@@ -245,18 +234,3 @@ def test_a_promise_by_name_stands_in_place_of_those_for_all() -> None:
     assert config_of(settings(ratio=8.0)).ratio == 8
     with pytest.raises(InputError, match="number for u"):
         config_of(settings(ratio={"u": 8.0}))
-
-
-def test_tables_have_a_row_for_each_variable() -> None:
-    figures = {"bytes": 1000, "ratio": 4.0, "rmse": 0.0, "psnr": None, "max_abs_error": 0.0}
-    assert report_table({"u": figures})[1] == ["u", "1.00 kB", "4.00x", "exact", "0"]
-    described = {
-        "bytes": 1000,
-        "ratio": 4.0,
-        "quality": {"psnr": 40.0, "rmse": 1.0},
-        "domain": {"shape": [1, 2, 3, 4]},
-        "variable": {"units": "", "dtype": "int8"},
-    }
-    header, row = info_table({"u": described})
-    assert len(header) == len(row)
-    assert row == ["u", "-", "1 x 2 x 3 x 4", "int8", "1.00 kB", "4.00x", "40 dB", "-"]

@@ -7,13 +7,17 @@ and frames of a few values by hand show what it does.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.rendering.bricks import Bricks, Palette
+from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.light import flatness, smoothing
-from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Marched, Task
+from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Marched, Table, Task
+from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_fields import CORNERS, _of_cells, central_slopes
 from fhash_codec.rendering.stream_march import stream
 
@@ -166,3 +170,47 @@ def streamed(frame: Frame, task: Task) -> Marched:
 def by_stream(library: object, frame: Frame, task: Task, *_: object) -> Marched:
     """A stand-in for `march_native`."""
     return streamed(frame, task)
+
+
+def frame_of(values: npt.ArrayLike, **place: Any) -> Frame:
+    """A frame of all vertices, or of those at a place."""
+    return Frame(values=np.asarray(values, dtype=np.float32), **{"first": (0, 0, 0), **place})
+
+
+def grid_of(shape: tuple[int, ...], spacing: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Grid:
+    """The grid of a domain (z, y, x) with a spacing (x, y, z)."""
+    return Grid(counts=tuple(shape[::-1]), origin=np.zeros(3), spacing=np.array(spacing))
+
+
+def table_of(
+    extinctions: npt.ArrayLike,
+    low: float = 0.0,
+    high: float = 1.0,
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Table:
+    """A table of extinctions from one value to another, all of one colour."""
+    extinctions = np.asarray(extinctions, dtype=np.float64)
+    colours = np.tile(np.float32(colour), (len(extinctions), 1))
+    return Table(low=low, high=high, colours=colours, extinctions=extinctions)
+
+
+def task_of(
+    shape: tuple[int, ...],
+    table: Table | None,
+    spacing: tuple[float, ...] = (1.0, 1.0, 1.0),
+    *,
+    camera: Camera | None = None,
+    size: tuple[int, int] = (8, 8),
+    **more: Any,
+) -> Task:
+    """A task for a domain (z, y, x), seen along z."""
+    front = Camera(view="xy", projection="parallel")
+    rays = Rays.of(front if camera is None else camera, grid_of(shape, spacing), size)
+    return Task(rays=rays, table=table, **{"step": 0.5, "threshold": 0.0, **more})
+
+
+def waves(shape: tuple[int, ...] = (20, 17, 30), pace: float = 1.0) -> np.ndarray:
+    """Waves across all axes, (z, y, x) float32, 0..1."""
+    z, y, x = np.meshgrid(*(np.linspace(0, pace, size) for size in shape), indexing="ij")
+    values = 0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)
+    return values.astype(np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -17,6 +17,7 @@ from fhash_cli.options import (
     feature_option,
     force_option,
     json_option,
+    option_group,
     quiet_option,
     run_argument,
     variables_option,
@@ -167,6 +168,30 @@ class Statistics:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RegionOptions:
+    """Options of `fhash decode` that say what is decoded, and as which numbers."""
+
+    variable: str | None = None
+    features: tuple[str, ...] = ()
+    steps: slice | None = None
+    times: tuple[str, ...] = ()
+    roi: Sequence[Sequence[int | None]] | None = None
+    box: Sequence[Sequence[float | None]] | None = None
+    lod: int | None = None
+    outside: Literal["nan", "background"] = "nan"
+    dtype: str | None = None
+    fill: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.times:
+            raise click.UsageError("--t and --time exclude each other")
+        if self.roi is not None and self.box is not None:
+            raise click.UsageError("--roi and --box exclude each other")
+        if self.lod is not None and self.outside != "nan":
+            raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Selection:
     """Frames that the options select of an open container, and how their values are given.
 
@@ -189,25 +214,17 @@ class Selection:
     fill: float | None
 
     @classmethod
-    def of(
-        cls,
-        volume: Volume,
-        steps: slice | None,
-        times: tuple[str, ...],
-        roi: Sequence[Sequence[int | None]] | None,
-        box: Sequence[Sequence[float | None]] | None,
-        lod: int | None,
-        outside: Literal["nan", "background"],
-        dtype: str | None,
-        fill: float | None,
-    ) -> Selection:
+    def of(cls, volume: Volume, options: RegionOptions) -> Selection:
         """Resolve the options; raises RegionError where they leave the series or its domain."""
         import numpy as np
 
         from fhash_codec.volume import holds
 
-        chosen = steps_at(volume, times) if times else steps_of(volume, steps)
-        region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
+        lod, box, fill = options.lod, options.box, options.fill
+        chosen = (
+            steps_at(volume, options.times) if options.times else steps_of(volume, options.steps)
+        )
+        region = region_of_box(volume, box) if box is not None else region_of(volume, options.roi)
         # A level of detail has its own vertices: those of the feature bounding box in the region.
         z, y, x = (
             (range(low, high) for low, high in region)
@@ -215,7 +232,7 @@ class Selection:
             else volume.lod_vertices(lod, region)
         )
         whole = all(float(step).is_integer() for step in chosen)
-        kind = np.dtype(dtype or (volume.dtype if whole else volume.float_dtype))
+        kind = np.dtype(options.dtype or (volume.dtype if whole else volume.float_dtype))
         own = volume.value_type.fill
         if fill is None and own is not None and kind.kind in "iu" and holds(kind, own):
             fill = own
@@ -225,7 +242,7 @@ class Selection:
             region=region,
             vertices=(z, y, x),
             lod=lod,
-            outside=outside,
+            outside=options.outside,
             kind=kind,
             fill=fill,
         )
@@ -357,20 +374,12 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @force_option
 @json_option
 @quiet_option
+@option_group(RegionOptions, "chosen")
 def command(
     run: str,
-    variable: str | None,
-    features: tuple[str, ...],
-    steps: slice | None,
-    times: tuple[str, ...],
-    roi: Sequence[Sequence[int | None]] | None,
-    box: Sequence[Sequence[float | None]] | None,
-    lod: int | None,
     output: str | None,
     isosurface: float | None,
-    outside: Literal["nan", "background"],
-    dtype: str | None,
-    fill: float | None,
+    chosen: RegionOptions,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -380,29 +389,16 @@ def command(
     Of several variables all are rebuilt, or those of --var u,v; one output holds them in HDF5,
     NetCDF and Zarr.
     """
-    if steps is not None and times:
-        raise click.UsageError("--t and --time exclude each other")
-    if roi is not None and box is not None:
-        raise click.UsageError("--roi and --box exclude each other")
-    if lod is not None and outside != "nan":
-        raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
-    _check_output(output, isosurface, dtype, force, run)
-    if isosurface is not None and fill is not None:
-        raise click.UsageError("--isosurface has no fill value; leave out --fill")
-    several = isosurface is None
+    _check_output(output, isosurface, chosen, force, run)
     with (
-        opened_variables(run, fill, features, variable, several=several) as volumes,
+        opened_variables(
+            run, chosen.fill, chosen.features, chosen.variable, several=isosurface is None
+        ) as volumes,
         Progress(quiet=quiet) as progress,
     ):
-        own = None if isosurface is None else volumes[0].float_dtype.name
-        parts = [
-            Part.of(
-                volume,
-                Selection.of(volume, steps, times, roi, box, lod, outside, own or dtype, fill),
-                progress,
-            )
-            for volume in volumes
-        ]
+        if isosurface is not None:
+            chosen = replace(chosen, dtype=volumes[0].float_dtype.name)
+        parts = [Part.of(volume, Selection.of(volume, chosen), progress) for volume in volumes]
         paths: list[str] = []
         if output is None:
             for part in parts:
@@ -411,7 +407,7 @@ def command(
             paths = _save_surface(output, isosurface, parts[0], force, run)
         else:
             paths = _save_regions(output, parts, force, run)
-        if own is None and dtype is None and not quiet:
+        if chosen.dtype is None and not quiet:
             for part in parts:
                 _say_why_floats(part)
         blocks = [_rows(part) for part in parts]
@@ -473,19 +469,21 @@ def _say_why_floats(part: Part) -> None:
 
 
 def _check_output(
-    output: str | None, isosurface: float | None, dtype: str | None, force: bool, run: str
+    output: str | None, isosurface: float | None, chosen: RegionOptions, force: bool, run: str
 ) -> None:
     """Refuse an output before any work."""
     from fhash_codec.isosurface import require_marching_cubes
     from fhash_formats.writers.vtk import check_mesh_output
 
     if isosurface is not None:
-        if output is None or dtype is not None:
+        if output is None or chosen.dtype is not None:
             raise click.UsageError(
                 "--isosurface writes a file of triangles: give -o s.vtp or -o s.ply, and no --dtype"
             )
         check_mesh_output(output, force, [run])
         require_marching_cubes()
+        if chosen.fill is not None:
+            raise click.UsageError("--isosurface has no fill value; leave out --fill")
     elif output is not None:
         check_writable(output, force, region=True, sources=[run])
 

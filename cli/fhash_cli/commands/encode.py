@@ -7,6 +7,7 @@ import glob
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from fhash_cli.options import (
     check_writable,
     force_option,
     json_option,
+    option_group,
     quiet_option,
     series_options,
     setting_options,
@@ -50,6 +52,21 @@ if TYPE_CHECKING:
 
 MAX_LABELS = 64
 """Range of integers up to which they may be labels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodeOptions:
+    """Options of `fhash encode` besides its data, output and settings."""
+
+    components: str | None
+    explain: bool
+    time_budget: float | None
+    part: str | None
+    plan: str | None
+    verbose: bool
+    report_folder: str | None
+    as_json: bool
+    quiet: bool
 
 
 @click.command("encode", cls=BaseCommand)
@@ -100,21 +117,14 @@ MAX_LABELS = 64
     type=click.Path(),
     help="Also measure reads and pictures of the file, and write the page of `fhash cost` on it.",
 )
+@option_group(EncodeOptions, "options")
 def command(
     data: str,
     output: str,
     source: SourceOptions,
     settings: dict[str, Any],
-    components: str | None,
+    options: EncodeOptions,
     force: bool,
-    as_json: bool,
-    quiet: bool,
-    explain: bool,
-    time_budget: float | None,
-    part: str | None,
-    plan: str | None,
-    verbose: bool,
-    report_folder: str | None,
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
@@ -128,13 +138,20 @@ def command(
     checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
     profile compact the same command starts again.
     """
+    time_budget, report_folder = options.time_budget, options.report_folder
+    explain, as_json, quiet = options.explain, options.as_json, options.quiet
     others = explain or time_budget is not None or report_folder is not None
-    wish = WishedPart.of(part, plan, with_others=others)
+    wish = WishedPart.of(options.part, options.plan, with_others=others)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
-    several = variables_to_encode(source, data, components, quiet=quiet)
+    several = variables_to_encode(source, data, options.components, quiet=quiet)
     if several is not None:
-        if time_budget is not None or report_folder is not None or verbose or part is not None:
+        if (
+            time_budget is not None
+            or report_folder is not None
+            or options.verbose
+            or wish is not None
+        ):
             raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
         encoded = _encode_several(data, output, several, settings, force, quiet)
         return _emit_several(encoded, explain, as_json)
@@ -163,7 +180,7 @@ def command(
             )
     if not quiet:
         _say_remarks(source, series, config, report, promise_kept=missed is None)
-    rows = report_rows(report, series.units, part=source.part, verbose=verbose)
+    rows = report_rows(report, series.units, part=source.part, verbose=options.verbose)
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows) + _explained(report, explain)

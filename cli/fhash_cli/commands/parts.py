@@ -25,6 +25,12 @@ if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
     from fhash_formats.series import Series
 
+PLANNED = (
+    "features", "dilation", "max_error", "max_error_rel", "effort", "tile", "access", "without",
+    "seed",
+)  # fmt: skip
+"""Settings of a plan: of the profile compact, and a bound as the promise."""
+
 
 @click.command("plan", cls=BaseCommand)
 @click.argument("data", type=click.Path())
@@ -32,7 +38,7 @@ if TYPE_CHECKING:
     "-o", "output", metavar="RUN.plan", required=True, type=click.Path(), help="Where to write."
 )
 @series_options
-@setting_options()
+@setting_options(*PLANNED)
 @force_option
 @json_option
 @quiet_option

@@ -5,28 +5,32 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import typing
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from fhash_cli.options import (
     BaseCommand,
     Command,
+    IntervalsType,
     RealRange,
     SliceType,
     check_writable,
+    feature_option,
     force_option,
     json_option,
+    option_group,
     quiet_option,
     run_argument,
     variable_option,
 )
 from fhash_cli.output import Progress, emit, extent, number, table
-from fhash_cli.scene_options import SceneOptions, scene_options
-from fhash_cli.selection import steps_of
-from fhash_formats.errors import InputError
+from fhash_cli.selection import steps_of, time_of
+from fhash_formats.errors import InputError, suggestion
 from fhash_formats.support.files import file_name
 
 if TYPE_CHECKING:
@@ -35,6 +39,369 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.plan import Plan
     from fhash_codec.rendering.scenes import Scene
     from fhash_codec.rendering.tracking import Tracked
+
+NUMBERS = {2: "A,B", 3: "X,Y,Z"}
+"""Placeholders of options that take so many numbers."""
+
+
+class NumbersType(click.ParamType[tuple[float, ...]]):
+    """A fixed count of numbers with commas between them."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.name = count, NUMBERS[count]
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """The numbers; the scene checks later whether their values are allowed."""
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self.count:
+            self.fail(
+                f"'{value}' is not {self.count} numbers with commas between them,"
+                f" such as {','.join('123'[: self.count])}",
+                param,
+                ctx,
+            )
+        return numbers
+
+
+class SizeType(click.ParamType[tuple[int, int]]):
+    """Pixels across and down, WxH, or one number for both."""
+
+    name = "WxH"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """The two numbers."""
+        try:
+            across, _, down = str(value).lower().partition("x")
+            return int(across), int(down or across)
+        except ValueError:
+            self.fail(f"'{value}' is not a size in pixels such as 800x600", param, ctx)
+
+
+class OpacityType(click.ParamType[Any]):
+    """Points VALUE:OPACITY with commas between them, or the name of an opacity preset.
+
+    named: whether it may be a name.
+    """
+
+    def __init__(self, *, named: bool = True) -> None:
+        self.named, self.name = named, "NAME|V:O,..." if named else "G:F,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The name, or a list of points."""
+        if self.named and ":" not in str(value):
+            return value
+        try:
+            return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
+        except ValueError:
+            what = "neither the name of an opacity nor" if self.named else "not"
+            self.fail(f"'{value}' is {what} points such as 0:0,0.5:0.2,2:1", param, ctx)
+
+
+class PlaneType(click.ParamType[dict[str, Any]]):
+    """A clip plane: its normal and an offset, or a point of it and its normal."""
+
+    name = "NX,NY,NZ,D"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> dict[str, Any]:
+        """The settings of a ClipPlane."""
+        try:
+            numbers = [float(part) for part in str(value).split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) == 4:
+            return {"normal": numbers[:3], "offset": numbers[3]}
+        if len(numbers) == 6:
+            return {"point": numbers[:3], "normal": numbers[3:]}
+        self.fail(
+            f"'{value}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
+            " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5",
+            param,
+            ctx,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Values of the options that `scene_options` adds.
+
+    Attributes:
+        file: path of a scene to begin from, or None.
+        places: places of the scene, such as `camera.view`, with their values.
+        effects: names of effects to switch on.
+        isosurfaces: texts VALUE[,COLOUR][,OPACITY].
+        settings: texts PLACE=VALUE.
+    """
+
+    file: str | None
+    places: dict[str, Any]
+    effects: tuple[str, ...]
+    isosurfaces: tuple[str, ...]
+    settings: tuple[str, ...]
+
+    def scene(self, volume: Volume) -> Scene:
+        """The scene; raises InputError for what it may not hold."""
+        from fhash_codec.rendering.scenes import Scene
+
+        base = Scene() if self.file is None else Scene.load(self.file)
+        values = base.to_dict()
+        if "step" in self.places or "time" in self.places:
+            for name in ("step", "time", "evolution"):
+                values.pop(name, None)
+        for place, value in self.places.items():
+            _put(values, place, value)
+        if values.get("step") is not None and float(values["step"]) < 0:
+            values["step"] += volume.shape[0]
+        for name in self.effects:
+            _put(values, f"effects.{_effect(name)}", True)
+        if self.isosurfaces:
+            _put(values, "effects.isosurfaces", [_isosurface(text) for text in self.isosurfaces])
+        for setting in self.settings:
+            place, equals, text = setting.partition("=")
+            if not equals:
+                raise InputError(
+                    f"--set {setting}: write PLACE=VALUE, such as effects.shading.ambient=0.3"
+                )
+            _put(values, place.strip(), _json(text))
+        if isinstance(values.get("time"), str):
+            values["time"] = time_of(volume, values["time"])
+        return Scene.from_dict(values)
+
+
+class Setting(NamedTuple):
+    """An option that sets one part of a scene.
+
+    Attributes:
+        flag: the option.
+        place: the part, such as `camera.view`.
+        metavar: what stands for the value in the help.
+        kind: type of the value; that of the field if None.
+        help: in place of the field's own.
+    """
+
+    flag: str
+    place: str
+    metavar: str | None = None
+    kind: click.ParamType[Any] | None = None
+    help: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The parameter of the command."""
+        return self.flag.strip("-").replace("-", "_")
+
+    def option(self) -> Callable[[Command], Command]:
+        """The option, with the type and the help of the scene's field."""
+        from fhash_codec.rendering.scenes import Scene
+
+        record: Any = Scene
+        *above, last = self.place.split(".")
+        for part in above:
+            hint = typing.get_type_hints(record)[part]
+            record = (*typing.get_args(hint), hint)[0]  # of a record or None
+        hint = typing.get_type_hints(record)[last]
+        number = next((kind for kind in (int, float) if hint in (kind, kind | None)), None)
+        text = self.help
+        if text is None:
+            field = next(each for each in dataclasses.fields(record) if each.name == last)
+            choices = ", ".join(field.metadata["choices"])
+            text = field.metadata["help"] + (f": {choices}" if choices else "")
+        return click.option(
+            self.flag,
+            self.name,
+            metavar=self.metavar or ("N" if number is int else "X" if number is float else None),
+            type=self.kind or number,
+            multiple=isinstance(self.kind, PlaneType),
+            help=text[0].upper() + text[1:] + "." * (text[-1] != "]"),
+        )
+
+
+SETTINGS = (
+    Setting("--t", "step", "N", help="step, between two of them too; -1 is the last. Default: the"
+            " first"),
+    Setting("--time", "time", "T", click.STRING, "a time instead of a step: a number, or a date"
+            " such as 2001-02-10T06:00"),
+    Setting("--size", "size", kind=SizeType(), help="pixels across and down.  [default: 512x512]"),
+    Setting("--view", "camera.view", "NAME"),
+    Setting("--azimuth", "camera.azimuth", "DEGREES"),
+    Setting("--elevation", "camera.elevation", "DEGREES"),
+    Setting("--zoom", "camera.zoom"),
+    Setting("--projection", "camera.projection", "NAME"),
+    Setting("--position", "camera.position", kind=NumbersType(3), help="where the camera stands, in"
+            " the coordinates of the series"),
+    Setting("--focal-point", "camera.focal_point", kind=NumbersType(3)),
+    Setting("--view-up", "camera.view_up", kind=NumbersType(3)),
+    Setting("--scale", "scale", kind=NumbersType(3), help="stretch the axes.  [default: one in"
+            " other units is as long as the rest]"),
+    Setting("--cmap", "transfer_function.colours", "NAME", help="colour map, or a ParaView preset"
+            " (JSON)"),
+    Setting("--opacity", "transfer_function.opacity", kind=OpacityType(), help="name of a"
+            " preset: auto, feature, linear, geom, sigmoid, foreground or opaque; or points"),
+    Setting("--range", "transfer_function.range", kind=NumbersType(2)),
+    Setting("--density", "transfer_function.density"),
+    Setting("--gradient-opacity", "transfer_function.gradient_opacity",
+            kind=OpacityType(named=False)),
+    Setting("--clip-box", "effects.clip", kind=IntervalsType(float), help="show only this part, in"
+            " coordinates; an end may be left out"),
+    Setting("--clip-plane", "effects.clip.planes", kind=PlaneType(), help="show only what lies on"
+            " the side of the normal, where it times the place is at least D (or X,Y,Z,NX,NY,NZ);"
+            " may be repeated"),
+    Setting("--background", "background", "COLOUR"),
+    Setting("--antialiasing", "effects.antialiasing"),
+    Setting("--march", "march.mode", "NAME"),
+    Setting("--device", "march.device", "NAME"),
+    Setting("--step", "march.step"),
+    Setting("--lod", "march.lod"),
+)  # fmt: skip
+"""Options that set one part of a scene."""
+
+
+OPTIONS: tuple[Callable[[Command], Command], ...] = (
+    click.option(
+        "--scene",
+        "file",
+        metavar="FILE",
+        type=click.Path(),
+        help="A scene to begin from: JSON, TOML, or a PNG of fhash render.",
+    ),
+    *(setting.option() for setting in SETTINGS),
+    feature_option,
+    click.option(
+        "--effect",
+        "effects",
+        metavar="NAME",
+        multiple=True,
+        help="shading, shadows, ambient-occlusion, maximum-intensity, minimum-intensity,"
+        " average-intensity, attenuated-maximum-intensity, jitter, box, axes, colour-bar or"
+        " time-label; may be repeated.",
+    ),
+    click.option(
+        "--isosurface",
+        "isosurfaces",
+        metavar="V[,COLOUR][,OPACITY]",
+        multiple=True,
+        help="A surface; may be repeated.",
+    ),
+    click.option("--no-volume", is_flag=True, help="Surfaces alone."),
+    click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy."),
+    click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy."),
+    click.option(
+        "--set",
+        "settings",
+        metavar="PLACE=VALUE",
+        multiple=True,
+        help="Any part of a scene, such as effects.shading.ambient=0.3.",
+    ),
+)
+"""Every option of a scene."""
+
+
+def scene_options(command: Command) -> Command:
+    """Add the options of SceneOptions; the command gets them as `options`."""
+
+    @functools.wraps(command)
+    def collected(**values: Any) -> None:
+        given = {
+            setting.place: value
+            for setting in SETTINGS
+            if (value := values.pop(setting.name)) not in (None, ())
+        }
+        if features := values.pop("features"):
+            given["features"] = features
+        if (box := given.get("effects.clip")) is not None:
+            given["effects.clip"] = _clip(box)
+        buffers = [name for name in ("depth", "normal") if values.pop(name)]
+        if buffers:
+            given["effects.buffers"] = buffers
+        if values.pop("no_volume"):
+            given["transfer_function.nothing"] = True
+        if "step" in given and "time" in given:
+            raise click.UsageError("--t and --time exclude each other")
+        names = [field.name for field in dataclasses.fields(SceneOptions) if field.name != "places"]
+        options = SceneOptions(places=given, **{name: values.pop(name) for name in names})
+        command(options=options, **values)
+
+    decorated: Command = collected
+    for option in reversed(OPTIONS):
+        decorated = option(decorated)
+    return decorated
+
+
+def _put(values: dict[str, Any], place: str, value: Any) -> None:
+    """Set a place such as `effects.shading.ambient` in nested tables.
+
+    A table on the way that is `true`, `false` or absent is made.
+    """
+    *above, last = place.split(".")
+    for part in above:
+        inner = values.get(part)
+        if inner is None or inner is True or inner is False:
+            inner = values[part] = {}
+        if not isinstance(inner, dict):
+            raise InputError(f"--set {place}: {part} has no settings of its own")
+        values = inner
+    values[last] = (
+        dict(values[last]) if value is True and isinstance(values.get(last), dict) else value
+    )
+
+
+def _effect(name: str) -> str:
+    """The field of Effects that a name stands for; raises InputError for an unknown name."""
+    from fhash_codec.rendering.scenes import Effects
+
+    names = [
+        field.name
+        for field in dataclasses.fields(Effects)
+        if field.name not in ("isosurfaces", "buffers", "antialiasing", "clip", "legend")
+    ]
+    plain = name.replace("-", "_").replace("color", "colour")
+    if plain not in names:
+        effects = [effect.replace("_", "-") for effect in names]
+        likely = suggestion(plain.replace("_", "-"), effects)
+        known = "" if likely.startswith("known") else f" Known: {', '.join(effects)}"
+        raise InputError(f"effect '{name[:60]}' is not known; {likely}{known}")
+    return plain
+
+
+def _clip(box: tuple[tuple[float | None, ...], ...]) -> dict[str, Any]:
+    """The settings of a Clip by the ends along z, y and x; axes without an end are left out."""
+    ends = {name: list(pair) for name, pair in zip("zyx", box, strict=True)}
+    return {name: pair for name, pair in ends.items() if pair != [None, None]}
+
+
+def _isosurface(text: str) -> dict[str, Any]:
+    """The record of a surface from VALUE[,COLOUR][,OPACITY]."""
+    first, *rest = text.split(",")
+    try:
+        surface: dict[str, Any] = {"value": float(first)}
+        for part in rest:
+            try:
+                surface["opacity"] = float(part)
+            except ValueError:
+                surface["colour"] = part.strip()
+    except ValueError as error:
+        raise InputError(
+            f"--isosurface {text}: write a value, then a colour and an opacity if need be,"
+            " such as 1.5,orange,0.5"
+        ) from error
+    return surface
+
+
+def _json(text: str) -> Any:
+    """A value as JSON, or the text itself where it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
 
 OWN = "own"
 """Value of `--track` that stands for the features of the file."""
@@ -56,19 +423,14 @@ class AnimationOptions:
     def __post_init__(self) -> None:
         if self.animate is not None and self.evolution is not None:
             raise click.UsageError("--animate and --evolution exclude each other")
-        for name, given in (
-            ("--frames", self.frames),
-            ("--fps", self.fps),
-            ("--pictures", self.pictures),
-            ("--processes", self.processes),
-        ):
-            if given is not None and self.animate is None:
-                raise click.UsageError(f"{name} is of an animation: give --animate too")
+        for name in ("frames", "fps", "pictures", "processes"):
+            if getattr(self, name) is not None and self.animate is None:
+                raise click.UsageError(f"--{name} is of an animation: give --animate too")
         if self.columns is not None and self.evolution is None:
             raise click.UsageError("--columns is of an evolution: give --evolution too")
 
     def several(self, scene: Scene) -> bool:
-        """Whether there is more than one picture to draw; `run_animation` then draws them."""
+        """Whether there is more than one picture to draw."""
         return self.animate is not None or scene.evolution is not None
 
     def over(self, scene: Scene, volume: Volume) -> Scene:
@@ -82,72 +444,56 @@ class AnimationOptions:
             scene, step=None, time=None, evolution=Evolution(steps=steps, columns=self.columns)
         )
 
-    def tracked(self, volume: Volume, progress: Progress) -> list[Tracked]:
-        """The features of `--track`; none without the option."""
-        from fhash_codec.rendering.tracking import parse_tracked
 
-        if not self.track:
-            return []
-        if OWN in self.track and len(self.track) > 1:
-            raise InputError(
-                f"--track {OWN} stands for the features of the file; leave it out, or the others"
-            )
-        return parse_tracked([] if OWN in self.track else self.track, volume, progress)
-
-
-def add_animation_options(command: Command) -> Command:
-    """Add the options of AnimationOptions; the command gets them as `several`."""
-
-    @click.option(
+add_animation_options = option_group(
+    AnimationOptions,
+    "several",
+    click.option(
         "--animate",
         metavar="SPEC",
         help="steps[=A:B[:EVERY]], time[=A:B[:EVERY]], orbit[=DEGREES], separated by commas,"
         " or a file (TOML, JSON). Times may be dates.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
-    )
-    @click.option(
+    ),
+    click.option(
         "--fps", type=RealRange(0.1, 240), metavar="X", help="Pictures per second of a film."
-    )
-    @click.option(
+    ),
+    click.option(
         "--pictures",
         metavar="NAME.png",
         type=click.Path(),
         help="Keep the pictures of a film too: NAME.0000.png and so on.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--processes",
         type=click.IntRange(1, 256),
         metavar="N",
         help="Processes that render at a time, for films of some hundred pictures or more: one uses"
         " all cores too, and each further one takes a second to start.  [default: 1]",
-    )
-    @click.option(
+    ),
+    click.option(
         "--evolution",
         metavar="A:B:S",
         type=SliceType(),
         help="These steps side by side in one picture.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--columns",
         type=click.IntRange(1, 1000),
         metavar="N",
         help="Pictures beside each other of an evolution.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--track",
         metavar="FEATURE[=#RRGGBB]",
         multiple=True,
         help="Draw interval:LO:HI, isosurface:V or segmentation[:T] in a colour of its own; repeat."
         f" '{OWN}': those of the file.",
-    )
-    @functools.wraps(command)
-    def collected(**values: Any) -> None:
-        names = [field.name for field in dataclasses.fields(AnimationOptions)]
-        command(several=AnimationOptions(**{name: values.pop(name) for name in names}), **values)
-
-    return collected
+    ),
+)
+"""Options of several pictures; the command gets them as `several`."""
 
 
 def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: Progress) -> Scene:
@@ -157,27 +503,20 @@ def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: 
     """
     from fhash_codec.rendering.tracking import tracking_scene
 
-    tracked = options.tracked(volume, progress)
+    tracked = _tracked(volume, options, progress)
     return tracking_scene(scene, tracked, volume) if tracked else scene
 
 
-def run_animation(
-    volume: Volume,
-    scene: Scene,
-    options: AnimationOptions,
-    output: str,
-    *,
-    force: bool,
-    progress: Progress,
-) -> tuple[dict[str, Any], str]:
-    """Draw the pictures of `--animate` or of an evolution; the result as JSON values and as text.
+def _tracked(volume: Volume, options: AnimationOptions, progress: Progress) -> list[Tracked]:
+    """The features of `--track`; none without the option."""
+    from fhash_codec.rendering.tracking import parse_tracked
 
-    Only for options and a scene that are `several`; applies `--track` itself. Raises InputError
-    before any work for outputs that cannot be written.
-    """
-    if options.animate is not None:
-        return _animate(volume, scene, options, output, force=force, progress=progress)
-    return _draw_evolution(volume, scene, options, output, force=force, progress=progress)
+    names = options.track
+    if OWN in names and len(names) > 1:
+        raise InputError(
+            f"--track {OWN} stands for the features of the file; leave it out, or the others"
+        )
+    return parse_tracked([] if OWN in names else names, volume, progress) if names else []
 
 
 def _animate(
@@ -190,7 +529,7 @@ def _animate(
     progress: Progress,
 ) -> tuple[dict[str, Any], str]:
     """Draw the pictures or the film of `--animate`."""
-    from fhash_codec.rendering.film import animate
+    from fhash_codec.rendering.film import Target, animate
     from fhash_codec.rendering.timeline import Animation
     from fhash_formats.errors import OutputExistsError
 
@@ -207,11 +546,13 @@ def _animate(
             volume,
             shown,
             animation,
-            output,
-            pictures=options.pictures,
-            force=force,
+            Target(
+                output=output,
+                pictures=options.pictures,
+                force=force,
+                processes=options.processes or 1,
+            ),
             progress=progress,
-            processes=options.processes or 1,
         )
     except OutputExistsError as error:
         # Only the command line is wrong so far: exit code 2.
@@ -228,8 +569,6 @@ def _animate(
 
 def _check_pictures(volume: Volume, output: str, pictures: str | None, force: bool) -> None:
     """Refuse outputs of an animation before any work."""
-    from pathlib import Path
-
     from fhash_codec.rendering.film import numbered
 
     for path in (output, pictures):
@@ -251,13 +590,11 @@ def _draw_evolution(
     progress: Progress,
 ) -> tuple[dict[str, Any], str]:
     """Draw an evolution as one picture, and follow the features of `--track`."""
-    from pathlib import Path
-
     from fhash_codec.rendering import render
     from fhash_codec.rendering.image import check_picture_name
     from fhash_codec.rendering.tracking import follow, tracking_scene
 
-    tracked = options.tracked(volume, progress)
+    tracked = _tracked(volume, options, progress)
     shown = tracking_scene(scene, tracked, volume) if tracked else scene
     check_picture_name(Path(output), shown.background)
     check_writable(output, force, sources=[volume.path])
@@ -296,6 +633,16 @@ def _places(followed: list[dict[str, Any]]) -> str:
     return table([header, *rows])
 
 
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """Options of `fhash render` about the files of one picture, and what is said of it."""
+
+    output: str | None
+    save_scene: str | None
+    explain: bool
+    force: bool
+
+
 @click.command("render", cls=BaseCommand)
 @run_argument
 @variable_option
@@ -319,15 +666,13 @@ def _places(followed: list[dict[str, Any]]) -> str:
 @force_option
 @json_option
 @quiet_option
+@option_group(PictureOptions, "picture")
 def command(
     run: str,
     variable: str | None,
-    output: str | None,
     options: SceneOptions,
     several: AnimationOptions,
-    save_scene: str | None,
-    explain: bool,
-    force: bool,
+    picture: PictureOptions,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -341,27 +686,29 @@ def command(
     from fhash_codec.times import time_text
     from fhash_codec.volume import open as open_volume
 
-    path = Path(output) if output is not None else Path(Path(file_name(run)).stem + ".png")
+    output = picture.output if picture.output is not None else Path(file_name(run)).stem + ".png"
+    path = Path(output)
     with open_volume(run, variable=variable) as volume, Progress(quiet=quiet) as progress:
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):
-            if explain or save_scene is not None:
+            if picture.explain or picture.save_scene is not None:
                 raise click.UsageError(
                     "--explain and --save-scene are for one picture;"
                     " leave them out of an animation or evolution"
                 )
-            result, text = run_animation(
-                volume, scene, several, str(path), force=force, progress=progress
+            draw = _draw_evolution if several.animate is None else _animate
+            result, text = draw(
+                volume, scene, several, str(path), force=picture.force, progress=progress
             )
             emit(result, text, as_json)
             return
         scene = tracking(volume, scene, several, progress)
-        _check_outputs(path, save_scene, scene, force, run)
+        _check_outputs(path, picture, scene, run)
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
         image = renderer.render(plan=plan, progress=progress)
         time = time_text(volume.coords["t"], plan.time)
-    paths = [str(written) for written in _save(image, path, save_scene, force)]
+    paths = [str(written) for written in _save(image, path, picture)]
     result = {
         "paths": paths,
         "size": list(scene.size),
@@ -372,35 +719,36 @@ def command(
         "counters": dict(image.counters),
         "seconds": image.seconds,
     }
-    if explain:
+    if picture.explain:
         result["plan"] = plan.to_dict()
-    emit(result, _text(plan, image, time, paths, explain), as_json)
+    emit(result, _text(plan, image, time, paths, picture.explain), as_json)
 
 
-def _check_outputs(path: Path, save_scene: str | None, scene: Scene, force: bool, run: str) -> None:
+def _check_outputs(path: Path, picture: PictureOptions, scene: Scene, run: str) -> None:
     """Refuse outputs before any work."""
     from fhash_codec.rendering.image import check_picture_name
 
     check_picture_name(path, scene.background)
     outputs = [path, *(path.with_name(f"{path.stem}.{name}.npy") for name in scene.effects.buffers)]
-    if save_scene is not None:
-        if Path(save_scene).suffix.lower() != ".json":
-            raise InputError(f"{save_scene}: scenes are written as .json; use such a name")
-        outputs.append(Path(save_scene))
+    if (scene_file := picture.save_scene) is not None:
+        if Path(scene_file).suffix.lower() != ".json":
+            raise InputError(f"{scene_file}: scenes are written as .json; use such a name")
+        outputs.append(Path(scene_file))
     for output in outputs:
-        check_writable(output, force, sources=[run])
+        check_writable(output, picture.force, sources=[run])
 
 
-def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list[Path]:
+def _save(image: Image, path: Path, picture: PictureOptions) -> list[Path]:
     """Write the picture, after its scene where one is asked for; the paths written."""
     from fhash_formats.support.files import replacing
 
-    if save_scene is None:
-        return image.save(path, force=force)
-    with replacing(Path(save_scene), force=force) as temporary:
+    if picture.save_scene is None:
+        return image.save(path, force=picture.force)
+    scene = Path(picture.save_scene)
+    with replacing(scene, force=picture.force) as temporary:
         temporary.write_text(json.dumps(dict(image.scene), indent=2) + "\n", encoding="utf-8")
-        paths = image.save(path, force=force)
-    return [Path(save_scene), *paths]
+        paths = image.save(path, force=picture.force)
+    return [scene, *paths]
 
 
 def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 
 import click
 
@@ -12,6 +13,7 @@ from fhash_cli.options import (
     check_writable,
     force_option,
     json_option,
+    option_group,
     quiet_option,
     run_argument,
 )
@@ -20,6 +22,16 @@ from fhash_formats.errors import InputError
 
 ALL = "all"
 """Value of `--var` that stands for every variable."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackOptions:
+    """Options of `fhash pack` about the arrays of the store."""
+
+    var: str | None
+    select: tuple[tuple[str, str], ...]
+    axes: str | None
+    absent: str
 
 
 @click.command("pack", cls=BaseCommand)
@@ -50,13 +62,11 @@ ALL = "all"
 @force_option
 @json_option
 @quiet_option
+@option_group(PackOptions, "chosen")
 def pack_command(
     data: str,
     output: str,
-    var: str | None,
-    select: tuple[tuple[str, str], ...],
-    axes: str | None,
-    absent: str,
+    chosen: PackOptions,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -70,6 +80,7 @@ def pack_command(
     import fhash_codec
     from fhash_formats.readers.common.file_series import parse_axes
 
+    var, axes = chosen.var, chosen.axes
     names = None if var is None or var == ALL else [name.strip() for name in var.split(",")]
     if names is not None and len(set(names)) < len(names):
         raise InputError(f"--var {var} has a name twice")
@@ -79,8 +90,8 @@ def pack_command(
             output,
             variables=names,
             axes=None if axes is None else parse_axes(axes),
-            select=dict(select),
-            absent=absent,
+            select=dict(chosen.select),
+            absent=chosen.absent,
             force=force,
             progress=progress,
         )

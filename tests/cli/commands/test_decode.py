@@ -9,17 +9,20 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import h5py
 import numpy as np
 import pytest
 from click.testing import Result
 
 import fhash_codec
 import fhash_formats
-from fhash_cli.commands.decode import TYPES, Selection, Statistics, check_fill, convert
-from fhash_cli.options import NumberType
+from fhash_cli.commands.decode import (
+    TYPES,
+    RegionOptions,
+    Selection,
+    Statistics,
+    convert,
+)
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.model import CompactModel
 from fhash_codec.progress import silent
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
@@ -35,18 +38,6 @@ def test_a_fill_value_stands_for_nan_in_any_type() -> None:
         convert(frame, np.dtype("i2"))
     with pytest.raises(InputError, match="at some vertices"):
         convert(frame, np.dtype("i2"), background=True)
-
-
-def test_fill_values_must_fit_the_type() -> None:
-    check_fill(np.dtype("i1"), None)
-    check_fill(np.dtype("i1"), -128)
-    with pytest.raises(InputError, match="fill value 300 does not fit int8"):
-        check_fill(np.dtype("i1"), 300)
-
-
-def test_whole_numbers_stay_exact() -> None:
-    assert NumberType().convert(str(2**63 - 1), None, None) == 2**63 - 1
-    assert NumberType().convert("-1.5", None, None) == -1.5
 
 
 @pytest.fixture(scope="module")
@@ -111,14 +102,6 @@ def test_a_fill_value_that_does_not_fit_is_refused_and_nothing_written(
     assert not out.exists()
 
 
-def test_times_between_steps_are_floats(fhash, counts, tmp_path) -> None:
-    out = tmp_path / "a.npy"
-    done = fhash("decode", counts[1], "--time", "0.5", "-o", str(out))
-    assert done.exit_code == 0
-    assert "between steps they are interpolated" in done.output
-    assert np.load(out).dtype == np.float32
-
-
 def test_few_integers_are_pointed_to_the_lossless_way(fhash, tmp_path) -> None:
     labels = np.random.default_rng(0).integers(0, 65, (2, 4, 9, 10)).astype("u1")
     np.save(tmp_path / "few.npy", labels % 65)
@@ -145,64 +128,10 @@ def test_integers_of_64_bits_are_converted_as_such() -> None:
     assert convert(frame[:1], np.dtype("u8"), integers=-integers[:1]).tolist() == [0]
 
 
-def test_statistics_of_huge_values_do_not_overflow() -> None:
-    statistics = Statistics()
-    for _ in range(3):
-        statistics.add(np.array([[5e307, 1.5e308, np.nan]]), 2)
-    assert statistics.result() == {
-        "min": 5e307,
-        "max": 1.5e308,
-        "mean": 1e308,
-        "inside_fraction": 2 / 3,
-    }
-
-
-WHOLE: dict[str, Any] = {
-    "steps": None,
-    "times": (),
-    "roi": None,
-    "box": None,
-    "lod": None,
-    "outside": "nan",
-    "dtype": None,
-    "fill": None,
-}
-
-
 def decoded(volume: fhash_codec.Volume, **options: Any) -> tuple[Selection, np.ndarray, Statistics]:
-    selection = Selection.of(volume, **{**WHOLE, **options})
+    selection = Selection.of(volume, RegionOptions(**options))
     frames = np.stack(list(selection.frames(volume, statistics := Statistics(), silent)))
     return selection, frames, statistics
-
-
-@pytest.mark.parametrize(
-    ("options", "index"),
-    [
-        ({}, np.s_[:]),
-        ({"steps": slice(1, None), "roi": [(1, 3), (None, None), (0, 4)]}, np.s_[1:, 1:3, :, :4]),
-        ({"times": ("4", "0")}, np.s_[[2, 0]]),
-    ],
-)
-def test_frames_are_the_part_of_the_volume(run: Path, options: dict[str, Any], index: Any) -> None:
-    with fhash_codec.open(run) as volume:
-        assert isinstance(volume, fhash_codec.Volume)
-        expected = np.asarray(volume)[index]
-        selection, frames, statistics = decoded(volume, **options)
-    np.testing.assert_array_equal(frames, expected)
-    assert selection.shape == frames.shape
-    assert selection.kind == frames.dtype
-    assert statistics.result()["max"] == np.nanmax(expected)
-
-
-def test_integers_of_64_bits_come_exactly(tmp_path: Path) -> None:
-    values = (1 << 60) + np.arange(4 * 3 * 4 * 5).reshape(4, 3, 4, 5)
-    path = tmp_path / "run.fhz"
-    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(max_error=0.0, effort=1))
-    with fhash_codec.open(path) as volume:
-        assert isinstance(volume, fhash_codec.Volume)
-        selection, frames, _ = decoded(volume, steps=slice(1, 3))
-    assert selection.kind == values.dtype
-    np.testing.assert_array_equal(frames, values[1:3])
 
 
 def test_the_source_s_own_fill_value_counts_where_the_type_has_it(run: Path) -> None:
@@ -211,7 +140,7 @@ def test_the_source_s_own_fill_value_counts_where_the_type_has_it(run: Path) -> 
         for own, taken in ((-9, -9), (1e300, None), (0.5, None)):
             types = replace(volume.value_type, fill=own)
             with patch.object(volume, "value_type", types):
-                assert Selection.of(volume, **{**WHOLE, "dtype": "int16"}).fill == taken
+                assert Selection.of(volume, RegionOptions(dtype="int16")).fill == taken
 
 
 Fhash = Callable[..., Result]
@@ -261,57 +190,6 @@ def test_a_time_between_steps_is_the_volume_at_that_step(
     )
 
 
-def test_outside_background_leaves_no_nan(
-    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
-) -> None:
-    filled = saved(fhash, run, tmp_path / "out.npy", "--outside", "background")
-    assert np.isnan(whole).any()
-    assert not np.isnan(filled).any()
-    np.testing.assert_array_equal(filled[~np.isnan(whole)], whole[~np.isnan(whole)])
-
-
-def test_coordinates_and_attributes_travel_with_the_region(
-    fhash: Fhash, run: Path, tmp_path: Path
-) -> None:
-    assert (
-        fhash(
-            "decode",
-            run,
-            "-o",
-            tmp_path / "out.h5",
-            "--time",
-            "0.5",
-            "--time",
-            "2.5",
-            "--roi",
-            "1:3,:,2:5",
-        ).exit_code
-        == 0
-    )
-    with h5py.File(tmp_path / "out.h5") as file:
-        values = file["density"]
-        assert values.shape == (2, 2, 7, 3)
-        assert values.attrs["units"] == "kg m-3"
-        got = [values.dims[axis][0][...].tolist() for axis in range(4)]
-    assert got == [[0.5, 2.5], [0.5, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [8.0, 7.0, 6.0]]
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd", "out.vtkhdf"],
-)
-def test_every_format_is_written_and_named(
-    fhash: Fhash, run: Path, tmp_path: Path, name: str
-) -> None:
-    result = fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    paths = [Path(path) for path in json.loads(result.stdout)["paths"]]
-    assert paths
-    assert all(path.exists() for path in paths)
-    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3").exit_code == 2
-    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--force").exit_code == 0
-
-
 def test_statistics_are_those_of_the_region(
     fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
 ) -> None:
@@ -333,22 +211,6 @@ def test_statistics_are_those_of_the_region(
     )
     assert filled["inside_fraction"] == report["inside_fraction"]
     assert list(tmp_path.iterdir()) == []
-
-
-def test_statistics_of_nothing_have_no_numbers(fhash: Fhash, run: Path) -> None:
-    result = fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:", "--json")
-    report = json.loads(result.stdout)
-    assert (report["min"], report["mean"], report["inside_fraction"]) == (None, None, 0.0)
-    assert "smallest        -\n" in fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:").stdout
-
-
-def test_dtype_rounds_to_integers(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    exact = saved(fhash, run, tmp_path / "exact.npy", "--outside", "background")
-    rounded = saved(
-        fhash, run, tmp_path / "rounded.npy", "--outside", "background", "--dtype", "uint8"
-    )
-    assert rounded.dtype == np.uint8
-    np.testing.assert_array_equal(rounded, np.rint(exact))
 
 
 @pytest.mark.parametrize("name", [name for name in TYPES if "int" in name])
@@ -554,31 +416,6 @@ def test_a_part_comes_back_as_that_part_of_the_source(
         assert found["time"].attrs["units"] == "hours since 2001-01-01"
         assert "month" not in found.variables
         assert "height" in found.coords
-
-
-@pytest.mark.parametrize(("dtype", "reads"), [("f8", 1), ("i8", 2)])
-def test_only_integers_of_64_bits_are_decoded_twice(
-    fhash: Fhash,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    dtype: str,
-    reads: int,
-) -> None:
-    """Statistics are of floats, which have not every such integer."""
-    path = tmp_path / "run.fhz"
-    values = (np.arange(2 * 4 * 5 * 6).reshape(2, 4, 5, 6) ** 2 + 2**60).astype(dtype)
-    fhash_codec.encode(values, path)
-    decoded = []
-    read = CompactModel.read_steps
-
-    def counted(model: CompactModel, *arguments: object) -> object:
-        decoded.append(model)
-        return read(model, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(CompactModel, "read_steps", counted)
-    got = saved(fhash, path, tmp_path / "out.npy")
-    assert got.dtype == values.dtype
-    assert len(decoded) == reads
 
 
 def test_figures_and_files_of_integers_far_from_zero_are_exact(

@@ -18,21 +18,15 @@ from click.testing import Result
 from PIL import Image
 
 import fhash_codec
-from fhash_cli import gallery
-from fhash_cli.gallery import commands, page
-from fhash_cli.simulating import (
+from fhash_cli.commands.demo import (
     SceneOptions,
     ShapeType,
-    describe,
-    is_data_file,
-    refuse_scene_options,
-    simulation_rows,
 )
-from fhash_codec.gallery import PICTURES
+from fhash_codec import gallery
+from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
 from fhash_codec.simulation.simulate import Simulation, simulate
 from fhash_formats import open_series
-from fhash_formats.errors import InputError
 
 Fhash = Callable[..., Result]
 SMALL = ("--shape", "6,7,8", "--steps", "3", "-q")
@@ -73,14 +67,6 @@ def test_other_shapes_are_refused(text: str) -> None:
         ShapeType().convert(text, None, None)
 
 
-def test_options_change_the_scene() -> None:
-    assert options().open().shape == (16, 32, 48, 48)
-    named = {"z": 4, "y": 5, "x": 6, "t": 7}
-    assert options(shape=named).open().shape == (7, 4, 5, 6)
-    assert options(steps=1, seed=9).open().seed == 9
-    assert options(scene="flame", paper_shape=True).open().shape == (136, 54, 172, 200)
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -91,12 +77,6 @@ def test_options_change_the_scene() -> None:
 def test_options_that_exclude_each_other_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(click.UsageError, match="exclude"):
         options(**settings).open()
-
-
-def test_names_of_files_and_folders() -> None:
-    assert all(is_data_file(Path(f"a/run.{suffix}")) for suffix in (*SUFFIXES, "NC4", "hdf5"))
-    assert not any(is_data_file(Path(name)) for name in ("demo", "a.b/demo", "run.fhz"))
-    assert options(scene="a/wake.v2.toml").name == "wake.v2"
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -137,16 +117,6 @@ def test_a_file_of_a_scene_is_simulated_and_never_replaced(
     scene.write_text('{"effects": [{"effect": "blub"}]}')
     message = refused(2, "demo", "--scene", scene, "-o", tmp_path / "other.npy")
     assert message.startswith(f"{scene}: effect 1 is 'blub'; did you mean 'blob'")
-
-
-def test_an_output_that_exists_is_kept_without_force(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    path = tmp_path / "run.npy"
-    path.write_text("mine")
-    assert "--force" in refused(2, "demo", *SMALL, "-o", path)
-    assert fhash("demo", *SMALL, "-o", path, "--force").exit_code == 0
-    assert np.load(path).shape == (3, 6, 7, 8)
 
 
 def test_a_full_disk_is_refused_before_any_work(
@@ -192,28 +162,6 @@ def test_one_frame_is_read_before_the_next_is_computed(
     )
     assert fhash("demo", *SMALL, "-o", tmp_path / "run.npy").exit_code == 0
     assert steps == [0, 1, 2]
-
-
-def test_a_line_says_what_is_simulated_and_how_large_it_is() -> None:
-    chosen = options(scene="shell", paper_shape=True)
-    text = describe(chosen, chosen.open())
-    assert text.startswith("simulating 'shell', a shell of a supernova")
-    assert text.endswith("136 x 216 x 216 x 216 values, 5.48 GB")
-
-
-def test_rows_explain_only_where_asked() -> None:
-    simulation = simulate("front", (2, 4, 4, 4))
-    simulation.read(1)
-    assert len(simulation_rows(simulation, 1.0, False)) == 1
-    rows = [(name.strip(), text) for name, text in simulation_rows(simulation, 1.0, True)]
-    assert ("shell", "125 places") in rows
-    assert any(name == "0 places" and "vortex" in text for name, text in rows)
-
-
-def test_scene_options_are_refused_where_none_is_simulated() -> None:
-    refuse_scene_options(options(), "--gallery")
-    with pytest.raises(InputError, match="--paper-shape is for a scene; leave it out"):
-        refuse_scene_options(options(paper_shape=True), "--gallery")
 
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "gallery.md"
@@ -292,33 +240,6 @@ def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, sce
     assert "explain" not in report
 
 
-@pytest.mark.usefixtures("small")
-def test_demo_keeps_files_that_exist_and_explains_where_asked(fhash: Fhash, tmp_path: Path) -> None:
-    words = ("demo", "--shape", "5,6,7", "--steps", "2", "-o", tmp_path / "demo", "-q")
-    first = fhash(*words)
-    assert first.stdout.startswith("data")
-    assert "never made" not in first.stdout
-    assert fhash(*words).exit_code == 2
-    again = fhash(*words, "--force", "--explain")
-    assert "never made, cost nothing" in again.stdout
-
-
-@pytest.mark.usefixtures("small")
-def test_a_file_of_a_scene_gives_the_files_their_name(fhash: Fhash, tmp_path: Path) -> None:
-    scene = tmp_path / "wake.toml"
-    scene.write_text('feature = "interval:0.5:2"\n[[effects]]\neffect = "blob"\n')
-    result = fhash(
-        "demo", "--scene", scene, *SMALL_DEMO, "-o", tmp_path, "-q", "--json", "--explain"
-    )
-    assert result.exit_code == 0, result.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        f"wake.{suffix}" for suffix in ("fhz", "h5", "png", "toml")
-    ]
-    report = json.loads(result.stdout)
-    assert report["settings"] == "--feature interval:0.5:2"
-    assert ["1 blob", "computed: adds its value inside its surface"] in report["explain"]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -347,16 +268,3 @@ def test_a_scene_with_a_wrong_feature_is_refused_before_it_is_simulated(
     scene = tmp_path / "s.toml"
     scene.write_text('feature = "intervall:1:2"\n[[effects]]\neffect = "blob"\n')
     assert "intervall" in refused(2, "demo", "--scene", scene, "-o", tmp_path / "demo")
-
-
-def test_demo_in_a_folder_that_cannot_be_is_refused(
-    refused: Callable[..., str], tmp_path: Path
-) -> None:
-    assert "No such file or directory" in refused(2, "demo", "-o", tmp_path / "no" / "demo")
-    (tmp_path / "file").write_text("")
-    refused(2, "demo", "-o", tmp_path / "file")
-
-
-def test_outputs_that_are_one_file_are_refused(refused: Callable[..., str], tmp_path: Path) -> None:
-    (tmp_path / "vortex.png").symlink_to(tmp_path / "vortex.h5")
-    assert "is the input itself" in refused(2, "demo", "-o", tmp_path, "--force")

@@ -44,15 +44,6 @@ def test_json_is_one_object_with_the_figures_of_the_file(
     assert [set(point) for point in report["curve"]] == [{"seconds", "epoch", "psnr"}] * 2
 
 
-def test_table_says_what_was_written(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    result = fhash("encode", data, "-o", tmp_path / "run.fhz", *SMALL)
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert str(tmp_path / "run.fhz") in result.stdout
-    assert "3 x 6 x 7 x 8" in result.stdout
-    assert "than the source on disk" in result.stdout
-    assert "100.000% of the domain, in z 0:6, y 0:7, x 0:8" in result.stdout
-
-
 def test_coded_tables_are_reported_with_their_loss(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -71,14 +62,6 @@ def test_coded_tables_are_reported_with_their_loss(
     assert model["tables_loss_db"] <= 0.1001
     assert fhash("verify", tmp_path / "coded").exit_code == 0
     assert fhash("diff", data, tmp_path / "coded", "--json").exit_code == 0
-
-
-def test_same_command_gives_the_same_bytes_without_timings(
-    fhash: Fhash, data: Path, tmp_path: Path
-) -> None:
-    for name in ("a", "b"):
-        assert fhash("encode", data, "-o", tmp_path / name, "--no-timings", *SMALL).exit_code == 0
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
@@ -104,15 +87,6 @@ def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
             values[1].min(),
             values[3].max(),
         )
-
-
-def test_force_replaces(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    output = tmp_path / "run.fhz"
-    output.write_bytes(b"old")
-    assert fhash("encode", data, "-o", output, *SMALL).exit_code == 2
-    assert output.read_bytes() == b"old"
-    assert fhash("encode", data, "-o", output, "--force", *SMALL).exit_code == 0
-    assert output.read_bytes() != b"old"
 
 
 def test_what_each_stage_bought_is_in_the_table_and_in_json(
@@ -174,10 +148,6 @@ def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
         assert report["psnr"] < 300
     else:
         assert str(output) in result.stdout
-
-
-def test_kept_promise_exits_with_0(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    assert fhash("encode", data, "-o", tmp_path / "run.fhz", "--psnr", "1", *SMALL).exit_code == 0
 
 
 @pytest.mark.filterwarnings("default")
@@ -270,12 +240,6 @@ def test_ctrl_c_after_the_file_was_written_says_so(
     assert fhash("verify", output).exit_code == 0
 
 
-def test_the_help_says_what_ctrl_c_leaves(fhash: Fhash) -> None:
-    text = " ".join(fhash("encode", "--help").stdout.split())
-    assert "Ctrl-C leaves no file" in text
-    assert "with the profile compact the same command starts again" in text
-
-
 def test_explain_says_what_took_the_time_and_what_was_left_out(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -293,12 +257,6 @@ def test_explain_says_what_took_the_time_and_what_was_left_out(
     assert report["quality"]["ssim_window"]["steps"] == []
 
 
-def test_a_stage_of_no_name_is_refused(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--without", "hed")
-    assert result.exit_code == 2
-    assert "without names 'hed'; did you mean 'head'?" in result.stderr
-
-
 def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -313,12 +271,3 @@ def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
     encoder = json.loads(fhash("info", run, "--json").stdout)["encoder"]
     assert set(encoder["predicted"]) == {"seconds", "bytes", "psnr"}
     assert encoder["took_seconds"] > 0
-
-
-def test_without_timings_a_budget_changes_no_byte(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    runs = [tmp_path / "a.fhz", tmp_path / "b.fhz"]
-    for run, words in zip(runs, (["--time-budget", "10m"], []), strict=True):
-        more = ["--effort", "2", "--no-timings", "-q"]
-        assert fhash("encode", data, "-o", run, *words, *more).exit_code == 0
-    assert runs[0].read_bytes() == runs[1].read_bytes()
-    assert "predicted" not in fhash("info", runs[0]).stdout

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.info import MAX_TEXT, details, details_rows, listing, positions, tiling_text
-from fhash_formats.series import ArraySeries, Coordinate
+from fhash_cli.commands.info import listing, tiling_text
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
@@ -61,43 +60,6 @@ def test_the_card_names_every_part_with_its_place(
     assert full.count("\n  layer ") == len(card["mlp"])
     assert "\n  learning_rate  " in full
     assert "\n  level " not in short
-
-
-def test_bytes_of_the_parts_are_those_of_the_arrays(fhash: Callable[..., Result]) -> None:
-    info = json.loads(fhash("info", GOLDEN / "paper-transform.fhz", "--json").stdout)
-    card, arrays = info["card"], info["arrays"]
-    parts = [*card["tables"], *card["mlp"], card["occupancy"]]
-    stored = sum(
-        array["bytes"]
-        for name, array in arrays.items()
-        if name.startswith(("parts/0.tables.", "parts/0.mlp.", "parts/0.occupancy."))
-    )
-    assert sum(part["bytes"] for part in parts) == stored
-    assert 0 < card["config"]["bytes"] < info["bytes"]
-
-
-def test_details_hold_what_json_can() -> None:
-    times = Coordinate(
-        name="time", values=np.array([0.0, 1.0]), attributes={"units": "days since 2001-01-01"}
-    )
-    series = ArraySeries(np.zeros((2, 3, 4, 5), "i2"), name="u", coords={"t": times}, missing=[-9])
-    series.attributes = {"note": "word " * 100, "valid": np.array([1, 2]), "odd": object()}
-    found = details(series)
-    assert (found["shape"], found["dtype"], found["fill"]) == ([2, 3, 4, 5], "int16", -9)
-    assert found["coordinates"][0]["dates"] == ["2001-01-01", "2001-01-02"]
-    assert found["coordinates"][1]["dates"] == []
-    assert found["attributes"]["valid"] == [1, 2]
-    rows = dict(details_rows(series))
-    assert rows["t, z, y, x"] == "2 x 3 x 4 x 5"
-    assert rows["note"].endswith("...")
-    assert len(rows["note"]) == MAX_TEXT + 3
-    assert "odd" not in rows
-
-
-def test_positions_of_times_are_dates_where_they_are() -> None:
-    time = Coordinate(name="t", values=np.array([0.5, 2.0]), attributes={"units": "s"})
-    assert positions(time, "t") == "t 0.5 to 2 s"
-    assert positions(time, "x") == "t 0.5 to 2 s"
 
 
 def test_several_variables_go_into_one_file_unless_one_can_be_read_in_two_ways() -> None:
@@ -177,13 +139,6 @@ def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: 
     )
 
 
-def test_info_as_json_is_one_object(fhash: Fhash, run: Path) -> None:
-    info = json.loads(fhash("info", run, "--json").stdout)
-    assert info["domain"]["shape"] == [3, 6, 7, 8]
-    assert info["bytes"] == run.stat().st_size
-    assert info["quality"]["rmse"] > 0
-
-
 @pytest.mark.parametrize("command", ["info", "verify", "decode"])
 @pytest.mark.parametrize("kept", [0, 1, 30, 1000, -1])
 def test_a_cut_file_is_found(
@@ -226,14 +181,6 @@ def test_info_of_data_lists_variables_and_their_commands(
     assert shapes == [[3, 4, 5, 6], [16, 12, 12, 3], [1, 16, 12, 12]]
 
 
-def test_info_of_data_repeats_what_the_user_said(fhash: Fhash, tmp_path: Path) -> None:
-    (tmp_path / "a.bin").write_bytes(bytes(4 * 5 * 6 * 2))
-    said = ["--shape", "x=4,y=5,z=6", "--dtype", "u2", "--missing", "-9", "--missing", "1e20"]
-    listed = json.loads(fhash("info", tmp_path / "a.bin", *said, "--json").stdout)
-    words = shlex.split(listed["variables"][0]["commands"][0])
-    assert words[-8:] == [*said[:-1], "1e+20"]
-
-
 def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["line"] = np.ones(4)
@@ -251,12 +198,6 @@ def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) 
         " stored\n"
         "\nbelow 3 dimensions: line (4,)\n"
     )
-
-
-def test_info_of_no_data_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
-    assert "does not exist" in refused(2, "info", tmp_path / "missing.h5")
-    (tmp_path / "a.txt").write_text("words")
-    assert "no format that can be read" in refused(2, "info", tmp_path / "a.txt")
 
 
 def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:

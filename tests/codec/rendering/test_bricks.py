@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from frame_field import frame_of, table_of
+from frame_field import task_of as plain_task
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fhash_codec import native
@@ -13,67 +13,23 @@ from fhash_codec.rendering.bricks import (
     FARTHEST,
     SIDE,
     Bricks,
-    Palette,
     cells_of,
     limits_of,
     smoothed,
 )
-from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid
-from fhash_codec.rendering.light import DEVIATIONS
-from fhash_codec.rendering.march_task import Frame, Surface, Table, Task
-from fhash_codec.rendering.scenes import Camera
-
-ENTRIES = np.array([0.0, 0.0, 2.0, 0.0, 0.0])
-TABLE = Table(
-    low=1.0,
-    high=3.0,
-    colours=np.random.default_rng(1).uniform(size=(5, 3)).astype(np.float32),
-    extinctions=ENTRIES,
-)
-
-
-def test_values_are_interpolated_between_the_entries_and_clamped_to_them() -> None:
-    palette, values = Palette.of(TABLE), np.linspace(0, 4, 33)
-    places = np.linspace(1, 3, 5)
-    np.testing.assert_allclose(palette.extinction(values), np.interp(values, places, ENTRIES))
-    for channel in range(3):
-        np.testing.assert_allclose(
-            palette.colour(values)[:, channel],
-            np.interp(values, places, TABLE.colours[:, channel]),
-        )
-
-
-def test_an_interval_is_visible_if_a_value_in_it_has_an_extinction() -> None:
-    visible = Palette.of(TABLE).visible
-    low = np.array([1.6, 1.0, 2.5, 1.0, 0.0, 2.4, np.nan, 2.2])
-    high = np.array([1.7, 1.5, 9.0, 3.0, 0.9, 2.6, 2.0, 1.8])
-    assert visible(low, high).tolist() == [True, False, False, True, False, True, False, False]
+from fhash_codec.rendering.march_task import Surface
 
 
 def bricks_of(values):
-    return Bricks.of(Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0)))
+    return Bricks.of(frame_of(values))
 
 
 def task_of(shape, extinctions, surfaces=()):
-    table = Table(
-        low=0.0,
-        high=1.0,
-        colours=np.ones((len(extinctions), 3), dtype=np.float32),
-        extinctions=np.array(extinctions),
-    )
-    grid = Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3))
-    return Task(
-        rays=Rays.of(Camera(), grid, (4, 4)),
-        step=0.5,
-        threshold=0.0,
-        table=table,
-        surfaces=surfaces,
-    )
+    return plain_task(shape, table_of(extinctions), surfaces=surfaces)
 
 
 @pytest.mark.parametrize("shape", [(20, 17, 33), (9, 8, 10), (1, 30, 2), (1, 1, 1), (70, 70, 70)])
-def test_a_brick_has_the_extremes_of_its_vertices(way, shape) -> None:
+def test_a_brick_has_the_extremes_of_its_vertices(shape) -> None:
     values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
     values[values > 1.5] = np.nan
     bricks = bricks_of(values)
@@ -88,7 +44,7 @@ def test_a_brick_has_the_extremes_of_its_vertices(way, shape) -> None:
     )
 
 
-def test_what_is_infinite_has_no_value(way) -> None:
+def test_what_is_infinite_has_no_value() -> None:
     values = np.zeros((10, 10, 10))
     values[1, 1, 1], values[2, 2, 2] = np.inf, -np.inf
     bricks = bricks_of(values)
@@ -98,7 +54,7 @@ def test_what_is_infinite_has_no_value(way) -> None:
     assert bricks_of(np.full((3, 3, 3), np.nan)).value_range == (0.0, 0.0)
 
 
-def test_bricks_matter_where_something_can_be_seen(way) -> None:
+def test_bricks_matter_where_something_can_be_seen() -> None:
     values = np.zeros((33, 33, 33))
     values[22, 2, 10] = 1.0
     values[2, 26, 26] = 0.4
@@ -111,17 +67,7 @@ def test_bricks_matter_where_something_can_be_seen(way) -> None:
     assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
 
 
-def test_a_table_of_denormal_width_is_one() -> None:
-    values = np.zeros((6, 6, 6), dtype=np.float32)
-    values[1, 1, 1] = 1.0
-    colours = np.ones((4097, 3), dtype=np.float32)
-    task = task_of(values.shape, [0.0, 1.0])
-    for extinctions, expected in ((np.ones(4097), True), (np.zeros(4097), False)):
-        table = Table(low=0.0, high=5e-324, colours=colours, extinctions=extinctions)
-        assert np.all(bricks_of(values).matters(replace(task, table=table)) == expected)
-
-
-def test_the_distance_is_that_to_the_nearest_brick_that_matters(way) -> None:
+def test_the_distance_is_that_to_the_nearest_brick_that_matters() -> None:
     values = np.zeros((60, 50, 90))
     for z, y, x in ((4, 4, 4), (50, 20, 60), (33, 44, 85)):
         values[z, y, x] = 1.0
@@ -135,23 +81,6 @@ def test_the_distance_is_that_to_the_nearest_brick_that_matters(way) -> None:
 
 def values(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random(shape, dtype=np.float32)
-
-
-@pytest.mark.parametrize("deviation", DEVIATIONS)
-def test_linear_values_stay_up_to_the_faces(deviation: float) -> None:
-    z, y, x = np.mgrid[:9, :8, :17].astype(np.float32)
-    linear = np.ascontiguousarray(z - 2 * y + 0.5 * x)
-    np.testing.assert_allclose(smoothed(linear, deviation), linear, atol=1e-5)
-
-
-def test_noise_falls_and_missing_values_stay_missing() -> None:
-    noise = values((24, 24, 24))
-    noise[3:5, 7, 9] = np.nan
-    found = smoothed(noise, 2.0)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(noise))
-    inner = (slice(6, -6),) * 3
-    assert np.nanstd(np.diff(found[inner], axis=0)) < 0.05 * np.nanstd(np.diff(noise, axis=0))
-    assert np.nanmean(found) == pytest.approx(float(np.nanmean(noise)), abs=0.02)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.01, 0.2])
@@ -179,32 +108,6 @@ def test_errors_cancel_and_what_is_larger_than_they_are_stays() -> None:
     assert (free[..., 8] - free[..., 7]).max() < 0.5
 
 
-def test_values_near_the_largest_float_stay_finite() -> None:
-    given = np.float32(3.2e38) * values((9, 10, 24), 3)
-    found = smoothed(given, 1.3)
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(
-        found / np.float32(1e38), smoothed(given / np.float32(1e38), 1.3), rtol=1e-5
-    )
-
-
-def task_of_cells(shape, extinctions, surfaces=(), low=0.0, high=1.0):
-    table = Table(
-        low=low,
-        high=high,
-        colours=np.ones((len(extinctions), 3), dtype=np.float32),
-        extinctions=np.array(extinctions),
-    )
-    grid = Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3))
-    return Task(
-        rays=Rays.of(Camera(), grid, (4, 4)),
-        step=0.5,
-        threshold=0.0,
-        table=table,
-        surfaces=surfaces,
-    )
-
-
 def noise(shape, share_missing=0.0):
     rng = np.random.default_rng(sum(shape))
     values = rng.uniform(0, 0.4, shape).astype(np.float32)
@@ -218,18 +121,18 @@ def test_limits_lie_around_what_is_seen() -> None:
     bricks = bricks_of(values)
     steps = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 3.0]
     np.testing.assert_allclose(
-        limits_of(bricks, task_of_cells(values.shape, steps)), [[0.125, 0.375], [0.75, np.inf]]
+        limits_of(bricks, task_of(values.shape, steps)), [[0.125, 0.375], [0.75, np.inf]]
     )
     # What touches is one.
     np.testing.assert_allclose(
-        limits_of(bricks, task_of_cells(values.shape, [1.0, 0.0, 1.0, 0.0, 0.0])), [[-np.inf, 0.75]]
+        limits_of(bricks, task_of(values.shape, [1.0, 0.0, 1.0, 0.0, 0.0])), [[-np.inf, 0.75]]
     )
     surface = Surface(value=0.6, colour=np.ones(3), opacity=1.0)
-    found = limits_of(bricks, task_of_cells(values.shape, [0.0, 0.0], (surface,)))
+    found = limits_of(bricks, task_of(values.shape, [0.0, 0.0], (surface,)))
     assert found.shape == (1, 2)
     assert found[0, 0] < 0.6 < found[0, 1]
     assert found[0, 1] - found[0, 0] < 1e-5
-    assert limits_of(bricks, task_of_cells(values.shape, [0.0, 0.0])).shape == (0, 2)
+    assert limits_of(bricks, task_of(values.shape, [0.0, 0.0])).shape == (0, 2)
 
 
 @pytest.mark.parametrize("shape", [(9, 9, 9), (17, 20, 23), (1, 22, 30), (6, 1, 40), (2, 2, 2)])
@@ -250,7 +153,7 @@ def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing
             ),
         ),
     ):
-        task = task_of_cells(shape, extinctions, surfaces)
+        task = task_of(shape, extinctions, surfaces)
         cells = cells_of(library, bricks, task, bricks.distance(task))
         limits = limits_of(bricks, task)
         padded = np.pad(values, [(0, int(size == 1)) for size in shape], mode="edge")
@@ -281,5 +184,5 @@ def test_where_most_cells_are_seen_they_are_not_looked_for() -> None:
     values = noise((17, 17, 17))
     bricks = bricks_of(values)
     for extinctions in ([1.0, 1.0], [0.0, 0.0], [0.0, 1.0] * 20 + [0.0, 0.0, 1.0] * 20):
-        task = task_of_cells(values.shape, extinctions)
+        task = task_of(values.shape, extinctions)
         assert cells_of(library, bricks, task, bricks.distance(task)) is None

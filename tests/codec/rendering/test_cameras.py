@@ -16,7 +16,6 @@ from fhash_codec.rendering.cameras import (
     Rays,
     from_matrix,
     pchip,
-    spline,
     to_matrix,
 )
 from fhash_codec.rendering.grid import Grid
@@ -42,15 +41,6 @@ UNEVEN = grid(x=np.linspace(100, 103, 7), y=np.linspace(5, -5, 21), z=[0.0, 0.5]
 def physical(rays: Rays, u: float, w: float) -> tuple[np.ndarray, np.ndarray]:
     origin, direction = rays.rays(u, w)
     return rays.grid.origin + origin * rays.grid.spacing, direction * rays.grid.spacing
-
-
-def test_where_the_vertices_are() -> None:
-    assert UNEVEN.counts == (7, 21, 2)
-    np.testing.assert_allclose(UNEVEN.spacing, [0.5, -0.5, 0.5])
-    np.testing.assert_allclose(UNEVEN.origin, [100, 5, 0])
-    np.testing.assert_array_equal(UNEVEN.bounds, [[0, 6], [0, 20], [0, 1]])
-    np.testing.assert_allclose(UNEVEN.corners, [[100, 103], [5, -5], [0, 0.5]])
-    assert UNEVEN.vertex_spacing == pytest.approx(0.5)
 
 
 def test_an_axis_of_one_vertex_is_as_thick_as_the_others_mean() -> None:
@@ -91,15 +81,6 @@ def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() ->
     given = in_units("m", scale=(1, 2, 0.01))
     np.testing.assert_allclose(given.spacing, [0.25, -1.5, 1.0])
     assert given.scale == (1, 2, 0.01)
-
-
-def test_a_stretched_grid_keeps_its_corners_apart_by_the_factors() -> None:
-    axes = {axis: Coordinate(name=axis, values=np.linspace(3, 5, 6)) for axis in "xyz"}
-    np.testing.assert_allclose(
-        Grid.of(axes, (1, 2, 3)).corners, Grid.of(axes).corners * np.array([[1], [2], [3]])
-    )
-    flat = axes | {"z": Coordinate(name="z", values=np.array([4.0]))}
-    np.testing.assert_allclose(Grid.of(flat, (1, 3, 7)).spacing, [0.4, 1.2, 0.8])
 
 
 def test_coordinates_that_are_no_places_are_told() -> None:
@@ -290,33 +271,6 @@ def test_a_matrix_comes_back_from_its_quaternion(
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(matrix @ axis, axis, atol=1e-12)
     np.testing.assert_allclose(to_matrix(from_matrix(matrix)), matrix, atol=1e-12)
-
-
-def test_a_matrix_turns_vectors_anticlockwise() -> None:
-    np.testing.assert_allclose(to_matrix(turn((0, 0, 1), 90)) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
-
-
-def test_two_rotations_are_joined_by_the_shorter_turn_at_one_speed() -> None:
-    at, axis = np.array([0.0, 2.0]), (0.0, 0.6, 0.8)
-    for sign in (1, -1):  # both quaternions of one rotation
-        rotations = np.array([turn(axis, 20), sign * turn(axis, 80)])
-        for share, degrees in ((0.0, 20), (0.5, 35), (1.0, 50), (2.0, 80)):
-            np.testing.assert_allclose(
-                to_matrix(spline(at, rotations, share)), to_matrix(turn(axis, degrees)), atol=1e-12
-            )
-
-
-def test_a_curve_passes_through_its_rotations_and_stays_of_unit_length() -> None:
-    at = np.array([0.0, 0.3, 0.5, 1.0])
-    rotations = np.array(
-        [turn((1, 0, 0), 10), turn((0, 1, 0), 80), turn((0, 0, 1), 170), turn((0.6, 0, 0.8), 60)]
-    )
-    for share, rotation in zip(at, rotations, strict=True):
-        np.testing.assert_allclose(
-            to_matrix(spline(at, rotations, share)), to_matrix(rotation), atol=1e-9
-        )
-    lengths = [np.linalg.norm(spline(at, rotations, share)) for share in np.linspace(0, 1, 41)]
-    np.testing.assert_allclose(lengths, 1.0, rtol=1e-9)
 
 
 def eye(camera: Camera, grid: Grid) -> np.ndarray:

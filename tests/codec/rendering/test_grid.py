@@ -10,7 +10,7 @@ import pytest
 
 from fhash_codec.rendering import grid as module
 from fhash_codec.rendering.cameras import view_of
-from fhash_codec.rendering.grid import LINE, Axis, Grid, Warp, downward, drawn_counts, proportions
+from fhash_codec.rendering.grid import Axis, Grid, downward, drawn_counts
 from fhash_formats.series import Coordinate
 
 
@@ -87,17 +87,6 @@ def test_what_ascends_downwards(attributes: dict[str, str], down: bool) -> None:
     assert downward(coordinate([0, 1], **attributes)) is down
 
 
-def test_degrees_of_both_kinds_are_the_same_units() -> None:
-    coords = [coordinate([0, 1], units=units) for units in ("degrees_east", "degrees_north", "m")]
-    np.testing.assert_allclose(proportions(coords, np.array([3.0, 1.0, 100.0])), [1, 1, 0.02])
-
-
-def test_a_warp_leads_to_the_series() -> None:
-    warp = Warp(counts=(3, 3, 2), places=(np.array([0, 0.5, 1, 2.0]), None, None))
-    np.testing.assert_allclose(warp.to_series(0, [0.5, 2.5]), [0.25, 1.5])
-    np.testing.assert_allclose(warp.to_series(1, [0.5, 1.5]), [0.5, 1.5])
-
-
 def grid(scale: tuple[float, float, float] | None = None, **axes: Any) -> Grid:
     values = {"x": range(11), "y": range(11), "z": range(11), **axes}
     given = {
@@ -127,13 +116,6 @@ def test_an_uneven_axis_keeps_its_ends_and_needs_no_warning() -> None:
     assert grid().series_spacing == grid().vertex_spacing
 
 
-def test_depths_go_downwards_with_any_stretch() -> None:
-    depth = Coordinate(name="depth", values=np.linspace(0, 40, 11), attributes={"positive": "down"})
-    np.testing.assert_allclose(grid(z=depth).corners[2], [0, -40])
-    np.testing.assert_allclose(grid(z=depth, scale=(1, 1, 2)).corners[2], [0, -80])
-    assert grid(z=depth).scale == (1, 1, -1)
-
-
 def test_planes_lines_and_a_point_are_seen_from_above() -> None:
     one = [3.0]
     for axes, flat, view in (
@@ -150,14 +132,6 @@ def test_planes_lines_and_a_point_are_seen_from_above() -> None:
         assert made.flat is flat
         assert view_of("auto", made) == view
         assert view_of("yx", made) == "yx"
-
-
-def test_a_line_is_thick_enough_to_be_seen() -> None:
-    one = [0.0]
-    for count in (17, 33, 34, 321):
-        line = grid(y=one, z=one, x=range(count))
-        thick = max(1.0, LINE * (count - 1))
-        np.testing.assert_allclose(line.corners[1:], [[-thick / 2, thick / 2]] * 2)
 
 
 def test_the_thinnest_axis_is_measured_in_vertex_spacings() -> None:

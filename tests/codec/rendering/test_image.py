@@ -1,4 +1,4 @@
-"""Images: pixels over a background, and files with their scene."""
+"""Pictures: files, and what pillow draws around the volume."""
 
 from __future__ import annotations
 
@@ -10,9 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image as Pictures
 
-from fhash_codec.rendering.image import Image
-from fhash_codec.rendering.scenes import Camera, Scene, scene_in_png
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.colours import named_map
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.image import DARK, LIGHT, Image, Pen, overlay, surrounded, time_text
+from fhash_codec.rendering.layout import Bar, Label, Layout, lay_out, strips
+from fhash_codec.rendering.scenes import Camera, Effects, LegendEntry, Scene
+from fhash_codec.rendering.view import edges
 from fhash_formats.errors import InputError, OutputExistsError
+from fhash_formats.series import Coordinate
 
 SCENE = Scene(
     size=(3, 2), camera=Camera(view="xz", position=(1.5, 2.0, 3.25)), background="#204060", step=3.5
@@ -35,13 +41,6 @@ def test_pixels_over_a_background() -> None:
     assert image().to_uint8("white")[0, 0].tolist() == [255, 128, 128]
 
 
-def test_pixels_over_nothing_keep_their_colour() -> None:
-    pixels = image().to_uint8("transparent")
-    assert pixels[0, 0].tolist() == [255, 0, 0, 128]
-    assert pixels[0, 1].tolist() == [0, 0, 0, 0]
-    assert image(scene=Scene(background="transparent").to_dict()).to_uint8().shape == (2, 3, 4)
-
-
 @pytest.mark.parametrize("background", ["white", "transparent"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3.0, -1.0])
 def test_no_value_gives_a_pixel_that_is_none(background: str, value: float) -> None:
@@ -51,42 +50,6 @@ def test_no_value_gives_a_pixel_that_is_none(background: str, value: float) -> N
     if not np.isfinite(value):
         assert pixels[0, 0].tolist() == ([255] * 3 if background == "white" else [0] * 4)
     assert pixels[0, 1].tolist() == ([255] * 3 if background == "white" else [255, 255, 255, 64])
-
-
-def test_saved_pictures_hold_their_scene(tmp_path: Path) -> None:
-    path = tmp_path / "view.png"
-    assert image().save(path) == [path]
-    with Pictures.open(path) as found:
-        np.testing.assert_array_equal(np.asarray(found), image().to_uint8())
-        assert found.text["fhash.source"] == "run.fhz"
-    assert scene_in_png(path) == Scene.load(path) == SCENE
-    assert [each.name for each in tmp_path.iterdir()] == ["view.png"]
-
-
-def test_buffers_lie_beside_the_picture(tmp_path: Path) -> None:
-    depth = np.full((2, 3), np.inf, dtype=np.float32)
-    normal = np.ones((2, 3, 3), dtype=np.float32)
-    paths = image(depth=depth, normal=normal).save(tmp_path / "view.png")
-    assert [path.name for path in paths] == ["view.depth.npy", "view.normal.npy", "view.png"]
-    np.testing.assert_array_equal(np.load(paths[0]), depth)
-    np.testing.assert_array_equal(np.load(paths[1]), normal)
-    assert [path.name for path in image(normal=normal).outputs(Path("a.png"))] == [
-        "a.normal.npy",
-        "a.png",
-    ]
-
-
-@pytest.mark.parametrize("existing", ["view.png", "view.depth.npy"])
-def test_an_older_picture_stays_unless_forced(tmp_path: Path, existing: str) -> None:
-    (tmp_path / existing).write_text("old")
-    new = image(depth=np.zeros((2, 3), dtype=np.float32))
-    with pytest.raises(OutputExistsError, match=existing):
-        new.save(tmp_path / "view.png")
-    assert [path.name for path in tmp_path.iterdir()] == [existing]
-    new.save(tmp_path / "view.png", force=True)
-    assert scene_in_png(tmp_path / "view.png") == SCENE
-    with pytest.raises(InputError, match=r"written as \.png"):
-        new.save(tmp_path / "view.gif")
 
 
 def test_a_notebook_shows_the_picture() -> None:
@@ -117,3 +80,170 @@ def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="JPEG cannot be transparent"):
         clear.save(tmp_path / "view.jpg")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("background", "dark"),
+    [("white", True), ("transparent", True), ("#102030", False), ("yellow", True), ("blue", False)],
+)
+def test_the_ink_is_told_apart_from_the_background(background: str, dark: bool) -> None:
+    pen = Pen(64, 64, background)
+    np.testing.assert_array_equal(pen.ink, DARK if dark else LIGHT)
+    np.testing.assert_array_equal(pen.halo, LIGHT if dark else DARK)
+
+
+def test_a_label_is_written_where_it_says() -> None:
+    for upright in (False, True):
+        label = Label(
+            lines=("temperature", "[degree]"), centre=(60.0, 48.0), size=12, upright=upright
+        )
+        pen = Pen(128, 96, "white")
+        pen.write(label)
+        (_, halo), (_, letters) = pen.written()
+        rows, columns = np.nonzero(halo)
+        left, top, right, bottom = label.box
+        assert left - 1 <= columns.min() < columns.max() <= right + 1
+        assert top - 1 <= rows.min() < rows.max() <= bottom + 1
+        assert bool(np.ptp(rows) > np.ptp(columns)) is upright
+        assert 0 < letters.sum() < halo.sum()
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 9])
+def test_a_colour_bar_is_cut_at_the_edges_of_a_tiny_picture(side: int) -> None:
+    bar = Bar(box=(1, 2, 10, 18), marks=(), title=(), size=8)
+    part = Pen(side, side, "white").colour_bar(bar, named_map("viridis"))
+    whole = Pen(20, 20, "white").colour_bar(bar, named_map("viridis"))
+    for layer, of_whole in zip(part, whole, strict=True):
+        np.testing.assert_array_equal(layer, of_whole[:side, :side])
+
+
+def test_a_colour_bar_and_a_legend_are_drawn_in_their_colours() -> None:
+    colours = named_map("viridis").rescaled(0, 2)
+    entry = LegendEntry(text="fast", colour="#ff0000")
+    layout = strips((160, 120), Effects(colour_bar=True, legend=(entry,)), colours, "u [m/s]")
+    assert layout.bar is not None
+    assert layout.legend is not None
+    pen = Pen(160, 120, "white")
+    drawn, opacity = pen.colour_bar(layout.bar, colours)
+    left, top, right, bottom = layout.bar.box
+    middle = (left + right) // 2
+    np.testing.assert_allclose(drawn[top, middle], colours(2.0), atol=0.05)
+    np.testing.assert_allclose(drawn[bottom - 1, middle], colours(0.0), atol=0.05)
+    assert opacity[:, : left - 2].max() == 0
+    squares, opacity = pen.legend(layout.legend)
+    at, row, _ = layout.legend.entries[0]
+    np.testing.assert_allclose(squares[int(row) + 3, int(at) + 3], [1, 0, 0])
+
+
+COORDS = {
+    axis: Coordinate(name=axis, values=np.linspace(0, extent, 11), attributes={"units": "km"})
+    for axis, extent in zip("xyz", (4, 3, 2), strict=True)
+}
+
+
+GRID = Grid.of(COORDS)
+
+
+SIZES = [(256, 256), (300, 700), (1024, 512)]
+
+
+NAMES = ("box", "axes", "colour_bar", "time_label")
+
+
+def drawn(
+    effects: Effects,
+    size: tuple[int, int] = (256, 256),
+    background: str = "#ffffff",
+    fill: float = 0.0,
+    **camera: Any,
+) -> Image:
+    rgba = np.zeros((size[1], size[0], 4), dtype=np.float32)
+    scene = Scene(background=background, size=size, effects=effects, camera=Camera(**camera))
+    colours = named_map("plasma").rescaled(-3, 5)
+    layout, rays = lay_out(scene, GRID, COORDS, colours, "speed [m/s]")
+    left, top, width, height = layout.view
+    rgba[top : top + height, left : left + width, 3] = fill
+    image = Image(rgba=rgba, scene=scene.to_dict())
+    return overlay(image, effects, rays, layout, colours=colours, label="step 3   t = 1 s")
+
+
+def test_nothing_is_drawn_unless_asked_for() -> None:
+    image = Image(rgba=np.zeros((4, 4, 4), dtype=np.float32))
+    rays = Rays.of(Camera(), GRID, (4, 4))
+    layout = Layout(size=(4, 4), view=(0, 0, 4, 4))
+    assert overlay(image, Effects(), rays, layout, colours=named_map("grey")) is image
+    assert surrounded(image, Effects(box=True), colours=named_map("grey"), quantity="") is image
+
+
+@pytest.mark.parametrize("background", ["#ffffff", "#10121c", "transparent"])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_effect_is_seen_on_any_background(
+    name: str, size: tuple[int, int], background: str
+) -> None:
+    image = drawn(Effects(**{name: True}), size, background)
+    assert image.rgba.shape == (size[1], size[0], 4)
+    assert np.all((image.rgba >= 0) & (image.rgba <= 1 + 1e-6))
+    assert np.all(image.rgba[..., :3] <= image.rgba[..., 3:] + 1e-6)
+    paper = np.array(
+        [0, 0, 0] if background == "transparent" else list(bytes.fromhex(background[1:]))
+    )
+    drawn_on = np.abs(image.to_uint8()[..., :3].astype(int) - paper).max(axis=-1) > 100
+    if background == "transparent":
+        drawn_on = image.to_uint8()[..., 3] > 100
+    assert drawn_on.sum() > 100
+    assert drawn_on.mean() < 0.2
+
+
+def test_edges_at_the_back_are_hidden_by_an_opaque_volume_and_those_at_the_front_are_not() -> None:
+    clear, filled = (drawn(Effects(box=True), fill=fill).rgba for fill in (0.0, 1.0))
+    rays = Rays.of(Camera(), GRID, (256, 256))
+    back = [edge for edge in edges(rays) if edge.fronts == 0]
+    front = [edge for edge in edges(rays) if edge.fronts == 2]
+    outline = [edge for edge in edges(rays) if edge.fronts == 1]
+    assert (len(back), len(front), len(outline)) == (3, 3, 6)
+
+    def at(picture: np.ndarray, edge: Any) -> float:
+        x, y = edge.ends.mean(axis=0)
+        return float(picture[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2, :3].max())
+
+    for edge in back:
+        assert at(filled, edge) == 0
+        assert at(clear, edge) > 0
+    for edge in front + outline:
+        assert at(filled, edge) > 0
+
+
+def test_from_inside_the_volume_the_overlay_is_finite() -> None:
+    everything = Effects(box=True, axes=True, colour_bar=True, time_label=True)
+    inside = drawn(
+        everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
+    )
+    assert np.all(np.isfinite(inside.rgba))
+
+
+def test_panels_get_their_bar_and_legend_outside() -> None:
+    panels = Image(rgba=np.ones((90, 200, 4), dtype=np.float32))
+    effects = Effects(
+        colour_bar=True, legend=(LegendEntry(text="a long meaning of it", colour="red"),), box=True
+    )
+    whole = surrounded(panels, effects, colours=named_map("plasma"), quantity="speed [m/s]")
+    height, width = whole.rgba.shape[:2]
+    assert height > 90
+    assert width > 200
+    assert np.all(whole.rgba[:90, :200] == 1)
+    assert whole.rgba[:90, 200:, 3].max() == 1
+    assert whole.rgba[90:, :, 3].max() == 1
+
+
+def test_the_text_of_a_time() -> None:
+    def times(values: list[float], units: str) -> Coordinate:
+        return Coordinate(name="time", values=np.array(values), attributes={"units": units})
+
+    assert time_text(3, 0.25, times([0, 0.25], "s")) == "step 3   t = 0.25 s"
+    assert time_text(3.5, 1e-9, times([0, 2e-9], "")) == "step 3.5   t = 1e-09"
+    late = times([347921.001, 347921.002], "s")
+    assert time_text(0, 347921.001, late) == "step 0   t = 347921.001 s"
+    dated = times([40.0, 40.25], "days since 2001-01-01")
+    assert time_text(1, 40.25, dated) == "step 1   2001-02-10 06:00"
+    assert time_text(0, 40.0, dated) == "step 0   2001-02-10"

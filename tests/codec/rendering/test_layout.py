@@ -14,15 +14,11 @@ from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.layout import (
     SMALLEST,
     TITLE_GAP,
-    Label,
     Layout,
     end_texts,
-    fitted,
-    font_size,
     lay_out,
     length,
     line_height,
-    overflow,
     quantity_of,
     scales,
     ticks,
@@ -40,33 +36,6 @@ def test_lines_are_no_longer_than_their_limit_and_hold_every_letter(limit: float
     assert all(length(line, 10) <= limit for line in lines)
     assert "".join(lines).replace(" ", "") == LONG.replace(" ", "")
     assert (len(lines) == 1) is (limit == 1000)
-
-
-def test_lines_break_where_words_end() -> None:
-    assert wrapped("density [kg/m3]", 10, 60) == ("density", "[kg/m3]")
-    assert wrapped(LONG, 10, 60)[:2] == ("sea_water_", "potential_")
-    assert wrapped("", 10, 50) == ("",)
-
-
-def test_the_font_is_the_largest_that_fits() -> None:
-    assert fitted([LONG], 20, 10_000) == 20
-    size = fitted([LONG], 20, 240)
-    assert length(LONG, size) <= 240 < length(LONG, size + 1)
-    assert fitted([LONG], 20, 3) == SMALLEST
-
-
-def test_larger_pictures_have_larger_letters() -> None:
-    assert [font_size(side, side) for side in (64, 256, 1024)] == [9, 10, 20]
-    assert font_size(2000, 256) == 10
-
-
-def test_a_turned_label_is_as_high_as_it_was_wide() -> None:
-    flat = Label(lines=("depth [m]", "down"), centre=(50, 60), size=12)
-    wide, tall = flat.extent
-    assert tall > 2 * line_height(12)
-    assert Label(lines=flat.lines, centre=(50, 60), size=12, upright=True).extent == (tall, wide)
-    left, top, right, bottom = flat.box
-    assert ((left + right) / 2, (top + bottom) / 2) == (50, 60)
 
 
 @pytest.mark.parametrize(
@@ -127,19 +96,6 @@ def test_ends_are_told_apart_in_few_letters(
     first: float, last: float, texts: tuple[str, str]
 ) -> None:
     assert end_texts(first, last) == texts
-
-
-def test_every_axis_has_a_name_and_two_ends() -> None:
-    rays = Rays.of(Camera(), Grid.of(COORDS), (400, 400))
-    labels, wanted = scales(rays, (50, 50, 450, 450), (0, 0, 500, 500), COORDS, 12, breaking=0)
-    assert wanted == 9
-    assert sorted(label.lines[0] for label in labels) == sorted(
-        ["x [km]", "y [km]", "z [km]", "0", "0", "0", "4", "3", "2"]
-    )
-    assert overflow(labels, (0, 0, 500, 500)) == (0, 0, 0, 0)
-    assert np.count_nonzero(overflow(labels, (100, 100, 400, 400))) == 3
-    broken, _ = scales(rays, (50, 50, 450, 450), (0, 0, 500, 500), COORDS, 12, breaking=1)
-    assert ("x", "[km]") in [label.lines for label in broken]
 
 
 def test_ends_that_are_out_of_view_have_no_number() -> None:
@@ -328,21 +284,9 @@ def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:
     assert rays.size[0] >= 0.3 * 24 - 1
 
 
-def test_a_plane_seen_from_above_fills_its_view() -> None:
-    layout, rays = laid_out("flat", (400, 400), Effects())
-    rows, columns = np.nonzero(covered(layout, rays))
-    assert 385 <= np.ptp(columns) + 1 <= 400
-    assert np.ptp(rows) + 1 == pytest.approx(392 * 182 / 362, abs=6)
-
-
 def test_names_of_quantities() -> None:
     assert quantity_of("speed", "m s-1") == "speed [m s-1]"
     assert quantity_of("share", "1") == quantity_of("share", "") == "share"
-
-
-def test_labels_are_records_of_texts() -> None:
-    layout, _ = laid_out("plain", (256, 256), Effects(axes=True))
-    assert all(isinstance(label, Label) and all(label.lines) for label in layout.labels)
 
 
 def test_a_colour_bar_has_two_ticks_or_more() -> None:

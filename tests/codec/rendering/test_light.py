@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frame_field import frame_of, table_of, task_of
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
@@ -24,7 +25,7 @@ from fhash_codec.rendering.light import (
     slope_scale,
     smoothing,
 )
-from fhash_codec.rendering.march_task import GRADES, Frame, Grading, Table
+from fhash_codec.rendering.march_task import GRADES, Grading
 from fhash_codec.rendering.plan import plan_picture
 from fhash_codec.rendering.scenes import AmbientOcclusion, Shadows
 from fhash_formats.errors import InputError
@@ -32,12 +33,6 @@ from fhash_formats.errors import InputError
 
 def grid(*spacing: float) -> Grid:
     return Grid(counts=(9, 9, 9), origin=np.zeros(3), spacing=np.array(spacing))
-
-
-def test_gradients_are_shares_of_the_range_in_the_distance_of_vertices() -> None:
-    np.testing.assert_allclose(slope_scale(grid(1, 1, 1), 4.0, 0.0, 4.0), [0.25] * 3)
-    factors = slope_scale(grid(1, 2, -4), 4.0, 0.0, 4.0)
-    np.testing.assert_allclose(factors / factors[0], [1, 0.5, -0.25])
 
 
 def test_no_gradient_is_too_steep_to_be_squared_in_float32() -> None:
@@ -121,23 +116,6 @@ def test_gradients_near_zero_are_all_beyond_the_last_factor_or_zero(volume: Volu
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def frame_of(values, stride=1):
-    return Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0), stride=stride)
-
-
-def grid_of(shape, spacing=(1.0, 1.0, 1.0)):
-    return Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.array(spacing))
-
-
-def table_of(extinctions):
-    return Table(
-        low=0.0,
-        high=1.0,
-        colours=np.ones((len(extinctions), 3), dtype=np.float32),
-        extinctions=np.array(extinctions),
-    )
-
-
 @pytest.mark.parametrize("resolution", [1.0, 2.0])
 @pytest.mark.parametrize("spacing", [1.0, -0.5])
 def test_the_shadow_within_a_slab_is_its_closed_form(resolution, spacing) -> None:
@@ -146,8 +124,7 @@ def test_the_shadow_within_a_slab_is_its_closed_form(resolution, spacing) -> Non
     lamp = UP * np.sign(spacing)
     light = light_grid(
         frame_of(np.ones(shape)),
-        grid_of(shape, (1, 1, spacing)),
-        table_of([0.05, 0.05]),
+        task_of(shape, table_of([0.05, 0.05]), (1, 1, spacing)),
         shadows=settings,
         lamp=lamp,
     )
@@ -166,8 +143,7 @@ def test_a_block_throws_its_shadow_away_from_the_lamp() -> None:
     lamp = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
     light = light_grid(
         frame_of(values),
-        grid_of(values.shape),
-        table_of([0.0, 5.0]),
+        task_of(values.shape, table_of([0.0, 5.0])),
         shadows=Shadows(strength=1.0, resolution=1.0),
         lamp=lamp,
     )
@@ -183,7 +159,9 @@ def test_surroundings_take_light_only_where_there_are_any() -> None:
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
     light = light_grid(
-        frame_of(values), grid_of(values.shape), table_of([0.0, 50.0]), ambient_occlusion=settings
+        frame_of(values),
+        task_of(values.shape, table_of([0.0, 50.0])),
+        ambient_occlusion=settings,
     )
     around = light.shares[:, 10, 10, 1]
     assert np.all(light.shares[..., 0] == 1)
@@ -195,7 +173,7 @@ def test_surroundings_take_light_only_where_there_are_any() -> None:
 def test_nothing_that_takes_light_leaves_all_of_it() -> None:
     for table in (None, table_of([0.0, 0.0])):
         light = light_grid(
-            frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table, shadows=Shadows(), lamp=UP
+            frame_of(np.ones((5, 5, 5))), task_of((5, 5, 5), table), shadows=Shadows(), lamp=UP
         )
         assert np.all(light.shares == 1)
         assert light.secondary_rays == 0
@@ -205,8 +183,7 @@ def test_shadows_need_a_lamp() -> None:
     with pytest.raises(InputError, match="lamp"):
         light_grid(
             frame_of(np.ones((5, 5, 5))),
-            grid_of((5, 5, 5)),
-            table_of([1.0, 1.0]),
+            task_of((5, 5, 5), table_of([1.0, 1.0])),
             shadows=Shadows(),
         )
 
@@ -215,14 +192,16 @@ def test_opacity_by_gradient_takes_as_little_light_as_it_draws() -> None:
     # A ball of even values inside and outside: only its rim has a gradient.
     z, y, x = np.mgrid[-15:16, -15:16, -15:16]
     ball = np.where(np.sqrt(x * x + y * y + z * z) < 9, 1.0, 0.0)
-    settings = {"table": table_of([0.0, 0.2]), "shadows": Shadows(strength=1.0, resolution=1.0)}
-    given = frame_of(ball), grid_of(ball.shape)
+
+    def lit(grading):
+        task = task_of(ball.shape, table_of([0.0, 0.2]), grading=grading)
+        shadows = Shadows(strength=1.0, resolution=1.0)
+        return light_grid(frame_of(ball), task, shadows=shadows, lamp=UP).shares[..., 0]
 
     def shares(factors):
-        grading = Grading(factors=np.array(factors), top=0.4)
-        return light_grid(*given, **settings, lamp=UP, grading=grading).shares[..., 0]
+        return lit(Grading(factors=np.array(factors), top=0.4))
 
-    whole = light_grid(*given, **settings, lamp=UP).shares[..., 0]
+    whole = lit(None)
     np.testing.assert_allclose(shares(np.ones(GRADES + 1)), whole, atol=1e-6)
     rim = shares(np.where(np.arange(GRADES + 1) < GRADES / 2, 0.0, 1.0))
     inside = shares(np.where(np.arange(GRADES + 1) < GRADES / 2, 1.0, 0.0))
@@ -249,12 +228,10 @@ def test_light_is_computed_again_only_for_what_changes_it(monkeypatch) -> None:
         del sums[:], extinctions[:]
         return light_grid(
             given,
-            grid_of(values.shape),
-            table,
+            task_of(values.shape, table, grading=grading),
             shadows=Shadows(resolution=1.0),
             lamp=lamp,
             ambient_occlusion=AmbientOcclusion(radius=radius),
-            grading=grading,
             bricks=bricks,
         ).shares
 

@@ -24,7 +24,6 @@ from fhash_codec.rendering.march_task import (
     Units,
     complete,
     extinctions_in,
-    rows,
     warped,
 )
 from fhash_codec.rendering.plan import arrays_on
@@ -43,49 +42,6 @@ def arrays_arrays(request: pytest.FixtureRequest) -> Arrays:
     return TorchArrays(torch.device("cpu"))
 
 
-def test_arrays_come_back_as_they_went(arrays_arrays: Arrays) -> None:
-    for kind in ("float32", "float64", "int64", "bool"):
-        values = np.arange(6).reshape(2, 3).astype(kind)
-        back = arrays_arrays.host(arrays_arrays.array(values))
-        np.testing.assert_array_equal(back, values)
-        assert back.dtype == values.dtype
-    assert arrays_arrays.host(arrays_arrays.array([1, 2], "float32")).dtype == np.float32
-    assert arrays_arrays.host(arrays_arrays.full(2, 1.5)).tolist() == [1.5, 1.5]
-    assert arrays_arrays.host(arrays_arrays.full((1, 2), 3, "int64")).tolist() == [[3, 3]]
-    assert arrays_arrays.host(arrays_arrays.empty((2, 3), "float32")).shape == (2, 3)
-    assert arrays_arrays.host(arrays_arrays.range(3)).tolist() == [0, 1, 2]
-
-
-def test_numbers_are_converted_towards_zero(arrays_arrays: Arrays) -> None:
-    values = arrays_arrays.array([-1.7, -0.5, 1.7])
-    assert arrays_arrays.host(arrays_arrays.to_int64(values)).tolist() == [-1, 0, 1]
-    assert arrays_arrays.host(arrays_arrays.to_float32(values)).dtype == np.float32
-    assert arrays_arrays.host(arrays_arrays.to_float64(arrays_arrays.range(2))).dtype == np.float64
-
-
-def test_a_copy_has_memory_of_its_own(arrays_arrays: Arrays) -> None:
-    first = arrays_arrays.array([1.0, 2.0])
-    second = arrays_arrays.copy(first)
-    second[0] = 5.0
-    assert arrays_arrays.host(first).tolist() == [1.0, 2.0]
-
-
-def test_elements_are_found_and_picked(arrays_arrays: Arrays) -> None:
-    array = arrays_arrays.array([[0.0, 3.0], [4.0, 0.0]])
-    rows, columns = arrays_arrays.nonzero(array)
-    assert arrays_arrays.host(rows).tolist() == [0, 1]
-    assert arrays_arrays.host(columns).tolist() == [1, 0]
-    picked = arrays_arrays.take_along(array, arrays_arrays.array([[1], [0]]), 1)
-    assert arrays_arrays.host(picked).tolist() == [[3.0], [4.0]]
-
-
-def test_rows_that_are_named_twice_are_added_twice(arrays_arrays: Arrays) -> None:
-    total = arrays_arrays.full((3, 2), 1.0)
-    values = arrays_arrays.array([[1.0, 2.0], [10.0, 20.0], [100.0, 200.0]])
-    arrays_arrays.add_rows(total, arrays_arrays.array([2, 0, 2]), values)
-    assert arrays_arrays.host(total).tolist() == [[11.0, 21.0], [1.0, 1.0], [102.0, 203.0]]
-
-
 def test_candidates_are_those_of_the_mask_on_the_host_and_all_on_a_device(
     arrays_arrays: Arrays,
 ) -> None:
@@ -102,16 +58,6 @@ def test_candidates_are_those_of_the_mask_on_the_host_and_all_on_a_device(
     other = arrays_arrays.array([9.0, 9.0, 9.0, 9.0])
     kept = arrays_arrays.kept(mask[some], values[:, 1][some], other[some])
     assert arrays_arrays.host(kept)[arrays_arrays.host(mask[some])].tolist() == [2.0, 3.0]
-
-
-def test_counts_come_together_and_positions_by_their_count(arrays_arrays: Arrays) -> None:
-    mask = arrays_arrays.array([False, True, True, False, True])
-    count, largest = arrays_arrays.counts(
-        arrays_arrays.xp.count_nonzero(mask), arrays_arrays.range(7).max()
-    )
-    assert (count, largest) == (3, 6)
-    assert arrays_arrays.host(arrays_arrays.chosen(mask, count)).tolist() == [1, 2, 4]
-    assert len(arrays_arrays.chosen(mask & False, 0)) == 0
 
 
 def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,12 +120,6 @@ def test_operations_equal_those_of_numpy(tensors: Arrays) -> None:
         np.testing.assert_array_equal(result[name], array, err_msg=name)
 
 
-def test_empty_arrays_have_the_type_and_shape_asked_for(tensors: Arrays) -> None:
-    for arrays in (NUMPY, tensors):
-        empty = arrays.host(arrays.empty((2, 3), "float32"))
-        assert (empty.shape, empty.dtype) == ((2, 3), np.dtype("float32"))
-
-
 def test_a_device_without_memory_is_an_input_error(tensors: Arrays) -> None:
     import torch
 
@@ -220,11 +160,6 @@ def test_counters_are_summed_in_one_order() -> None:
         complete({"photons": 1})
 
 
-def test_every_counter_has_a_row() -> None:
-    assert [name for name, _, _ in rows({})] == [name.replace("_", " ") for name in COUNTERS]
-    assert ("secondary rays", "1,234", COUNTERS["secondary_rays"]) in rows({"secondary_rays": 1234})
-
-
 def volume(low: float, high: float, dtype: str) -> Volume:
     fields = SimpleNamespace(value_range=ValueRange(low, high), float_dtype=np.dtype(dtype))
     return cast(Volume, fields)
@@ -263,19 +198,6 @@ WARP = Warp(counts=(5, 2, 3), places=(PLACES, None, None))
 
 def frame(values: np.ndarray, first: tuple[int, int, int] = (0, 0, 0), stride: int = 1) -> Frame:
     return Frame(values=values.astype(np.float32), first=first, stride=stride)
-
-
-def test_without_a_warp_nothing_happens() -> None:
-    given = frame(np.zeros((2, 2, 2)))
-    assert warped(given, None) is given
-
-
-def test_values_are_linear_between_the_vertices_of_the_series() -> None:
-    z, y, x = np.meshgrid(range(3), range(2), range(5), indexing="ij")
-    drawn = warped(frame(100 * z + 10 * y + x), WARP)
-    assert drawn.values.shape == (3, 2, 8)
-    np.testing.assert_allclose(drawn.values[2, 1], 210 + PLACES)
-    assert drawn.values.flags.c_contiguous
 
 
 def test_a_vertex_without_a_value_takes_those_beside_it_along() -> None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_field import frame_of, table_of, waves
+from frame_field import task_of as plain_task
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import SIDE, Bricks
-from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import (
     MAX_MAGNITUDE,
@@ -22,11 +22,10 @@ from fhash_codec.rendering.march import (
     TILE,
     March,
     MarchInput,
-    empty_table,
     march_native,
     numbers,
 )
-from fhash_codec.rendering.march_task import Frame, Grading, Lighting, Surface, Table, Task
+from fhash_codec.rendering.march_task import Grading, Lighting, Surface
 from fhash_codec.rendering.scenes import Camera, Shadows
 from fhash_codec.rendering.view import Body
 
@@ -74,17 +73,11 @@ COUNTS = (21, 17, 13)
 
 def input_of(values: Any, low: float, high: float, level: float, **place: Any) -> MarchInput:
     """The input for a frame of values, a table and a surface."""
-    grid = Grid(counts=COUNTS, origin=np.zeros(3), spacing=np.array([1.0, 2.0, -3.0]))
-    frame = Frame(values=np.asarray(values, dtype=np.float32), **place)
-    task = Task(
-        rays=Rays.of(Camera(), grid, (4, 4)),
-        step=0.5,
-        threshold=0.0,
-        table=Table(
-            low=low, high=high, colours=np.ones((2, 3), np.float32), extinctions=np.ones(2)
-        ),
-        surfaces=(Surface(value=level, colour=np.ones(3), opacity=1.0),),
-    )
+    frame = frame_of(values, **place)
+    surfaces = (Surface(value=level, colour=np.ones(3), opacity=1.0),)
+    table = table_of([1.0, 1.0], low, high)
+    more = {"camera": Camera(), "size": (4, 4), "surfaces": surfaces}
+    task = plain_task(COUNTS[::-1], table, (1.0, 2.0, -3.0), **more)
     return MarchInput.of(frame, task, Bricks.of(frame))
 
 
@@ -112,18 +105,6 @@ def test_values_are_scaled_to_what_float32_can_compute_with(low: float, high: fl
     assert given.levels[0] == pytest.approx((given.low + given.high) / 2)
 
 
-def test_ordinary_values_are_not_copied() -> None:
-    values = np.linspace(0, 1, 27, dtype=np.float32).reshape(3, 3, 3)
-    assert input_of(values, 0.0, 1.0, 0.5, first=(0, 0, 0)).values is not None
-    assert np.shares_memory(input_of(values, 0.0, 1.0, 0.5, first=(0, 0, 0)).values, values)
-
-
-def test_an_empty_table_shows_nothing() -> None:
-    table = empty_table(1.0, 2.0)
-    assert not table.extinctions.any()
-    assert (table.low, table.high) == (1.0, 2.0)
-
-
 CENTRAL = Lighting(
     ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True
 )
@@ -143,157 +124,14 @@ def path(request):
 
 
 def marched(values, task, path=0, first=(0, 0, 0)):
-    frame = Frame(values=np.asarray(values, dtype=np.float32), first=first)
+    frame = frame_of(values, first=first)
     return march_native(native.library(), frame, task, Bricks.of(frame), path=path)
 
 
-def task_of(
-    shape,
-    extinctions,
-    *,
-    camera=None,
-    size=(20, 18),
-    step=0.5,
-    threshold=0.0,
-    lighting=CENTRAL,
-    **more,
-):
-    table = None
-    if extinctions is not None:
-        colours = np.tile(np.float32([0.9, 0.6, 0.3]), (len(extinctions), 1))
-        table = Table(
-            low=0.0,
-            high=1.0,
-            colours=colours,
-            extinctions=np.asarray(extinctions, dtype=np.float64),
-        )
-    rays = Rays.of(
-        camera or Camera(azimuth=20.0),
-        Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3)),
-        size,
-    )
-    return Task(rays=rays, step=step, threshold=threshold, table=table, lighting=lighting, **more)
-
-
-def waves(shape=(14, 17, 22), pace=1.0):
-    z, y, x = np.meshgrid(*(np.linspace(0, pace, size) for size in shape), indexing="ij")
-    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(
-        np.float32
-    )
-
-
-def trilinear(values, places):
-    """Values and gradients of the cell at places (n, 3), x, y, z, clamped."""
-    last = np.array(values.shape[::-1]) - 1
-    at = np.clip(places, 0, last)
-    low = np.minimum(at.astype(np.int64), last - 1)
-    share = at - low
-    value, slope = np.zeros(len(at)), np.zeros((len(at), 3))
-    for corner in np.ndindex(2, 2, 2):
-        index = low + corner
-        weights = np.where(corner, share, 1 - share)
-        found = values[index[:, 2], index[:, 1], index[:, 0]].astype(np.float64)
-        weight = weights.prod(axis=1)
-        value += np.where(weight > 0, weight * found, 0)
-        for axis in range(3):
-            slope[:, axis] += (
-                (2 * corner[axis] - 1) * np.delete(weights, axis, axis=1).prod(axis=1) * found
-            )
-    return value, slope
-
-
-def slopes(values, places):
-    """Central differences, where one is missing that of the cell, where that is missing none."""
-    places = np.clip(places, 0, np.array(values.shape[::-1]) - 1)
-    central = np.stack(
-        [
-            (trilinear(values, places + one)[0] - trilinear(values, places - one)[0]) / 2
-            for one in np.eye(3)
-        ],
-        axis=-1,
-    )
-    return np.nan_to_num(np.where(np.isnan(central), trilinear(values, places)[1], central))
-
-
-def lit(colour, slope, along, lighting):
-    length = np.sqrt((slope**2).sum(axis=1))
-    cosine = np.abs((slope * along).sum(axis=1)) / np.where(length > 0, length, np.inf)
-    shine = lighting.specular * cosine**lighting.specular_power
-    return colour * (lighting.ambient + lighting.diffuse * cosine)[:, None] + shine[:, None]
-
-
-def places_of(task, shape):
-    """Pixels, places, lengths and directions of the samples of all rays, number by number."""
-    origin, along = (
-        np.array(np.broadcast_to(part.reshape(-1, 3), (np.prod(task.rays.size), 3)))
-        for part in task.rays.pixels()
-    )
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    with np.errstate(divide="ignore"):
-        ends = (np.stack([np.zeros(3), np.array(shape[::-1]) - 1.0]) - origin[:, None]) / along[
-            :, None
-        ]
-    enter, leave = np.maximum(ends.min(axis=1).max(axis=1), 0), ends.max(axis=1).min(axis=1)
-    for number in range(int(np.ceil((leave - enter).max() / task.step))):
-        pixels = np.flatnonzero(enter + number * task.step < leave)
-        left = leave[pixels] - enter[pixels] - number * task.step
-        yield (
-            pixels,
-            origin[pixels] + (enter[pixels] + (number + 0.5) * task.step)[:, None] * along[pixels],
-            np.minimum(left, task.step),
-            along[pixels],
-        )
-
-
-def pictured(values, task):
-    """The lit picture of a task."""
-    rgb, clear = np.zeros((np.prod(task.rays.size), 3)), np.ones(np.prod(task.rays.size))
-    for pixels, places, length, along in places_of(task, values.shape):
-        value = trilinear(values, places)[0]
-        extinction = np.interp(
-            value, np.linspace(0, 1, len(task.table.extinctions)), task.table.extinctions
-        )
-        opacity = np.where(np.isnan(value), 0, -np.expm1(-extinction * length))
-        colour = lit(
-            task.table.colours[0].astype(np.float64), slopes(values, places), along, task.lighting
-        )
-        rgb[pixels] += (clear[pixels] * opacity)[:, None] * colour
-        clear[pixels] *= 1 - opacity
-    return np.concatenate([rgb, 1 - clear[:, None]], axis=1).reshape(
-        task.rays.size[1], task.rays.size[0], 4
-    )
-
-
-@pytest.mark.parametrize("missing", [False, True])
-def test_a_volume_is_lit_by_central_differences(path, missing) -> None:
-    values = waves()
-    if missing:
-        values[4:7, 5:9, 3:12] = np.nan
-    task = task_of(values.shape, np.linspace(0, 0.4, 100), shaded=True)
-    found = marched(values, task, path)
-    np.testing.assert_allclose(found.rgba, pictured(values, task), atol=5e-4)
-    cell = marched(values, replace(task, lighting=CELL), path)
-    assert np.abs(found.rgba - cell.rgba)[..., :3].max() > 0.02
-    np.testing.assert_array_equal(found.rgba[..., 3], cell.rgba[..., 3])
-    assert found.counters == cell.counters
-
-
-def test_a_sphere_is_lit_by_central_differences(path) -> None:
-    axis = np.linspace(-1, 1, 21)
-    values = np.sqrt(sum(part**2 for part in np.meshgrid(axis, axis, axis))).astype(np.float32)
-    surface = Surface(value=0.5, colour=np.array([1.0, 0.5, 0.25]), opacity=1.0)
-    task = task_of(values.shape, None, surfaces=(surface,), depth=True, normal=True, size=(33, 33))
-    found, cell = marched(values, task, path), marched(values, replace(task, lighting=CELL), path)
-    np.testing.assert_array_equal(found.normal, cell.normal)
-    np.testing.assert_array_equal(found.depth, cell.depth)
-    origin, along = task.rays.pixels()
-    along = np.broadcast_to(along / np.linalg.norm(along, axis=-1, keepdims=True), (33, 33, 3))
-    hit = np.isfinite(found.depth)
-    assert hit.sum() > 50
-    places = (origin + found.depth[..., None] * along)[hit]
-    exact = lit(surface.colour, slopes(values, places), along[hit], CENTRAL)
-    np.testing.assert_allclose(found.rgba[hit][:, :3], exact, atol=1e-3)
-    assert np.abs(found.rgba - cell.rgba).max() > 0.02
+def task_of(shape, extinctions, **more):
+    table = None if extinctions is None else table_of(extinctions, colour=(0.9, 0.6, 0.3))
+    given = {"camera": Camera(azimuth=20.0), "size": (20, 18), "lighting": CENTRAL, **more}
+    return plain_task(shape, table, **given)
 
 
 CASES = {
@@ -337,37 +175,15 @@ def test_all_paths_make_one_picture(path, case, shape) -> None:
 
 
 def test_all_paths_make_one_picture_in_a_grid_of_light(path) -> None:
-    values = waves()
+    values = waves((14, 17, 22))
     for shaded in (False, True):
         task = task_of(values.shape, np.linspace(0, 0.4, 100), shaded=shaded)
-        frame = Frame(values=values, first=(0, 0, 0))
-        light = light_grid(
-            frame, task.rays.grid, task.table, shadows=Shadows(), lamp=np.array([0, 0, 1.0])
-        )
+        frame = frame_of(values)
+        light = light_grid(frame, task, shadows=Shadows(), lamp=np.array([0, 0, 1.0]))
         task = replace(task, light=light)
         np.testing.assert_allclose(
             marched(values, task, path).rgba, marched(values, task).rgba, atol=2e-5
         )
-
-
-@pytest.mark.parametrize("step", [0.3, 0.5, 1.9])
-def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step) -> None:
-    values = waves((40, 41, 43))
-    task = task_of(values.shape, [0.0] * 50 + [0.5] * 2 + [0.0] * 50, size=(50, 40), step=step)
-    found, everything = (
-        marched(values, task, path),
-        marched(values, replace(task, skipping=False), path),
-    )
-    np.testing.assert_allclose(found.rgba, everything.rgba, atol=1e-6)
-    corners = np.lib.stride_tricks.sliding_window_view(values, (2, 2, 2)).reshape(39, 40, 42, 8)
-    low, high = (end / 101 for end in (49, 52))
-    seen = (corners.max(-1) > low) & (corners.min(-1) < high)
-    inside = 0
-    for _, places, _, _ in places_of(task, values.shape):
-        x, y, z = np.clip(places.T.astype(np.int64), 0, np.array([[41], [39], [38]]))
-        inside += seen[z, y, x].sum()
-    assert 0 < inside < 0.3 * everything.counters["samples"]
-    assert found.counters["samples"] <= 1.1 * inside
 
 
 @pytest.mark.parametrize("step", [0.3, 0.5, 0.9, 2.5, 3.9, 7.0])

@@ -11,13 +11,11 @@ import pytest
 from frame_field import by_stream
 
 import fhash_codec
-from fhash_codec import EncodeConfig, Renderer, Scene, Volume
-from fhash_codec.rendering.grid import Grid
+from fhash_codec import EncodeConfig, Scene, Volume
 from fhash_codec.rendering.march_task import NUMPY, Units
-from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_at, plan_picture
+from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_picture
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_formats.errors import FhashWarning, InputError, RegionError
-from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
 
 
 def plan(volume: Volume, **scene: Any) -> Plan:
@@ -72,15 +70,6 @@ def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None
     assert planned.lamp @ (rays.up * spacing) > 0
     assert planned.lamp @ (rays.right * spacing) < 0
     assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
-
-
-def test_the_step_is_in_spacings_of_what_is_marched(volume: Volume) -> None:
-    fine, coarse = (plan(volume, march={"lod": lod, "step": 0.25}) for lod in (0, 2))
-    assert (
-        coarse.task.step
-        == pytest.approx(4 * fine.task.step)
-        == pytest.approx(Grid.of(volume.coords).vertex_spacing)
-    )
 
 
 def test_far_away_the_level_of_detail_is_coarse(volume: Volume) -> None:
@@ -216,31 +205,6 @@ def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
             plan(network, march={"mode": "arm"}, effects={"shadows": True})
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_ordinary_single_precision_stays_what_it_is(tmp_path: Path, dtype: type) -> None:
-    field = np.linspace(200, 300, 5 * 6 * 7).reshape(1, 5, 6, 7).astype(dtype)
-    fhash_codec.encode(field, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        assert (Units.of(volume) == Units()) is (dtype is np.float32)
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("value", [0.0, 5.0, 1e-320, -1.7976931348623157e308])
-def test_constant_values_have_a_table_that_single_precision_holds(
-    tmp_path: Path, value: float
-) -> None:
-    fhash_codec.encode(
-        np.full((1, 5, 6, 7), value), tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1)
-    )
-    with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        table = plan(volume).task.table
-        assert table is not None
-        assert np.float32(table.low) < np.float32(table.high)
-        assert np.isfinite(
-            fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba
-        ).all()
-
-
 def test_a_picture_that_would_take_ages_is_told(volume: Volume) -> None:
     for scene in ({"scale": [1e6, 1, 1e-6]}, {"march": {"step": 1e-5}}):
         with pytest.warns(FhashWarning, match="a ray takes up to .* samples"):
@@ -284,16 +248,6 @@ def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: in
         )
         assert given.function.opacity(0.5) == 0.25
         assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
-
-
-@pytest.mark.parametrize(("thickness", "seen"), [(2, True), (8, True), (9, False)])
-def test_thin_volumes_show_every_value(tmp_path: Path, thickness: int, seen: bool) -> None:
-    values = np.zeros((1, thickness, 20, 20), dtype=np.float32)
-    values[:, :, :4, :4] = np.random.default_rng(0).random((1, thickness, 4, 4))
-    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as volume:
-        function = Renderer(volume).plan(Scene()).function
-    assert (function.opacity(0.0) > 0) is np.bool_(seen)
-    assert function.opacity(1.0) > 0
 
 
 def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
@@ -385,44 +339,8 @@ def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
     assert plan(volume, **scene).mode == "cache"
 
 
-@pytest.mark.parametrize(("mode", "words"), [("cache", "has other values"), ("arm", "is linear")])
-def test_a_plan_says_where_network_and_lattice_differ(
-    tmp_path: Path, volume: Volume, mode: str, words: str
-) -> None:
-    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
-    path = tmp_path / "a.fhz"
-    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
-    with fhash_codec.open(path) as paper:
-        assert words in plan(paper, march={"mode": mode}).to_dict()["march"]
-    assert words not in plan(volume).to_dict()["march"]
-
-
-TOPICS = [
-    "picture",
-    "proportions",
-    "time",
-    "march",
-    "value",
-    "gradient",
-    "secondary rays",
-    "level of detail",
-    "region",
-    "bricks",
-    "rays end",
-    "step",
-]
-
-
 def lines(volume: Volume, **scene: Any) -> dict[str, str]:
     return plan_picture(volume, Scene.from_dict(scene)).to_dict()
-
-
-def test_every_plan_has_the_same_topics(volume: Volume) -> None:
-    assert list(lines(volume)) == TOPICS
-    more = lines(volume, effects={"buffers": ["depth"], "box": True, "time_label": True})
-    assert list(more) == [*TOPICS, "buffers", "around"]
-    assert more["buffers"] == "depth"
-    assert more["around"].startswith("box, time_label: drawn afterwards; the volume has 512 x ")
 
 
 @pytest.mark.parametrize(
@@ -469,49 +387,3 @@ def test_a_line_says_what_the_scene_asks_for(
 ) -> None:
     assert words in lines(volume, **scene)[topic]
     assert all("\n" not in line for line in lines(volume, **scene).values())
-
-
-def test_a_plan_moved_in_time_says_so(volume: Volume) -> None:
-    plan = plan_picture(volume, Scene())
-    moved = plan_at(plan, volume, Scene(time=1.5))
-    assert (moved.step, moved.time) == (1.5, 1.5)
-    assert moved.task is plan.task
-    changed = {topic for topic in TOPICS if moved.to_dict()[topic] != plan.to_dict()[topic]}
-    assert changed == {"time"}
-
-
-def test_places_and_planes_are_explained(tmp_path: Path) -> None:
-    def explained(values: np.ndarray, z: Coordinate, **scene: Any) -> dict[str, str]:
-        axes = {
-            axis: index_coordinate(axis, n) for axis, n in zip("tzyx", values.shape, strict=True)
-        }
-        series = ArraySeries(values, name="q", units="K", coords={**axes, "z": z})
-        fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(effort=1), force=True)
-        with fhash_codec.open(tmp_path / "a.fhz") as opened:
-            return lines(opened, **scene)
-
-    values = np.random.default_rng(0).random((1, 4, 9, 9)).astype(np.float32)
-    depth = Coordinate(name="depth", values=np.array([0, 1, 2, 6.0]), attributes={"units": "hPa"})
-    assert explained(values, depth)["proportions"] == (
-        "those of the coordinates; z is uneven and resampled to 7 even vertices;"
-        " z ascends downwards"
-    )
-    single = Coordinate(name="z", values=np.zeros(1))
-    lit = explained(values[:, :1], single, effects={"shading": True})
-    assert lit["gradient"] == "none: a plane is drawn in its colours, without light"
-
-
-@pytest.mark.parametrize(
-    ("march", "words"),
-    [
-        ({"mode": "stream"}, "one sample of each ray in a pass"),
-        ({"mode": "arm"}, "as many samples as rays in a pass"),
-        ({"mode": "arm", "samples_per_pass": 5000}, "5,000 samples in a pass"),
-    ],
-)
-def test_a_line_says_how_a_network_is_marched(
-    files: dict[str, Path], march: dict[str, Any], words: str
-) -> None:
-    with fhash_codec.open(files["paper"]) as network:
-        plan = Renderer(network).plan(Scene.from_dict({"march": march}))
-    assert words in dict(plan.reasons)["march"]

@@ -18,7 +18,7 @@ from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import render
 from fhash_codec.rendering import renderer as module
-from fhash_codec.rendering.march_task import COUNTERS, Units, complete, rows
+from fhash_codec.rendering.march_task import COUNTERS, Units
 from fhash_codec.rendering.renderer import evolution
 from fhash_codec.rendering.scenes import Effects, Evolution, scene_in_png
 from fhash_codec.rendering.scenes import Scene as Scene_evolution
@@ -42,10 +42,6 @@ def test_without_a_scene_the_default_is_rendered(volume: Volume) -> None:
     assert image.rgba.shape == (*Scene().size[::-1], 4)
     assert dict(image.scene) == Scene().to_dict()
     assert set(stages) == {"decoding", "marching"}
-
-
-def test_it_is_the_picture_of_a_renderer(volume: Volume) -> None:
-    np.testing.assert_array_equal(render(volume, SMALL).rgba, Renderer(volume).render(SMALL).rgba)
 
 
 @pytest.mark.parametrize(
@@ -247,24 +243,6 @@ def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None
         assert renderer.render(scene(effects={name: {"strength": 0}})).counters == plain.counters
 
 
-def test_where_there_is_no_volume_there_is_no_light_to_take_away(renderer: Renderer) -> None:
-    surface = {"isosurfaces": [{"value": 5}]}
-    alone = {"transfer_function": {"nothing": True}}
-    lit, dark = (
-        renderer.render(scene(effects={**surface, **more}, **alone))
-        for more in ({}, {"shadows": True})
-    )
-    assert lit.counters["secondary_rays"] == dark.counters["secondary_rays"] == 0
-
-
-def test_the_histogram_does_not_depend_on_the_step(renderer: Renderer) -> None:
-    first, last = (renderer.plan(scene(step=step)).function for step in (0, 2))
-    np.testing.assert_array_equal(first.points, last.points)
-    edges, counts = renderer.histogram()
-    assert counts.sum() > 0
-    assert len(edges) == len(counts) + 1
-
-
 @pytest.mark.parametrize("factor", [5e-324, 1e307, -1e307], ids=str)
 def test_values_at_the_ends_of_float64_have_a_picture(tmp_path: Path, factor: float) -> None:
     values = np.linspace(-17, 17, 5 * 6 * 7).reshape(1, 5, 6, 7).round() * factor
@@ -284,29 +262,6 @@ def test_values_beyond_the_range_of_a_header_are_counted_at_its_ends(volume: Vol
         patch.setattr(volume, "value_range", narrow)
         counts = shown.histogram()[1]
     assert counts.sum() == counts[0] + counts[-1] > 0
-
-
-def test_counters_are_complete_and_known() -> None:
-    assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {
-        **dict.fromkeys(COUNTERS, 0),
-        "rays": 5,
-        "samples": 1,
-    }
-    with pytest.raises(KeyError):
-        complete({"raise": 1})
-    assert rows({"samples": 12345})[2][1] == "12,345"
-
-
-def test_progress_is_reported(volume: Volume) -> None:
-    said: list[tuple[str, int, int]] = []
-    Renderer(volume).render(
-        scene(),
-        progress=lambda stage, done, total, note: said.append((stage, done, total)),
-    )
-    assert said[0][0] == "decoding"
-    assert said[-1][0] == "marching"
-    assert all(0 <= done <= total for _, done, total in said)
-    assert said[-1][1] == said[-1][2]
 
 
 @pytest.mark.parametrize(
@@ -403,15 +358,3 @@ def test_evolutions_that_cannot_be(volume: Volume, drawing: Any) -> None:
         Renderer(volume).plan(
             dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0,)))
         )
-
-
-def test_a_renderer_draws_evolutions(files: dict[str, Path]) -> None:
-    with fhash_codec.open(files["compact"]) as real:
-        image = fhash_codec.render(
-            real,
-            dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0, 1.5), columns=2)),
-        )
-        single = fhash_codec.render(
-            real, dataclasses.replace(SMALL_EVOLUTION, step=1.5, effects=Effects(time_label=True))
-        )
-        np.testing.assert_array_equal(image.rgba[:, -SMALL_EVOLUTION.size[0] :], single.rgba)

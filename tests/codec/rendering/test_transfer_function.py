@@ -20,8 +20,6 @@ from fhash_codec.rendering.transfer_function import (
     alpha,
     extinction_of,
     opacity_preset,
-    raised,
-    shown_range,
 )
 from fhash_formats.errors import FhashWarning, InputError
 
@@ -52,27 +50,11 @@ def test_the_presets_of_pyvista() -> None:
     assert at("opaque", [-5, 0, 10, 50]) == [1, 1, 1, 1]
 
 
-@pytest.mark.parametrize("name", PRESETS[2:])
-def test_presets_reach_over_the_values_shown(name: str) -> None:
-    moved = at(name, np.linspace(100, 200, 101), shown=(100.0, 200.0))
-    np.testing.assert_allclose(moved, at(name, np.linspace(0, 10, 101)), atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["auto", "feature"])
 def test_an_interval_is_shown_within_its_ends(name: str) -> None:
     assert at(name, [2, 3, 4, 5, 6, 7, 8], features=("interval:3:7",)) == pytest.approx(
         [0, 0, INTERVAL, INTERVAL, INTERVAL, 0, 0]
     )
-
-
-def test_an_end_that_the_data_do_not_reach_is_no_end() -> None:
-    assert at("auto", [5, 9, 10], features=("interval:5:100",)) == pytest.approx(
-        [0, INTERVAL, INTERVAL]
-    )
-    assert at("auto", [0, 4, 5], features=("interval:-inf:5",)) == pytest.approx(
-        [INTERVAL, INTERVAL, 0]
-    )
-    assert at("auto", [5, 10], features=("segmentation:5",)) == pytest.approx([0, INTERVAL])
 
 
 def test_surfaces_and_intervals_of_one_value_are_tents() -> None:
@@ -111,29 +93,6 @@ def test_one_value_alone_in_a_histogram() -> None:
     assert at("auto", [3.0], histogram=(edges, counts), value_range=(3.0, 3.0)) == [BACKGROUND]
 
 
-def test_a_side_that_the_data_have_not_has_no_points() -> None:
-    counts = np.full(256, 10)
-    counts[0] = 9000
-    points = opacity_preset(
-        "auto",
-        shown=RANGE,
-        value_range=RANGE,
-        features=(),
-        histogram=(np.linspace(0, 10, 257), counts),
-    )
-    assert points[:, 0].min() > 0
-    assert points[:, 1].tolist() == [0, BACKGROUND]
-
-
-def test_colours_reach_over_the_feature() -> None:
-    assert shown_range((), RANGE) == RANGE
-    assert shown_range(("interval:3:7",), RANGE) == (3, 7)
-    assert shown_range(("interval:3:7", "segmentation:5"), RANGE) == (3, 10)
-    assert shown_range(("interval:3:7", "isosurface:9"), RANGE) == RANGE
-    low, high = shown_range((), (5.0, 5.0))
-    assert low == 5 < high
-
-
 @pytest.mark.parametrize("scale", [1.0, 2.0**-1000, 2.0**1019])
 def test_the_background_is_clear_however_small_or_large_the_values_are(scale: float) -> None:
     counts = np.zeros(16, dtype=np.int64)
@@ -150,11 +109,6 @@ def test_the_background_is_clear_however_small_or_large_the_values_are(scale: fl
     assert opacities == pytest.approx([BACKGROUND, 0, BACKGROUND], rel=0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("features", [(), ("interval:3:7",)])
-def test_a_plane_is_opaque(features: tuple[str, ...]) -> None:
-    assert at("auto", [-1, 0, 5, 11], features=features, thinnest=(1, 1.0)) == [1, 1, 1, 1]
-
-
 def test_up_to_eight_vertices_every_value_is_seen_as_through_eight_spacings() -> None:
     full = 1 - (1 - BACKGROUND) ** 8
     histogram = (np.linspace(0, 10, 11), np.array([90, 1, 1, 1, 1, 1, 1, 1, 1, 1]))
@@ -165,17 +119,6 @@ def test_up_to_eight_vertices_every_value_is_seen_as_through_eight_spacings() ->
     thick = at("auto", [0, 3, 10], thinnest=(9, 8.0), histogram=histogram)
     assert thick == at("auto", [0, 3, 10], histogram=histogram)
     assert thick[0] == 0
-
-
-def test_features_of_thin_volumes_are_raised_too_and_named_presets_are_not() -> None:
-    thin = at("auto", [2, 5], features=("interval:3:7",), thinnest=(3, 2.0))
-    assert thin == pytest.approx([0, 1 - (1 - INTERVAL) ** 4])
-    for name in ("linear", "feature"):
-        given = {"features": ("interval:3:7",)}
-        assert at(name, [2, 5], thinnest=(1, 1.0), **given) == at(name, [2, 5], **given)
-    points = np.array([[0.0, 0.5], [1.0, 1.0]])
-    np.testing.assert_array_equal(raised(points, (9, 2.0)), points)
-    np.testing.assert_allclose(raised(points, (8, 4.0)), [[0, 0.75], [1, 1]])
 
 
 VALUES = np.linspace(-2, 12, 1401)
@@ -197,12 +140,6 @@ def test_alpha_does_not_depend_on_the_steps() -> None:
     assert float(alpha(extinction_of(1e-9, 1.0), 1e-9)) == pytest.approx(1e-18, rel=1e-8)
 
 
-def test_opacity_of_one_is_capped_and_finite() -> None:
-    assert float(extinction_of(1.0, 0.5)) == OPAQUE / 0.5
-    assert float(alpha(extinction_of(1.0, 1.0), 0.0)) == 0.0
-    assert float(alpha(extinction_of(1.0, 1.0), 1.0)) == 1.0
-
-
 def test_points_are_in_data_units_and_hold_beyond_the_ends() -> None:
     function = made({"opacity": [[2, 0.5], [4, 0]], "unit_distance": 3.0, "density": 2.0})
     np.testing.assert_allclose(function.opacity([-9, 2, 3, 4, 99]), [0.5, 0.5, 0.25, 0, 0])
@@ -211,20 +148,6 @@ def test_points_are_in_data_units_and_hold_beyond_the_ends() -> None:
     )
     assert function.extinction(np.nan) == 0
     assert np.all(np.isfinite(function.colour([np.nan, np.inf, -np.inf])))
-
-
-def test_the_unit_distance_is_a_vertex_spacing_unless_said() -> None:
-    assert made(spacing=0.25).unit_distance == 0.25
-    assert made({"unit_distance": 7}, spacing=0.25).unit_distance == 7
-
-
-def test_colours_by_name_points_and_range() -> None:
-    np.testing.assert_allclose(made({"colours": "grey"}).colour([0, 5, 10])[:, 0], [0, 0.5, 1])
-    np.testing.assert_allclose(
-        made({"colours": "grey", "range": [4, 6]}).colour([0, 5, 10])[:, 0], [0, 0.5, 1]
-    )
-    points = made({"colours": [[2, "#000000"], [4, "white"]]})
-    np.testing.assert_allclose(points.colour([0, 3, 9])[:, 0], [0, 0.5, 1])
 
 
 @pytest.mark.parametrize(
@@ -305,20 +228,6 @@ def test_visible_is_a_query_by_range() -> None:
     np.testing.assert_array_equal(function.visible(low, high), wider)
     assert 100 < truth.sum() < 2900
     assert not np.any(truth & ~wider)
-
-
-def test_visible_beyond_the_ends_and_of_nothing() -> None:
-    function = made({"opacity": [[2, 0.5], [4, 0]]})
-    assert function.visible([-5, 5, 3.9], [-4, 6, 8]).tolist() == [True, False, True]
-    assert function.visible([np.nan, np.inf, 3, 0], [1, -np.inf, 2, np.nan]).tolist() == [False] * 4
-    assert function.visible(np.zeros((2, 3)), np.ones((2, 3))).shape == (2, 3)
-    assert bool(made({"opacity": "opaque"}).visible(1e30, 1e31))
-
-
-def test_a_narrow_range_gets_the_whole_table() -> None:
-    function = made({"opacity": [[0, 0], [5, 0], [5.0005, 1], [5.001, 0], [10, 0]]})
-    assert function.span == (5.0, 5.001)
-    assert function.table()[3].max() > 5
 
 
 def test_a_peak_that_a_table_misses_is_told() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from fhash_codec.rendering.plan import plan_picture
 from fhash_codec.rendering.scenes import Camera, Clip
 from fhash_codec.rendering.view import (
     Body,
-    corners_of,
     edges,
     outer_edges,
     part_in_view,
@@ -90,12 +88,6 @@ def test_what_leaves_nothing_is_refused(settings: dict[str, Any], part: str) -> 
 
 def test_a_clip_that_only_touches_leaves_an_empty_picture() -> None:
     assert body_of(x=[6, 7]).bounds[0].tolist() == [10, 10]
-
-
-def test_corners_of_a_cube() -> None:
-    normals = np.concatenate([np.eye(3), -np.eye(3)])
-    corners = corners_of(normals, np.array([0.0, 0, 0, 1, 1, 1]), 1e-9)
-    assert sorted(map(tuple, corners + 0.0)) == list(itertools.product((0, 1), repeat=3))
 
 
 @pytest.mark.parametrize("projection", ["perspective", "parallel"])
@@ -189,16 +181,6 @@ COORDS = {
 
 
 GRID_BOX = Grid.of(COORDS)
-
-
-@pytest.mark.parametrize("projection", ["perspective", "parallel"])
-@pytest.mark.parametrize("view", ["iso", "xy", "zx"])
-def test_every_edge_has_its_side(view: str, projection: str) -> None:
-    seen = edges(Rays.of(Camera(view=view, projection=projection), GRID_BOX, (64, 64)))
-    assert len(seen) == 12
-    assert {edge.axis for edge in outer_edges(Rays.of(Camera(), GRID_BOX, (64, 64)))} == {0, 1, 2}
-    assert all(0 <= edge.fronts <= 2 for edge in seen)
-    assert min(edge.fronts for edge in seen) == 0
 
 
 def test_edges_behind_a_perspective_camera_are_cut_off() -> None:

@@ -19,7 +19,6 @@ from fhash_codec.simulation.simulate import (
     counts,
     reasons,
     simulate,
-    spacing_of,
     terms_of,
 )
 from fhash_formats.errors import InputError, RegionError
@@ -147,13 +146,6 @@ def test_blocks_cover_every_vertex_once_and_are_small(shape: tuple[int, int, int
     assert (covered == 1).all()
 
 
-def test_a_finer_lattice_shows_the_same_field() -> None:
-    coarse, fine = (simulate("front", (2, n, n, n)).read(1) for n in (24, 48))
-    means = fine.reshape(24, 2, 24, 2, 24, 2).mean(axis=(1, 3, 5))
-    assert np.abs(means - coarse).mean() < 0.02
-    assert np.corrcoef(means.ravel(), coarse.ravel())[0, 1] > 0.97
-
-
 def test_flows_in_turn_come_near_the_exact_motion_with_more_splits() -> None:
     """A blob is blown along while it turns: the exact place follows from the velocities."""
     effects = [
@@ -191,21 +183,6 @@ def test_the_amount_of_a_blob_stays(effect: dict[str, Any], kept: float) -> None
     np.testing.assert_allclose(amounts, amounts[0], rtol=kept)
 
 
-def test_the_amount_of_a_wound_up_blob_comes_nearer_on_a_finer_lattice() -> None:
-    """Widths of sheets as thin as the lattice are estimates: 28 % off at worst on 16^3 vertices."""
-    effects = [
-        {"effect": "blob", "centre": (0.5, 0.5, 0.4), "radius": 0.15},
-        {"effect": "vortex", "strength": 1},
-    ]
-
-    def gain(count: int) -> float:
-        series = simulate({"effects": effects}, (2, count, count, count))
-        first, last = (float(frame.mean(dtype=np.float64)) for frame in series.frames())
-        return abs(last / first - 1)
-
-    assert gain(56) < 0.5 * gain(14) < 0.15
-
-
 def test_counters_say_what_was_computed() -> None:
     effects = [BLOB, {"effect": "rotation"}, {"effect": "vortex"}, {"effect": "diffusion"}]
     series = simulate({"effects": effects, "splits": 3}, (2, 4, 4, 4))
@@ -239,12 +216,6 @@ def test_a_frame_that_no_memory_holds_is_refused() -> None:
     assert simulate("front", (1, 16384, 16384, 8)).shape[1] == 16384
 
 
-def test_memory_does_not_grow_with_the_steps() -> None:
-    series = simulate("vortex", (10_000, 4, 4, 4))
-    assert series.read(9_999).nbytes == 256
-    assert series.counters.frames == 1
-
-
 BLOB_TERMS = {"effect": "blob"}
 
 
@@ -269,44 +240,6 @@ def test_an_effect_that_is_not_named_or_has_no_strength_is_never_made(
 ) -> None:
     assert made(monkeypatch, BLOB_TERMS) == ["blob"]
     assert made(monkeypatch, BLOB_TERMS, {"effect": kind, "strength": 0}) == ["blob"]
-
-
-@pytest.mark.parametrize("kind", EFFECTS)
-def test_a_named_effect_is_made_once(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    assert made(monkeypatch, BLOB_TERMS, {"effect": kind}) == ["blob", kind]
-
-
-def test_without_a_body_nothing_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    effects = [{"effect": kind} for kind, effect in EFFECTS.items() if effect.role != "body"]
-    assert made(monkeypatch, *effects) == []
-    terms = terms_of(SimulatedScene(effects=tuple(effects)), 0)  # type: ignore[arg-type]
-    assert len(terms.idle) == len(effects)
-    assert "no body" in terms.idle[0]
-
-
-def test_roles_and_sums() -> None:
-    effects = (BLOB_TERMS, {"effect": "diffusion"}, {"effect": "diffusion", "strength": 0.5})
-    terms = terms_of(SimulatedScene(effects=effects), 0)  # type: ignore[arg-type]
-    assert terms.diffusivity == pytest.approx(0.501)
-    assert terms.spreads == [1, 2]
-    assert not terms.stretched
-    assert terms.exact
-
-
-@pytest.mark.parametrize(
-    ("kind", "sheared", "exact"),
-    [("rotation", False, True), ("vortex", True, True), ("turbulence", True, False)],
-)
-def test_flows_say_whether_they_shear_and_are_exact(kind: str, sheared: bool, exact: bool) -> None:
-    one = SimulatedScene(effects=(BLOB_TERMS, {"effect": kind}))  # type: ignore[arg-type]
-    two = SimulatedScene(effects=(BLOB_TERMS, {"effect": kind}, {"effect": "advection"}))  # type: ignore[arg-type]
-    assert (terms_of(one, 0).sheared, terms_of(one, 0).exact) == (sheared, exact)
-    assert not terms_of(two, 0).exact
-
-
-def test_the_spacing_of_one_vertex_is_zero() -> None:
-    scene = SimulatedScene(shape=(1, 4, 10), size=(1.0, 2.0, 5.0))
-    assert spacing_of(scene) == (0.0, 0.5, 0.5)
 
 
 EFFECTS_HERE = [

@@ -16,8 +16,10 @@ import pytest
 from PIL import Image as Pictures
 
 from fhash_codec import EncodeConfig, Renderer, Volume, encode_dataset
-from fhash_codec.rendering.film import animate, film, numbered, rendered_by_workers
-from fhash_codec.rendering.image import Image
+from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering import film as film_module
+from fhash_codec.rendering.film import Animated, Target, film, numbered, rendered_by_workers
+from fhash_codec.rendering.image import Draw, Image
 from fhash_codec.rendering.scenes import Effects, Scene, TransferFunctionSpec, scene_in_png
 from fhash_codec.rendering.timeline import Animation
 from fhash_codec.volume import open as open_volume
@@ -31,6 +33,20 @@ from fhash_formats.errors import (
 )
 
 SMALL = Scene(size=(20, 14))
+
+
+def animate(
+    volume: Volume,
+    scene: Scene,
+    animation: Animation,
+    output: Path,
+    *,
+    progress: Progress = silent,
+    draw: Draw | None = None,
+    **how: Any,
+) -> Animated:
+    target = Target(output=output, **how)
+    return film_module.animate(volume, scene, animation, target, progress=progress, draw=draw)
 
 
 def read_film(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -106,20 +122,6 @@ def test_an_interrupted_film_leaves_nothing(volume: Volume, tmp_path: Path, draw
         with pytest.raises(KeyboardInterrupt):
             animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / name, draw=draw)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_film_is_refused_before_any_work(
-    volume: Volume, tmp_path: Path, drawing: Any
-) -> None:
-    (tmp_path / "a.gif").write_bytes(b"mine")
-    draw = drawing()
-    with pytest.raises(OutputExistsError):
-        animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / "a.gif", draw=draw)
-    assert draw.scenes == []
-    animate(
-        volume, SMALL, Animation.parse("steps", volume), tmp_path / "a.gif", draw=draw, force=True
-    )
-    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF")
 
 
 def test_without_the_package_an_mp4_says_what_to_install(
@@ -213,20 +215,6 @@ def test_pictures_are_numbered_and_hold_their_scene(
     assert [scene_in_png(path) for path in done.paths] == draw.scenes
     assert draw.upcoming == [*draw.scenes[1:], None]
     assert [path.name for path in numbered(Path("b.png"), 10_001)][-1] == "b.10000.png"
-
-
-def test_an_interrupted_animation_goes_on(volume: Volume, tmp_path: Path, drawing: Any) -> None:
-    animation, output = Animation.parse("steps", volume), tmp_path / "a.png"
-    whole = animate(volume, SMALL, animation, output, draw=drawing())
-    before = [path.read_bytes() for path in whole.paths]
-    whole.paths[1].unlink()
-    whole.paths[3].unlink()
-    draw = drawing()
-    done = animate(volume, SMALL, animation, output, draw=draw)
-    assert (done.rendered, done.kept) == (2, 3)
-    assert [scene.step for scene in draw.scenes] == [1, 3]
-    assert draw.upcoming == [None, None]  # what follows is there already
-    assert [path.read_bytes() for path in whole.paths] == before
 
 
 @pytest.mark.parametrize("spoil", ["cut", "scene", "another volume"])

@@ -27,25 +27,6 @@ def test_mixing_keeps_order_and_kinds() -> None:
     assert mixed(one, other, 1.0) is other
 
 
-def test_points_that_ascend_still_do_between() -> None:
-    first, second = ((0.0, 0.0), (1.0, 0.2), (5.0, 0.3)), ((-4.0, 1.0), (4.0, 0.0), (4.5, 0.1))
-    for weight in (0.1, 0.5, 0.9):
-        values = [value for value, _ in mixed(first, second, weight)]
-        assert values == sorted(values)
-
-
-def test_time_and_camera_stay_those_of_the_first_scene() -> None:
-    first = Scene(camera=Camera(azimuth=10.0), step=1.0, background="#000000")
-    second = Scene(camera=Camera(azimuth=50.0), step=2.0, background="#ffffff")
-    between = mixed(first, second, 0.5)
-    assert (between.camera, between.step) == (first.camera, 1.0)
-    assert between.background == "#808080"
-
-
-def test_tuples_of_other_lengths_are_not_mixed() -> None:
-    assert mixed((1.0, 2.0), (3.0,), 0.5) == (1.0, 2.0)
-
-
 SMALL = Scene(size=(20, 14))
 
 
@@ -71,26 +52,6 @@ def test_keys_are_met_and_their_settings_mixed(volume: Volume) -> None:
     np.testing.assert_allclose(scenes[2].transfer_function.opacity, [[0.25, 0.2], [2.0, 0.4]])
     assert [scene.effects.shadows is None for scene in scenes] == [True] * 8 + [False]
     assert scenes[4].transfer_function == keys[1].transfer_function
-
-
-def test_a_timeline_passes_its_keys_and_rests_beyond_them(volume: Volume) -> None:
-    keys = [(0.25, Scene(step=1.0, size=(20, 14))), (0.75, Scene(step=3.0, size=(20, 14)))]
-    timeline = Timeline(keys, volume, scale=None)
-    shares = (0.0, 0.25, 0.5, 0.75, 1.0)
-    assert [timeline.scene(share).step for share in shares] == [1, 1, 2, 3, 3]
-
-
-def test_given_times_replace_those_of_the_keys(volume: Volume) -> None:
-    keys = [(0.0, Scene(step=1.0)), (1.0, Scene(step=3.0))]
-    assert Timeline(keys, volume, scale=None, steps=(4, 0)).scene(0.5).step == 2
-    by_time = Timeline(keys, volume, scale=None, times=(0, 8)).scene(0.25)
-    assert (by_time.step, by_time.time) == (None, 2)
-
-
-def test_a_still_scene_keeps_its_time_and_turns(volume: Volume) -> None:
-    timeline = Timeline([(0.0, Scene(time=4.0))], volume, scale=None, orbit=90.0)
-    scene = timeline.scene(0.5)
-    assert (scene.step, scene.time, scene.camera.azimuth) == (None, 4.0, 45.0)
 
 
 def test_keys_outside_the_series_are_refused_even_where_other_times_are_given(
@@ -148,13 +109,6 @@ def test_a_whole_turn_ends_before_it_begins_again(volume: Volume) -> None:
     assert {each.step for each in scenes} == {2.0}
     half = dataclasses.replace(Animation.parse("orbit=180", volume), frames=3).scenes(scene, volume)
     assert [each.camera.azimuth for each in half] == [10, 100, 190]
-
-
-def test_time_and_orbit_together(volume: Volume) -> None:
-    scenes = dataclasses.replace(Animation.parse("steps,orbit=90", volume), frames=3).scenes(
-        SMALL, volume
-    )
-    assert [(scene.step, scene.camera.azimuth) for scene in scenes] == [(0, 0), (2, 45), (4, 90)]
 
 
 def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
@@ -247,9 +201,3 @@ def test_every_n_th_step(words: str, steps: list[float], volume: Volume) -> None
     animation = Animation.parse(words, volume)
     assert [scene.step for scene in animation.scenes(SMALL, volume)] == steps
     assert animation.rate == (8.0 if all(float(step).is_integer() for step in steps) else 24.0)
-
-
-def test_every_n_th_time_and_an_orbit(volume: Volume) -> None:
-    scenes = Animation.parse("time=0:8:3,orbit=90", volume).scenes(SMALL, volume)
-    assert [scene.time for scene in scenes] == [0, 3, 6]
-    assert [scene.camera.azimuth for scene in scenes] == [0, 45, 90]

@@ -6,20 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 import pytest
-from frame_field import FrameField
+from frame_field import FrameField, frame_of, table_of, task_of
 
 from fhash_codec import Renderer, Scene, Volume
-from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.light import light_grid
-from fhash_codec.rendering.march_task import Arrays, Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.march_task import Arrays, Lighting, Surface, Task
 from fhash_codec.rendering.renderer import decoded_frame
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.rendering.stream_fields import Field, NetworkField
-from fhash_formats.series import Coordinate
 
 
 @pytest.fixture
@@ -36,29 +32,16 @@ def frame_task() -> Callable[..., tuple[FrameField, Task]]:
         surfaces: tuple[Surface, ...] = (),
         fog: float = 0.0,
     ) -> tuple[FrameField, Task]:
-        axes = {
-            axis: Coordinate(name=axis, values=np.arange(n, dtype=float), attributes={})
-            for axis, n in zip("zyx", values.shape, strict=True)
-        }
-        grid = Grid.of(axes)
-        frame = Frame(values=values.astype(np.float32), first=(0, 0, 0))
-        table = Table(
-            low=0.0,
-            high=1.0,
-            colours=np.ones((2, 3), dtype=np.float32),
-            extinctions=np.full(2, fog),
-        )
         ambient = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
-        return FrameField(frame, grid), Task(
-            rays=Rays.of(
-                Camera(view="xy", projection="parallel", parallel_scale=2.0), grid, (8, 8)
-            ),
+        task = task_of(
+            values.shape,
+            table_of([fog, fog]) if fog else None,
+            camera=Camera(view="xy", projection="parallel", parallel_scale=2.0),
             step=step,
-            threshold=0.0,
-            table=table if fog else None,
             surfaces=surfaces,
             lighting=ambient if surfaces else None,
         )
+        return FrameField(frame_of(values), task.rays.grid), task
 
     return of
 
@@ -82,8 +65,7 @@ def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
         if plan.lights:
             light = light_grid(
                 frame,
-                grid,
-                task.table,
+                task,
                 shadows=plan.shadows,
                 lamp=plan.lamp,
                 ambient_occlusion=plan.occlusion,

@@ -1,4 +1,4 @@
-"""Streamed marches, with numpy and torch."""
+"""Streamed rays and marches, with numpy and torch."""
 
 from __future__ import annotations
 
@@ -13,17 +13,101 @@ from frame_field import FrameField
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering.bricks import Palette
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Marched, Surface, Task
 from fhash_codec.rendering.plan import arrays_on
-from fhash_codec.rendering.stream_fields import Field
-from fhash_codec.rendering.stream_march import Projection, crossings, stream
-from fhash_codec.rendering.stream_rays import Beams
+from fhash_codec.rendering.stream_fields import Beams, Field, Leaping, shares
+from fhash_codec.rendering.stream_march import Canvas, Events, stream
 from fhash_formats.errors import InputError
 
 FrameTask = Callable[..., tuple[FrameField, Task]]
-Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Any, Task]]
+
+
+def test_shares_are_spread_evenly_and_belong_to_the_number() -> None:
+    found = shares(np.arange(10_000), NUMPY)
+    assert 0 < found.min() < found.max() < 1
+    counts = np.histogram(found, bins=10, range=(0, 1))[0]
+    assert np.abs(counts - 1000).max() < 150
+    np.testing.assert_array_equal(shares(np.array([7, 3]), NUMPY), found[[7, 3]])
+
+
+def test_rows_of_a_picture_are_those_of_the_whole(frame_task: FrameTask) -> None:
+    field, task = frame_task(np.zeros((9, 7, 7)), fog=1.0)
+    task = replace(task, jitter=True, antialiasing=2)
+    whole = Beams.of(task, field.bounds, range(8))
+    part = Beams.of(task, field.bounds, range(3, 5))
+    chosen = slice(3 * 32, 5 * 32)
+    np.testing.assert_array_equal(part.origin, whole.origin[chosen])
+    np.testing.assert_array_equal(part.depth, whole.depth[chosen])
+
+
+def test_a_leap_ends_at_the_first_sample_in_a_brick_that_matters(frame_task: FrameTask) -> None:
+    values = np.zeros((60, 9, 9))
+    values[37:41] = 1.0
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    field, task = frame_task(values, step=0.4, surfaces=(surface,))
+    beams = Beams.of(task, field.bounds, range(8))
+    leaping = Leaping.of(field.bricks, task, field.first, NUMPY)
+    rays, every_ray = np.arange(64), np.ones(64, dtype=bool)
+    reached, leaps = leaping.leap(beams.origin, beams.pace, beams.begin, beams.end, every_ray)
+    every = np.arange(beams.end.max())[None]
+    matters = leaping.matters(beams.places(rays, np.broadcast_to(every, (64, every.size))))
+    assert 0 < leaps < 20 * 64
+    np.testing.assert_array_equal(reached, matters.argmax(axis=1))
+    # From a sample in a brick that matters there is no leap.
+    again, none = leaping.leap(beams.origin, beams.pace, reached, beams.end, every_ray)
+    np.testing.assert_array_equal(again, reached)
+    assert none == 0
+
+
+Planned = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
+
+
+@pytest.mark.parametrize("cuts", [(), (1,), (1, 2), (2,)])
+def test_events_are_joined_front_to_back_however_they_are_split(
+    frame_task: FrameTask, cuts: tuple[int, ...]
+) -> None:
+    field, task = frame_task(np.full((9, 7, 7), 0.5), fog=0.1)
+    task = replace(task, depth=True)
+    beams = Beams.of(task, field.bounds, range(8))
+    assert task.table is not None
+    canvas = Canvas(field, task, beams, Palette.of(task.table))
+    rays = np.array([3, 9])
+    opacity = np.array([[0.25, 0.5, 0.5], [0.0, 0.125, 0.0]])
+    at = np.broadcast_to(np.arange(3.0), (2, 3))
+    for part in np.split(np.arange(3), cuts):
+        canvas.add(
+            rays,
+            Events(
+                opacity=opacity[:, part],
+                at=at[:, part],
+                which=np.zeros((2, len(part)), dtype=np.int64),
+                values=np.full((2, len(part)), 0.5),
+            ),
+        )
+    np.testing.assert_array_equal(canvas.clear[rays], [0.1875, 0.875])
+    np.testing.assert_allclose(canvas.colour[rays], np.array([[0.8125], [0.125]]) * np.ones(3))
+    # Less than half of the light is left after the second event of the first ray alone.
+    assert canvas.depth[3] == beams.depth[3] + task.step
+    assert np.isinf(canvas.depth[9])
+
+
+def test_central_shading_differs_from_that_of_cells_and_keeps_the_normals(
+    volume: Volume, planned: Planned, central_scene: dict[str, Any]
+) -> None:
+    effects = {**central_scene["effects"], "shading": {"light": [1, 2, 3]}}
+    cells, central = (
+        stream(*planned(volume, scene, NUMPY), adaptive=True)
+        for scene in ({**central_scene, "effects": effects}, central_scene)
+    )
+    assert 1e-3 < np.abs(cells.rgba - central.rgba)[..., :3].max() < 0.3
+    np.testing.assert_array_equal(cells.rgba[..., 3], central.rgba[..., 3])
+    np.testing.assert_array_equal(cells.normal, central.normal)
+    assert cells.counters == central.counters
+
+
 FramePicture = Callable[[str, dict[str, Any]], Marched]
 
 
@@ -97,17 +181,6 @@ def test_counters_prove_that_nothing_else_is_done(frame_picture: FramePicture, m
     assert depth == plain
 
 
-def test_bricks_that_cannot_be_seen_cost_nothing(frame_picture: FramePicture) -> None:
-    narrow: dict[str, Any] = {"transfer_function": {"opacity": [[6, 0], [7, 0.5], [8, 0]]}}
-    skipping, marching = (
-        frame_picture("arm", {**narrow, "march": {"skipping": on}}) for on in (True, False)
-    )
-    np.testing.assert_array_equal(skipping.rgba, marching.rgba)
-    assert skipping.counters["skipped_bricks"] > 0
-    assert marching.counters["skipped_bricks"] == 0
-    assert skipping.counters["samples"] < marching.counters["samples"] / 3
-
-
 def test_only_samples_in_visible_cells_are_evaluated(
     frame_picture: FramePicture, planned: Planned, volume: Volume
 ) -> None:
@@ -130,16 +203,6 @@ def test_only_samples_in_visible_cells_are_evaluated(
     x, y, z = np.minimum(beams.places(row, column).astype(int), np.array(visible.shape[::-1]) - 1).T
     inside = int(visible[z, y, x].sum())
     assert inside <= found.counters["evaluations"] <= 1.1 * inside
-
-
-def test_rays_end_where_no_light_is_left(frame_picture: FramePicture) -> None:
-    opaque: dict[str, Any] = {"transfer_function": {"opacity": "opaque"}}
-    ending, going = (
-        frame_picture("stream", {**opaque, "march": {"threshold": threshold}})
-        for threshold in (1 / 1024, 0.0)
-    )
-    assert ending.counters["samples"] < going.counters["samples"] / 4
-    np.testing.assert_allclose(ending.rgba, going.rgba, atol=1 / 1024)
 
 
 NETWORK: dict[str, Any] = {
@@ -181,16 +244,6 @@ def test_the_picture_of_a_network_is_near_that_of_its_vertices(
     assert np.mean(np.abs(streamed - cache)) < 0.02
 
 
-@pytest.mark.parametrize("fog", [1e-9, 1e-3, 0.3])
-@pytest.mark.parametrize("step", [0.02, 0.37, 5.0])
-def test_a_slab_of_fog_is_as_opaque_as_its_length(
-    frame_task: FrameTask, fog: float, step: float
-) -> None:
-    field, task = frame_task(np.full((9, 7, 7), 0.5), step=step, fog=fog)
-    rgba = stream(field, task, adaptive=True).rgba
-    np.testing.assert_allclose(rgba, -np.expm1(-fog * 8), rtol=1e-6)
-
-
 @pytest.mark.parametrize("budget", [1, 10**6])
 @pytest.mark.parametrize("value", [0.381, 0.395, 0.405, 0.81, 0.795, 0.99])
 @pytest.mark.parametrize(("count", "step"), [(11, 0.5), (10, 3.9)])
@@ -204,93 +257,6 @@ def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
     for skipping in (True, False):
         found = stream(field, replace(task, skipping=skipping), adaptive=True, budget=budget)
         np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
-
-
-@pytest.mark.parametrize("budget", [1, 10**6])
-@pytest.mark.parametrize("level", [0.0625, 0.3, 0.6, 0.9375])
-def test_every_crossing_of_a_wave_is_seen(frame_task: FrameTask, level: float, budget: int) -> None:
-    wave = np.abs((np.arange(97) + 12) % 24 - 12.0) / 12
-    field, task = frame_task(
-        np.broadcast_to(wave[:, None, None], (97, 7, 7)),
-        step=0.9,
-        surfaces=(Surface(value=level, colour=np.ones(3), opacity=0.1),),
-    )
-    np.testing.assert_allclose(
-        stream(field, task, adaptive=True, budget=budget).rgba, 1 - 0.9**8, atol=1e-6
-    )
-
-
-def test_nothing_is_seen_of_what_has_no_value(frame_task: FrameTask) -> None:
-    field, task = frame_task(np.full((9, 7, 7), np.nan), fog=1.0)
-    found = stream(field, task, adaptive=False)
-    assert not found.rgba.any()
-    assert found.counters["samples"] == 0
-
-
-VALUES = np.array([[0.2, 0.9, np.nan, 0.4], [np.nan, 0.1, 0.6, 0.6], [np.nan] * 4])
-LENGTHS = np.array([[1.0, 1.0, 1.0, 0.5]] * 3)
-OPACITIES = np.where(np.isnan(VALUES), 0.0, 0.5 * np.nan_to_num(VALUES))
-
-
-@pytest.mark.parametrize("pace", [1, 3, 4])
-@pytest.mark.parametrize(
-    ("kind", "values", "at"),
-    [
-        ("maximum", [0.9, 0.6], [1, 2]),
-        ("minimum", [0.2, 0.1], [0, 1]),
-        ("average", [1.3 / 2.5, 1.0 / 2.5], [0, 1]),
-        ("attenuated", [0.9 * 0.9, 0.6 * 0.95], [1, 2]),
-    ],
-)
-def test_values_and_places(kind: str, values: list[float], at: list[int], pace: int) -> None:
-    projection = Projection(kind, (0.0, 1.0), 3, NUMPY)
-    alive = np.arange(3)
-    for first in range(0, 4, pace):
-        part = slice(first, min(first + pace, 4))
-        sample = np.broadcast_to(np.arange(4)[part], VALUES[:, part].shape)
-        projection.add(alive, sample, VALUES[:, part], LENGTHS[:, part], OPACITIES[:, part])
-    np.testing.assert_allclose(projection.values[:2], values, rtol=1e-14)
-    assert not np.isfinite(projection.values[2])
-    np.testing.assert_array_equal(projection.at[:2], at)
-
-
-def test_only_an_attenuated_maximum_can_be_finished_early() -> None:
-    for kind in ("maximum", "minimum", "average", "attenuated"):
-        projection = Projection(kind, (0.0, 1.0), 1, NUMPY)
-        projection.add(
-            np.array([0]), np.array([[0]]), np.array([[0.7]]), np.ones((1, 1)), np.full((1, 1), 0.5)
-        )
-        assert projection.finished(np.array([0]))[0] == (kind == "attenuated")
-
-
-def test_roots_are_exact() -> None:
-    sample = np.arange(6.0)[None]
-    found = crossings(
-        lambda row, at, counted: (at - 2.3) ** 3,
-        sample,
-        (sample - 2.3) ** 3,
-        (
-            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
-            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
-        ),
-    )
-    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
-    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
-    assert found.which[0, 1:3, 0].tolist() == [1, 0]
-
-
-def test_nothing_is_crossed_where_a_value_is_missing() -> None:
-    """Neither between samples of which one has no value, nor where the search meets none."""
-    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
-    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
-    missing = crossings(lambda row, at, _: np.full(len(at), np.nan), sample, values, (surface,))
-    assert not missing.opacity.any()
-    there = crossings(lambda row, at, counted: at - 2, sample, values, (surface,))
-    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
-    assert there.at[0, 2, 0] == 2.5
-
-
-Planned_stream_torch = Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]
 
 
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:
@@ -308,7 +274,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
 
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
-    planned: Planned_stream_torch,
+    planned: Planned,
     volume: Volume,
     tensors: Arrays,
     scene: dict[str, Any],
@@ -328,7 +294,7 @@ def test_torch_makes_the_picture_of_numpy(
 
 
 def test_nothing_leaves_the_device_before_the_picture(
-    planned: Planned_stream_torch, volume: Volume, tensors: Arrays
+    planned: Planned, volume: Volume, tensors: Arrays
 ) -> None:
     import torch
     from torch.overrides import TorchFunctionMode
@@ -368,7 +334,7 @@ def test_nothing_leaves_the_device_before_the_picture(
 
 
 def test_torch_marches_through_a_network_as_numpy_does(
-    planned: Planned_stream_torch,
+    planned: Planned,
     files: dict[str, Path],
     tensors: Arrays,
     network_scene: dict[str, Any],
@@ -390,7 +356,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])
 def test_cuda_makes_the_picture_of_numpy(
-    files: dict[str, Path], planned: Planned_stream_torch, central_scene: dict[str, Any], kind: str
+    files: dict[str, Path], planned: Planned, central_scene: dict[str, Any], kind: str
 ) -> None:
     import torch
 
@@ -408,7 +374,7 @@ def test_cuda_makes_the_picture_of_numpy(
 
 
 def test_a_device_without_enough_memory_says_so(
-    planned: Planned_stream_torch, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
+    planned: Planned, volume: Volume, tensors: Arrays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 

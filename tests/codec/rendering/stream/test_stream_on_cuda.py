@@ -17,7 +17,7 @@ import fhash_codec
 from fhash_codec import Volume
 from fhash_codec.paper.engines.fused import program as driver
 from fhash_codec.paper.engines.fused.engine import FusedPoints
-from fhash_codec.rendering import stream_rays as canvas
+from fhash_codec.rendering import stream_march as canvas
 from fhash_codec.rendering.march_task import NUMPY, Arrays, Task
 from fhash_codec.rendering.plan import arrays_on
 from fhash_codec.rendering.stream_fields import Field
