@@ -6,9 +6,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from fhash_codec.bench.rate.plot import require_matplotlib
 from fhash_codec.cost.page import json_text, page, require_plotly
-from fhash_codec.cost.plot import plot
+from fhash_codec.cost.plot import plot, require_matplotlib
 from fhash_codec.cost.results import CostReport
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
 from fhash_formats.support.files import check_output, explained, replacing_all

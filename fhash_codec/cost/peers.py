@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.bench.rate.measuring import UNIFORM
-from fhash_codec.bench.rate.own import trial_of
 from fhash_codec.bench.rate.peers import (
     Variant,
     filled,
@@ -20,7 +18,7 @@ from fhash_codec.bench.rate.peers import (
     stored,
     stored_bytes,
 )
-from fhash_codec.bench.rate.search import EXACT, Search, Trial
+from fhash_codec.bench.rate.search import EXACT, UNIFORM, Search, Trial, trial_of
 from fhash_codec.cost.allowance import Allowance, BudgetSpentError
 from fhash_codec.cost.facts import Facts
 from fhash_codec.cost.plan import Wish

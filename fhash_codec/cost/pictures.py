@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from statistics import median
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.bench.pictures.likeness import black, picture_psnr, picture_ssim
-from fhash_codec.bench.pictures.pictures import FINEST, STEPS, THRESHOLDS, in_turns
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.own import KeptFile
 from fhash_codec.cost.reads import LEVELS
@@ -38,6 +38,14 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series
 
 __all__ = ["NOTHING", "PictureCosts"]
+
+STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+"""Ray steps, in vertex spacings."""
+THRESHOLDS = (0.3, 0.1, 0.03, 0.01, 1 / 256, 1 / 1024)
+"""Shares of light at which a ray ends."""
+FINEST = {"step": 1 / 32, "threshold": 0.0, "lod": 0.0}
+"""Finest setting of each knob; pictures of other settings are compared with its picture."""
+
 
 SIZE = 384
 """Pixels along both sides."""
@@ -253,3 +261,18 @@ def _likeness(rgba: Single, reference: Single | None) -> tuple[float | None, flo
     if reference is rgba:
         return None, 1.0
     return picture_psnr(rgba, reference, 1.0), picture_ssim(black(rgba), black(reference))
+
+
+def in_turns(runs: Mapping[str, Callable[[], Image]], turns: int) -> dict[str, tuple[float, Image]]:
+    """Run every variant once without timing, then in turns.
+
+    Returns the median milliseconds and the last picture of each variant.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    images = {name: run() for name, run in runs.items()}
+    for _ in range(turns):
+        for name, run in runs.items():
+            begun = time.perf_counter()
+            images[name] = run()
+            seconds[name].append(time.perf_counter() - begun)
+    return {name: (1e3 * median(seconds[name]), images[name]) for name in runs}

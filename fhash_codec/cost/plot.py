@@ -6,11 +6,11 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.bench.rate.plot import require_matplotlib
 from fhash_codec.cost.advice import bytes_text
 from fhash_codec.cost.panel import Axis, Panel
 from fhash_codec.cost.panels import panels
 from fhash_codec.cost.results import CostReport
+from fhash_formats.errors import MissingDependencyError
 
 __all__ = ["plot"]
 
@@ -119,3 +119,13 @@ def _plain(value: float, _: int) -> str:
 
 def _nothing(*_: object) -> str:
     return ""
+
+
+def require_matplotlib() -> Any:
+    """The module that draws; raises MissingDependencyError."""
+    try:
+        return importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "a plot needs matplotlib; pip install 'fhash[bench]'"
+        ) from error

@@ -85,7 +85,7 @@ def ablate(
     if any(axis.profile == "paper" for axis in axes_named(names)):
         need_torch("bench ablate")
     if plot is not None:
-        from fhash_codec.bench.rate.plot import require_matplotlib
+        from fhash_codec.cost.plot import require_matplotlib
 
         require_matplotlib()
         check_writable(plot, force, sources=[] if data is None else [data])

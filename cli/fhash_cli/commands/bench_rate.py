@@ -106,8 +106,8 @@ def rate(
     with Progress(quiet=quiet) as progress, opened(data, source, progress) as series:
         from fhash_codec.bench.rate.own import PROFILES
         from fhash_codec.bench.rate.plot import plot as draw
-        from fhash_codec.bench.rate.plot import require_matplotlib
         from fhash_codec.bench.rate.rate import BOUNDS, TARGETS, bench_rate
+        from fhash_codec.cost.plot import require_matplotlib
 
         if plot is not None:
             require_matplotlib()

@@ -110,7 +110,7 @@ def render(
         from fhash_codec.bench.pictures.pictures import bench_render
         from fhash_codec.bench.pictures.plot import plot as draw
         from fhash_codec.bench.pictures.results import PARTS
-        from fhash_codec.bench.rate.plot import require_matplotlib
+        from fhash_codec.cost.plot import require_matplotlib
         from fhash_codec.rendering.scenes import Scene
 
         if plot is not None:

@@ -130,7 +130,7 @@ def train(
 
     need_torch("bench train")
     if plot is not None:
-        from fhash_codec.bench.rate.plot import require_matplotlib
+        from fhash_codec.cost.plot import require_matplotlib
 
         require_matplotlib()
         check_writable(plot, force, sources=[] if data is None else [data])

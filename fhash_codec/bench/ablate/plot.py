@@ -7,7 +7,7 @@ from typing import Any
 
 from fhash_codec.bench.ablate.ablate import told
 from fhash_codec.bench.ablate.results import AblateBench, Row, Run
-from fhash_codec.bench.rate.plot import require_matplotlib
+from fhash_codec.cost.plot import require_matplotlib
 
 COLUMNS = 3
 """Panels side by side."""

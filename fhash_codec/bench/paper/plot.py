@@ -11,7 +11,7 @@ from typing import Any
 from fhash_codec.bench.paper.cell import Cell
 from fhash_codec.bench.paper.groups import Group, by_data, groups
 from fhash_codec.bench.paper.printed import DECIBELS, ENCODINGS, SETS
-from fhash_codec.bench.rate.plot import require_matplotlib
+from fhash_codec.cost.plot import require_matplotlib
 from fhash_formats.support.files import replacing
 
 __all__ = ["plot_convergence"]

@@ -12,10 +12,9 @@ from functools import partial
 from statistics import median
 from typing import Protocol
 
-from fhash_codec.bench.pictures import orbit
 from fhash_codec.bench.pictures.beside_vtk import timed
 from fhash_codec.bench.pictures.likeness import black, picture_psnr
-from fhash_codec.bench.pictures.orbit import shell, view_of_shell
+from fhash_codec.bench.pictures.orbit import SIDE, shell, view_of_shell
 from fhash_codec.bench.pictures.ospray_peer import OsprayPeer
 from fhash_codec.bench.pictures.results import Beside
 from fhash_codec.bench.pictures.vtk_peer import Drawn, VtkPeer, require_vtk
@@ -70,7 +69,7 @@ def beside_shell(
             raise
         variants = []
     variants += [] if ospray is None else [("OSPRay", False)]
-    side = orbit.SIDE
+    side = SIDE
     frame = Frame(values=shell(side), first=(0, 0, 0))
     bricks, found = Bricks.of(frame), []
     for number, (name, shaded) in enumerate(variants):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import CDLL
 from dataclasses import replace
 from functools import cache, partial
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -27,8 +25,8 @@ from fhash_codec.bench.pictures.results import (
     Stream,
     Switch,
 )
+from fhash_codec.cost.pictures import FINEST, STEPS, THRESHOLDS, in_turns
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import (
     AmbientOcclusion,
@@ -44,7 +42,7 @@ from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.support.threads import usable_threads
 
-__all__ = ["bench_render", "in_turns"]
+__all__ = ["bench_render"]
 
 TURNS = 5
 """Runs of each median, by default."""
@@ -54,14 +52,8 @@ STREAM_SIZE = 128
 """Pixels along both sides where rays march through the model, which is slow on a CPU."""
 NEAREST = 1e-2
 """Smallest zoom of the search for one at which a pixel is as wide as several vertices."""
-STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-"""Ray steps, in vertex spacings."""
-THRESHOLDS = (0.3, 0.1, 0.03, 0.01, 1 / 256, 1 / 1024)
-"""Shares of light at which a ray ends."""
 LEVELS = (3, 2, 1)
 """Levels of detail."""
-FINEST = {"step": 1 / 32, "threshold": 0.0, "lod": 0.0}
-"""Finest setting of each knob; pictures of other settings are compared with its picture."""
 NOTES = (
     "milliseconds are medians of runs in turns: each turn runs every variant once,"
     " from another side in comparisons with VTK",
@@ -183,21 +175,6 @@ def _measure(
         except MissingDependencyError as error:
             refused[part] = str(error)
     return results, refused, beside().version if beside.cache_info().currsize else None
-
-
-def in_turns(runs: Mapping[str, Callable[[], Image]], turns: int) -> dict[str, tuple[float, Image]]:
-    """Run every variant once without timing, then in turns.
-
-    Returns the median milliseconds and the last picture of each variant.
-    """
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    images = {name: run() for name, run in runs.items()}
-    for _ in range(turns):
-        for name, run in runs.items():
-            begun = time.perf_counter()
-            images[name] = run()
-            seconds[name].append(time.perf_counter() - begun)
-    return {name: (1e3 * median(seconds[name]), images[name]) for name in runs}
 
 
 class _Bench:

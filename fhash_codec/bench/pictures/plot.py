@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fhash_codec.bench.pictures.results import RenderBench
-from fhash_codec.bench.rate.plot import require_matplotlib
+from fhash_codec.cost.plot import require_matplotlib
 from fhash_formats.errors import InputError
 
 KNOBS = {"step": "#d1604b", "threshold": "#4a86c0", "lod": "#2f9e6e"}

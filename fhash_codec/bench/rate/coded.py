@@ -6,16 +6,9 @@ import time
 from pathlib import Path
 from typing import TypeAlias
 
+from fhash_codec.bench.rate.filters import read_region, touched_bytes
 from fhash_codec.bench.rate.layouts import Values
-from fhash_codec.bench.rate.peers import (
-    Variant,
-    opened_file,
-    read_all,
-    read_region,
-    stored,
-    stored_bytes,
-    touched_bytes,
-)
+from fhash_codec.bench.rate.peers import Variant, opened_file, read_all, stored, stored_bytes
 from fhash_codec.bench.rate.programs.program import Coded, ProgramVariant, folder_of
 from fhash_codec.boxes import Box
 

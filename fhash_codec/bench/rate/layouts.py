@@ -12,10 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.boxes import Box
-
 Values = npt.NDArray[Any]
-Spans = list[tuple[int, int]]
 
 LAYOUTS = {
     "frame": "(z, y, x) of each step",
@@ -51,20 +48,3 @@ def joined(parts: Sequence[Values], layout: str, shape: tuple[int, ...]) -> Valu
     if layout == "turned":
         return np.moveaxis(parts[0].reshape(planes, steps, *plane), 0, 1)
     return np.asarray(parts[0]).reshape(shape)
-
-
-def spans_of(
-    layout: str, shape: tuple[int, ...], step: int, region: Box
-) -> list[tuple[int, Spans]]:
-    """Part numbers that hold a region (z, y, x) of one step, with its spans in each."""
-    steps, planes = shape[:2]
-    (low, high), *plane = region
-    if layout == "frame":
-        return [(step, [*region])]
-    if layout == "plane":
-        return [(z, [(step, step + 1), *plane]) for z in range(low, high)]
-    if layout == "folded":
-        return [(0, [(step * planes + low, step * planes + high), *plane])]
-    if layout == "turned":
-        return [(0, [(z * steps + step, z * steps + step + 1), *plane]) for z in range(low, high)]
-    return [(0, [(step, step + 1), *region])]

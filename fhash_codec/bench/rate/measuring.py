@@ -15,11 +15,12 @@ import numpy.typing as npt
 
 from fhash_codec.bench.rate.clock import Spent, spent
 from fhash_codec.bench.rate.coded import AnyVariant, PeerFiles, there_and_back
-from fhash_codec.bench.rate.own import Own, promised, trial_of
-from fhash_codec.bench.rate.peers import SMALL_CHUNK, Variant, filled, small_chunks
+from fhash_codec.bench.rate.filters import SMALL_CHUNK, small_chunks
+from fhash_codec.bench.rate.own import Own, promised
+from fhash_codec.bench.rate.peers import Variant, filled
 from fhash_codec.bench.rate.programs.program import ProgramVariant, folder_of
 from fhash_codec.bench.rate.results import OWN, Access, Point, Speed, TilePrice
-from fhash_codec.bench.rate.search import Search, Trial
+from fhash_codec.bench.rate.search import UNIFORM, Search, Trial, trial_of
 from fhash_codec.bench.rate.timing import (
     LONG_SECONDS,
     PLACES,
@@ -43,8 +44,6 @@ SLACK = 0.05
 """dB of PSNR above the target at which a search ends."""
 BOUND_SLACK = 0.1
 """dB of the largest error below the bound at which a search ends."""
-UNIFORM = 20 * math.log10(math.sqrt(3))
-"""dB by which the RMSE of a uniformly distributed error lies below the tolerance."""
 ONE_TILE_VERTICES = 12_000_000
 """Vertices that are coded as one tile at most, to find the price of tiles; of longer series some
 steps in the middle."""

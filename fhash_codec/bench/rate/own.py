@@ -13,7 +13,7 @@ from typing import Any
 
 import fhash_codec
 from fhash_codec.bench.rate.clock import Spent, spent
-from fhash_codec.bench.rate.search import EXACT, Trial
+from fhash_codec.bench.rate.search import Trial, trial_of
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.errors import Errors
@@ -110,15 +110,3 @@ class Own:
             volume.read(step, region)
             count = volume.container.bytes_read
         return count, time.perf_counter() - begun
-
-
-def trial_of(errors: Errors, level: float, count: int) -> Trial:
-    """The Trial that stands for measured errors and a number of bytes."""
-    exact = errors.rmse == 0 or errors.psnr is None
-    largest = errors.max_abs_error or 0.0
-    return Trial(
-        level=level,
-        bytes=count,
-        psnr=EXACT if exact else float(errors.psnr or 0.0),
-        max_error=largest / errors.data_range,
-    )

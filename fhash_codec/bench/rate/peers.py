@@ -12,26 +12,22 @@ followed by Blosc (zstd, shuffle). Traps:
 from __future__ import annotations
 
 import importlib
-import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fhash_codec.bench.rate.layouts import Spans, Values, joined, parts_of, spans_of
-from fhash_codec.boxes import Box
+from fhash_codec.bench.rate.layouts import Values, joined, parts_of
 from fhash_formats.errors import InputError, MissingDependencyError
 
 Filter = Mapping[str, Any]
 
 LADDER = 20 * math.log10(2)
 """dB between settings that are powers of two apart."""
-SMALL_CHUNK = 32
-"""Vertices along an axis of a chunk, as a user who reads regions would choose."""
 MAX_CHUNK = 2**31
 """Bytes of the largest chunk; HDF5 allows less than 4 GiB."""
 
@@ -98,8 +94,6 @@ def peers() -> dict[str, tuple[Variant, ...]]:
         "SZ3": _sz3(plugins),
         "SPERR": _sperr(plugins),
         "ZFP": _zfp(plugins),
-        "BitRound": _bit_round(plugins),
-        "Blosc": _blosc(plugins),
     }
 
 
@@ -144,52 +138,6 @@ def _zfp(plugins: Any) -> tuple[Variant, ...]:
             peer="ZFP", mode="tolerance", layout=layout, goals=BOTH, setting=accuracy, step=LADDER
         )
         for layout in ("frame", "plane", "series")
-    )
-
-
-def _bit_round(plugins: Any) -> tuple[Variant, ...]:
-    return (
-        replace(
-            _lossless(plugins, "BitRound", "bits"),
-            lossless=False,
-            step=LADDER,
-            prepare=_rounded,
-        ),
-    )
-
-
-def _blosc(plugins: Any) -> tuple[Variant, ...]:
-    return (_lossless(plugins, "Blosc", "lossless"),)
-
-
-def _lossless(plugins: Any, peer: str, mode: str) -> Variant:
-    """Blosc (zstd, shuffle) on single frames."""
-
-    def setting(part: Values, data_range: float, level: float) -> Filter:
-        return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
-
-    return Variant(peer=peer, mode=mode, layout="frame", goals=BOTH, setting=setting, lossless=True)
-
-
-def small_chunks(variants: Sequence[Variant]) -> Variant:
-    """Variant of a peer for random access: small chunks of a frame.
-
-    All chunks share one tolerance, since they differ in range and detail.
-    """
-    return replace(
-        next(variant for variant in reversed(variants) if variant.layout == "frame"),
-        chunk=SMALL_CHUNK,
-    )
-
-
-def _rounded(values: Values, level: float) -> Values:
-    """Values with as many bits of the mantissa as a level has steps."""
-    from numcodecs import BitRound
-
-    bits = min(max(round(level / LADDER), 1), np.finfo(values.dtype).nmant)
-    codec = BitRound(bits)
-    return np.asarray(codec.decode(codec.encode(np.array(values))), dtype=values.dtype).reshape(
-        values.shape
     )
 
 
@@ -238,42 +186,6 @@ def read_all(file: Any, variant: Variant, shape: tuple[int, ...]) -> Values:
     """Every value of a series of `shape` (t, z, y, x), decoded."""
     parts = [file[str(number)][...] for number in range(len(file))]
     return joined(parts, variant.layout, shape)
-
-
-def read_region(
-    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
-) -> Values:
-    """A region (z, y, x) of one step of a series of `shape`."""
-    parts = [
-        dataset[tuple(slice(*span) for span in spans)]
-        for dataset, spans in _parts(file, variant, shape, step, region)
-    ]
-    return np.concatenate([part.reshape(-1, *part.shape[-2:]) for part in parts])
-
-
-def touched_bytes(
-    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
-) -> int:
-    """Stored bytes of the chunks that a region of one step meets."""
-    total = 0
-    for dataset, spans in _parts(file, variant, shape, step, region):
-        firsts = [
-            range(low // n * n, high, n)
-            for (low, high), n in zip(spans, dataset.chunks, strict=True)
-        ]
-        total += sum(
-            int(dataset.id.get_chunk_info_by_coord(corner).size)
-            for corner in itertools.product(*firsts)
-        )
-    return total
-
-
-def _parts(
-    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
-) -> list[tuple[Any, Spans]]:
-    """The datasets that hold a region of one step, with its spans in them."""
-    found = spans_of(variant.layout, shape, step, region)
-    return [(file[str(number)], spans) for number, spans in found]
 
 
 def filled(values: Values) -> Values:

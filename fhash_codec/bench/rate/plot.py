@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any
 
 from fhash_codec.bench.rate.results import OWN, Point, RateBench
-from fhash_formats.errors import MissingDependencyError
+from fhash_codec.cost.plot import require_matplotlib
 
 COLOURS = {
     "SZ3": "#4a86c0",
@@ -17,16 +16,6 @@ COLOURS = {
     "Blosc": "#8a8f98",
 }
 OWN_COLOURS = ("#d1604b", "#3b3f46", "#e0a030")
-
-
-def require_matplotlib() -> Any:
-    """The module that draws; raises MissingDependencyError."""
-    try:
-        return importlib.import_module("matplotlib.figure")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "a plot needs matplotlib; pip install 'fhash[bench]'"
-        ) from error
 
 
 def plot(result: RateBench, path: Path) -> None:

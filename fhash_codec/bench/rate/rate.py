@@ -11,9 +11,9 @@ import numpy as np
 
 from fhash_codec.bench.machine import machine
 from fhash_codec.bench.rate.coded import AnyVariant
+from fhash_codec.bench.rate.filters import all_filters
 from fhash_codec.bench.rate.measuring import Bench
 from fhash_codec.bench.rate.own import PROFILES, promised
-from fhash_codec.bench.rate.peers import peers
 from fhash_codec.bench.rate.programs.registry import PROGRAMS, programs
 from fhash_codec.bench.rate.results import PEERS, RateBench
 from fhash_codec.features.scan import scan
@@ -123,7 +123,7 @@ def all_variants(
 
     Raises InputError for a path without a program, MissingDependencyError without hdf5plugin.
     """
-    filters = peers() if names else {}
+    filters = all_filters() if names else {}
     found, refused = programs(named)
     return {**{name: filters[name] for name in names}, **found}, refused
 

@@ -10,6 +10,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fhash_codec.measure.errors import Errors
+
+UNIFORM = 20 * math.log10(math.sqrt(3))
+"""dB by which the RMSE of a uniformly distributed error lies below the tolerance."""
 EXACT = 400.0
 """PSNR in dB that stands for no error at all."""
 
@@ -133,3 +137,15 @@ def _slope(nearest: list[Trial], goal: str) -> float:
     if len(nearest) < 2 or EXACT in qualities:
         return 1.0
     return min(max((qualities[1] - qualities[0]) / (nearest[1].level - nearest[0].level), 0.2), 4.0)
+
+
+def trial_of(errors: Errors, level: float, count: int) -> Trial:
+    """The Trial that stands for measured errors and a number of bytes."""
+    exact = errors.rmse == 0 or errors.psnr is None
+    largest = errors.max_abs_error or 0.0
+    return Trial(
+        level=level,
+        bytes=count,
+        psnr=EXACT if exact else float(errors.psnr or 0.0),
+        max_error=largest / errors.data_range,
+    )

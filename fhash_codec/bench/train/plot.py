@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.bench.rate.plot import require_matplotlib
 from fhash_codec.bench.train.curves import GOALS
+from fhash_codec.cost.plot import require_matplotlib
 
 __all__ = ["plot"]
 

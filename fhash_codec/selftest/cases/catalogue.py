@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from functools import cache
 
 from fhash_codec.selftest.case import Case
-from fhash_codec.selftest.cases import (
-    features,
-    fronts,
-    invariance,
-    networks,
-    rays,
-    shapes,
-    times,
-    values,
-)
+from fhash_codec.selftest.cases.features import FEATURE_CASES
+from fhash_codec.selftest.cases.fronts import FRONT_CASES
+from fhash_codec.selftest.cases.invariance import GUISE_CASES
+from fhash_codec.selftest.cases.networks import NETWORK_CASES
+from fhash_codec.selftest.cases.rays import RAY_CASES
+from fhash_codec.selftest.cases.shapes import SHAPE_CASES
+from fhash_codec.selftest.cases.times import TIME_CASES
+from fhash_codec.selftest.cases.values import VALUE_CASES
 from fhash_formats.errors import InputError, suggestion
 
 __all__ = ["cases", "choose_cases"]
@@ -25,14 +23,14 @@ __all__ = ["cases", "choose_cases"]
 def cases() -> tuple[Case, ...]:
     """All cases, group by group."""
     return (
-        *values.CASES,
-        *shapes.CASES,
-        *fronts.CASES,
-        *features.CASES,
-        *times.CASES,
-        *networks.CASES,
-        *rays.CASES,
-        *invariance.CASES,
+        *VALUE_CASES,
+        *SHAPE_CASES,
+        *FRONT_CASES,
+        *FEATURE_CASES,
+        *TIME_CASES,
+        *NETWORK_CASES,
+        *RAY_CASES,
+        *GUISE_CASES,
     )
 
 

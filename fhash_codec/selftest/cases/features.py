@@ -13,7 +13,7 @@ from fhash_codec.selftest.case import Case
 from fhash_codec.selftest.cases.fields import SHAPE, lattice, series, waves
 from fhash_codec.selftest.cases.settings import MORE, QUICK, Settings, of_all
 
-__all__ = ["CASES"]
+__all__ = ["FEATURE_CASES"]
 
 Values = npt.NDArray[Any]
 
@@ -21,7 +21,7 @@ INSIDE = "interval:10:30"
 """The interval into which `_lifted` lifts the values of the feature."""
 
 
-def _case(
+def _feature_case(
     name: str,
     about: str,
     make: Callable[[], Values],
@@ -75,60 +75,64 @@ def _with_holes() -> Values:
 
 KEYS = EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,3", tables="transform")
 
-CASES: tuple[Case, ...] = (
-    _case("at-every-border", "a feature that is the surface of the domain", _lifted(_borders)),
-    _case(
+FEATURE_CASES: tuple[Case, ...] = (
+    _feature_case(
+        "at-every-border", "a feature that is the surface of the domain", _lifted(_borders)
+    ),
+    _feature_case(
         "at-every-border-grown",
         "the surface of the domain, grown beyond the domain",
         _lifted(_borders),
         dilation=64,
     ),
-    _case("one-vertex", "a feature of one vertex that moves", _lifted(_vertex)),
-    _case(
+    _feature_case("one-vertex", "a feature of one vertex that moves", _lifted(_vertex)),
+    _feature_case(
         "one-vertex-grown", "a feature of one vertex, grown by one", _lifted(_vertex), dilation=1
     ),
-    _case("opposite-corners", "a feature in opposite corners in turn", _lifted(_corners)),
-    _case("whole-box", "two vertices whose bounding box is the domain", _lifted(_ends)),
-    _case("everything", "an interval that holds all values", waves, ("interval:-1:2",)),
-    _case(
+    _feature_case("opposite-corners", "a feature in opposite corners in turn", _lifted(_corners)),
+    _feature_case("whole-box", "two vertices whose bounding box is the domain", _lifted(_ends)),
+    _feature_case("everything", "an interval that holds all values", waves, ("interval:-1:2",)),
+    _feature_case(
         "empty-key-frames",
         "a feature that is empty in some key frames",
         _lifted(lambda t, z, y, x: (t == 2) & (x > 3)),
         settings={**QUICK, "paper-keys": KEYS},
     ),
-    _case(
+    _feature_case(
         "one-key-frame-filled",
         "a feature that exists only at the last step",
         _lifted(lambda t, z, y, x: (t == 3) & (y == 2)),
     ),
-    _case(
+    _feature_case(
         "every-second-vertex",
         "a feature of which no two vertices touch",
         _lifted(lambda t, z, y, x: (t + z + y + x) % 2 == 0),
     ),
-    _case("beside-missing", "a feature that meets missing values", _with_holes, dilation=1),
-    _case("open-interval", "an interval from -inf to inf", waves, ("interval:-inf:inf",)),
-    _case(
+    _feature_case("beside-missing", "a feature that meets missing values", _with_holes, dilation=1),
+    _feature_case("open-interval", "an interval from -inf to inf", waves, ("interval:-inf:inf",)),
+    _feature_case(
         "one-value", "an interval of one value", lambda: np.rint(10 * waves()), ("interval:5:5",)
     ),
-    _case(
+    _feature_case(
         "surface-on-vertices",
         "an isosurface through vertices",
         lambda: np.rint(10 * waves()),
         ("isosurface:5",),
     ),
-    _case("surface-at-the-end", "an isosurface at the largest value", waves, ("isosurface:1",)),
-    _case(
+    _feature_case(
+        "surface-at-the-end", "an isosurface at the largest value", waves, ("isosurface:1",)
+    ),
+    _feature_case(
         "two-features", "two features that overlap", waves, ("interval:0.2:0.6", "isosurface:0.6")
     ),
-    _case(
+    _feature_case(
         "segmented-step",
         "segmentation of values that form two clusters",
         _lifted(lambda t, z, y, x: x > 5),
         ("segmentation",),
         1,
     ),
-    _case(
+    _feature_case(
         "nothing-selected",
         "refused: the feature selects no vertex",
         waves,

@@ -13,12 +13,12 @@ from fhash_codec.selftest.case import Case
 from fhash_codec.selftest.cases.fields import SHAPE, lattice, noise, series
 from fhash_codec.selftest.cases.settings import EXACT, MORE, QUICK, Settings
 
-__all__ = ["CASES"]
+__all__ = ["FRONT_CASES"]
 
 Values = npt.NDArray[Any]
 
 
-def _case(
+def _front_case(
     name: str,
     about: str,
     make: Callable[[], Values],
@@ -74,50 +74,54 @@ def _shell() -> Values:
     return np.where(radius < 1.5 + 0.3 * t, 1e3, np.where(radius < 2.5 + 0.3 * t, -1e3, 0.0))
 
 
-CASES: tuple[Case, ...] = (
-    _case("checkerboard", "0 and 1 alternate along every axis", _checkerboard, {**QUICK, **EXACT}),
-    _case(
+FRONT_CASES: tuple[Case, ...] = (
+    _front_case(
+        "checkerboard", "0 and 1 alternate along every axis", _checkerboard, {**QUICK, **EXACT}
+    ),
+    _front_case(
         "checkerboard-uint8",
         "0 and 1 alternate along every axis",
         _checkerboard,
         {**QUICK, **EXACT},
         dtype="uint8",
     ),
-    _case(
+    _front_case(
         "flicker",
         "the sign changes with every step",
         lambda: (-1) ** lattice()[0] * (1 + lattice()[3]),
     ),
-    _case("white-noise", "white noise: no value can be predicted", noise),
-    _case(
+    _front_case("white-noise", "white noise: no value can be predicted", noise),
+    _front_case(
         "white-noise-float64",
         "white noise: no value can be predicted",
         noise,
         dtype="float64",
         quick=False,
     ),
-    _case(
+    _front_case(
         "white-noise-int16",
         "white noise: no value can be predicted",
         lambda: 1e4 * noise(),
         {**QUICK, **EXACT},
         dtype="int16",
     ),
-    _case("spike", "one value of 1e6, all others 0", _spike),
-    _case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
-    _case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
-    _case("step-between", "a step between two vertices", _step(5.5)),
-    _case(
+    _front_case("spike", "one value of 1e6, all others 0", _spike),
+    _front_case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
+    _front_case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
+    _front_case("step-between", "a step between two vertices", _step(5.5)),
+    _front_case(
         "slow-front",
         "a front narrower than a vertex that moves 0.3 vertices a step",
         _front(0.3, 0.05),
     ),
-    _case(
+    _front_case(
         "creeping-front",
         "a front that moves 0.001 vertices a step",
         _front(0.001, 0.05),
         quick=False,
     ),
-    _case("fast-front", "a front that moves 4 vertices a step", _front(4.0, 0.05), quick=False),
-    _case("thin-shell", "a shell one vertex thick that grows 0.3 vertices a step", _shell),
+    _front_case(
+        "fast-front", "a front that moves 4 vertices a step", _front(4.0, 0.05), quick=False
+    ),
+    _front_case("thin-shell", "a shell one vertex thick that grows 0.3 vertices a step", _shell),
 )

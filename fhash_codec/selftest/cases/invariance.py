@@ -21,11 +21,11 @@ from fhash_codec.selftest.cases.settings import Settings
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import ArraySeries
 
-__all__ = ["CASES"]
+__all__ = ["GUISE_CASES"]
 
 Values = npt.NDArray[Any]
 
-SHAPE: Shape = (4, 9, 10, 12)
+GUISE_SHAPE: Shape = (4, 9, 10, 12)
 POWERS = (2.0, 2.0**-20, 2.0**40)
 """Factors that change the exponent of a float32 but none of its digits, so no decision of the
 encoder changes."""
@@ -211,27 +211,27 @@ def _quality(values: Values, decoded: Values) -> float:
 
 
 def _make() -> ArraySeries:
-    return series((waves(SHAPE) + 0.02 * noise(SHAPE)).astype(np.float32))
+    return series((waves(GUISE_SHAPE) + 0.02 * noise(GUISE_SHAPE)).astype(np.float32))
 
 
-QUICK: Settings = {
+GUISE_QUICK: Settings = {
     "bound": EncodeConfig(max_error_rel=1e-2, effort=1),
     "paper": EncodeConfig(profile="paper", width=16, epochs=30, device="cpu"),
 }
-MORE: Settings = {
+GUISE_MORE: Settings = {
     "absolute": EncodeConfig(max_error=1e-2, effort=1),
     "psnr": EncodeConfig(psnr=45.0, effort=2),
     "head": EncodeConfig(psnr=45.0, effort=5),
 }
 
-CASES = (
+GUISE_CASES = (
     Case(
         name="scaled-and-shifted",
         group="values",
         about="errors do not depend on the unit or the offset of the values",
         make=_make,
-        settings=QUICK,
-        more=MORE,
+        settings=GUISE_QUICK,
+        more=GUISE_MORE,
         checks=(powers_of_two, affine),
     ),
     Case(
@@ -239,8 +239,8 @@ CASES = (
         group="shapes",
         about="errors do not depend on signs, directions or the order of axes",
         make=_make,
-        settings=QUICK,
-        more=MORE,
+        settings=GUISE_QUICK,
+        more=GUISE_MORE,
         checks=(guises,),
     ),
 )

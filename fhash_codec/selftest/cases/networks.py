@@ -27,7 +27,7 @@ from fhash_codec.selftest.checks.network_checks import (
 from fhash_codec.selftest.checks.oracle import agrees, gradients
 from fhash_formats.series import ArraySeries
 
-__all__ = ["CASES"]
+__all__ = ["NETWORK_CASES"]
 
 SHAPE = (3, 6, 7, 8)
 PLAIN = EncodeConfig(profile="paper", width=8, epochs=60, device="cpu")
@@ -72,7 +72,7 @@ WILD = {
 }
 STEADY = {f"{name}-constant": replace(config, schedule="constant") for name, config in WILD.items()}
 
-CASES = (
+NETWORK_CASES = (
     _case(
         "folds",
         "every fold from 2 to 8: few levels or many",

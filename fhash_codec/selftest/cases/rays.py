@@ -15,7 +15,7 @@ from fhash_codec.selftest.cases.settings import Settings
 from fhash_codec.selftest.checks.ray_checks import blocks, closed_form, key_times, scene, scenes
 from fhash_formats.series import ArraySeries
 
-__all__ = ["CASES"]
+__all__ = ["RAY_CASES"]
 
 SHAPE: Shape = (2, 7, 6, 5)
 BOUND: Settings = {"bound": EncodeConfig(max_error_rel=1e-3, effort=1)}
@@ -145,7 +145,7 @@ RANGE = {
     "linear": scene(transfer_function={"opacity": "linear"}),
 }
 
-CASES = (
+RAY_CASES = (
     _case(
         "opacity-1",
         "opaque values, alone and beside transparent ones",

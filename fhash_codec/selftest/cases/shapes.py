@@ -14,7 +14,7 @@ from fhash_codec.selftest.cases.fields import SHAPE, Shape, series, waves
 from fhash_codec.selftest.cases.settings import MORE, QUICK, Settings, of_all
 from fhash_formats.series import ArraySeries
 
-__all__ = ["CASES"]
+__all__ = ["SHAPE_CASES"]
 
 ONE_KEY_FRAME: Settings = {
     "paper-first": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0"),
@@ -31,7 +31,9 @@ TILES: Settings = {
 TILES_OF_ONE: Settings = {"bound": EncodeConfig(max_error_rel=1e-2, effort=1, tile="1x1x1x1")}
 
 
-def _case(name: str, about: str, shape: Shape, settings: Settings = QUICK, **rest: Any) -> Case:
+def _shape_case(
+    name: str, about: str, shape: Shape, settings: Settings = QUICK, **rest: Any
+) -> Case:
     make = _field(shape)
     return Case(
         name=name,
@@ -58,11 +60,11 @@ def _placed(name: str, about: str, **axes: Any) -> Case:
 
 Z, Y, X = (np.arange(float(n)) for n in SHAPE[1:])
 
-CASES: tuple[Case, ...] = (
-    _case("one-voxel", "a series of one value", (1, 1, 1, 1)),
-    _case("one-voxel-in-time", "one vertex at many steps", (97, 1, 1, 1)),
-    _case("one-frame", "a single step", (1, 9, 10, 11)),
-    _case(
+SHAPE_CASES: tuple[Case, ...] = (
+    _shape_case("one-voxel", "a series of one value", (1, 1, 1, 1)),
+    _shape_case("one-voxel-in-time", "one vertex at many steps", (97, 1, 1, 1)),
+    _shape_case("one-frame", "a single step", (1, 9, 10, 11)),
+    _shape_case(
         "one-key-frame",
         "one key frame stands for all steps",
         SHAPE,
@@ -70,16 +72,16 @@ CASES: tuple[Case, ...] = (
         more=ONE_KEY_FRAME_CODED,
     ),
     *(
-        _case(f"one-along-{axis}", f"axis {axis} has one vertex", shape)
+        _shape_case(f"one-along-{axis}", f"axis {axis} has one vertex", shape)
         for axis, shape in {"z": (4, 1, 10, 11), "y": (4, 9, 1, 11), "x": (4, 9, 10, 1)}.items()
     ),
-    _case("line", "one line of vertices", (3, 1, 1, 127)),
-    _case("twos", "two vertices along every axis", (2, 2, 2, 2)),
-    _case("threes", "three vertices along every axis", (3, 3, 3, 3)),
-    _case("primes", "lengths that are primes", (5, 7, 11, 13)),
-    _case("larger-primes", "lengths just above powers of two", (3, 17, 5, 37), quick=False),
+    _shape_case("line", "one line of vertices", (3, 1, 1, 127)),
+    _shape_case("twos", "two vertices along every axis", (2, 2, 2, 2)),
+    _shape_case("threes", "three vertices along every axis", (3, 3, 3, 3)),
+    _shape_case("primes", "lengths that are primes", (5, 7, 11, 13)),
+    _shape_case("larger-primes", "lengths just above powers of two", (3, 17, 5, 37), quick=False),
     *(
-        _case(
+        _shape_case(
             f"long-{axis}",
             f"axis {axis} is hundreds of times as long as the others",
             shape,
@@ -92,8 +94,10 @@ CASES: tuple[Case, ...] = (
             "x": (2, 1, 2, 2048),
         }.items()
     ),
-    _case("odd-tiles", "tiles that do not divide the lengths", SHAPE, TILES, more={}),
-    _case("tiles-of-one", "every vertex is a tile of its own", (2, 3, 4, 3), TILES_OF_ONE, more={}),
+    _shape_case("odd-tiles", "tiles that do not divide the lengths", SHAPE, TILES, more={}),
+    _shape_case(
+        "tiles-of-one", "every vertex is a tile of its own", (2, 3, 4, 3), TILES_OF_ONE, more={}
+    ),
     _placed(
         "descending-positions",
         "positions that descend along every axis",

@@ -17,7 +17,7 @@ from fhash_codec.selftest.cases.settings import COMPACT, MORE, PAPER, Settings
 from fhash_formats.errors import FhashError, RegionError
 from fhash_formats.series import ArraySeries
 
-__all__ = ["CASES"]
+__all__ = ["TIME_CASES"]
 
 STEPS = 6
 """Steps of the series."""
@@ -33,7 +33,7 @@ ENDS: Settings = {
 EVEN = np.arange(float(STEPS))
 
 
-def _case(
+def _time_case(
     name: str, about: str, times: npt.NDArray[np.float64], settings: Settings = SETTINGS
 ) -> Case:
     def make() -> ArraySeries:
@@ -82,30 +82,32 @@ def _outside(run: Run) -> Iterator[Finding]:
     yield Finding(name="outside is refused", worst=float(wrong), limit=0.0, unit="answers")
 
 
-CASES: tuple[Case, ...] = (
-    _case("uneven", "steps from 1e-3 to 1e3 long", np.cumsum([0, 1e-3, 1, 1e3, 0.5, 30])),
-    _case("tiny", "steps of 1e-12", 1e-12 * EVEN),
-    _case("denormal", "steps of the smallest number", 5e-324 * EVEN),
-    _case("huge", "times from 3.5e5 hours on", 3.5e5 + EVEN),
-    _case(
+TIME_CASES: tuple[Case, ...] = (
+    _time_case("uneven", "steps from 1e-3 to 1e3 long", np.cumsum([0, 1e-3, 1, 1e3, 0.5, 30])),
+    _time_case("tiny", "steps of 1e-12", 1e-12 * EVEN),
+    _time_case("denormal", "steps of the smallest number", 5e-324 * EVEN),
+    _time_case("huge", "times from 3.5e5 hours on", 3.5e5 + EVEN),
+    _time_case(
         "huge-and-fine",
         "times that are consecutive float64 numbers",
         np.array([3.5e5 + 2.0**-34 * n for n in range(STEPS)]),
     ),
-    _case("descending", "times that run backwards", 10 - EVEN**2),
-    _case("negative", "times before the epoch", -1e9 + 3600 * EVEN),
-    _case("both-ends", "times from -1.7e308 to 1.7e308", 1.7e308 * np.linspace(-1, 1, STEPS), ENDS),
-    _case(
+    _time_case("descending", "times that run backwards", 10 - EVEN**2),
+    _time_case("negative", "times before the epoch", -1e9 + 3600 * EVEN),
+    _time_case(
+        "both-ends", "times from -1.7e308 to 1.7e308", 1.7e308 * np.linspace(-1, 1, STEPS), ENDS
+    ),
+    _time_case(
         "repeated",
         "a repeated time: step numbers replace the times",
         np.array([0.0, 1, 1, 2, 3, 4]),
     ),
-    _case(
+    _time_case(
         "not-a-time",
         "times that are NaN or infinite: step numbers replace them",
         np.array([0.0, 1, np.nan, np.inf, 4, 5]),
     ),
-    _case(
+    _time_case(
         "one-time",
         "a single step at a time that is not 0",
         np.array([1e5])[:1],

@@ -17,7 +17,7 @@ from fhash_codec.selftest.cases.fields import SHAPE, lattice, noise, series, wav
 from fhash_codec.selftest.cases.settings import COMPACT, EXACT, MORE, PAPER, QUICK, Settings
 from fhash_formats.series import ArraySeries, Series
 
-__all__ = ["CASES"]
+__all__ = ["VALUE_CASES"]
 
 Values = npt.NDArray[Any]
 INTEGERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
@@ -177,7 +177,7 @@ OF_64_BITS: Settings = {**COMPACT, "wide": EncodeConfig(max_error=1024.0, effort
 """Settings for 64-bit integers. Volumes return them as float64, so the bound covers the rounding to
 float64."""
 
-CASES: tuple[Case, ...] = (
+VALUE_CASES: tuple[Case, ...] = (
     _case(
         "constant-zero",
         "a constant series comes back exactly",

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.selftest.case import Finding, Run
 
-__all__ = ["CHECKS", "rounding"]
+__all__ = ["ACCESS_CHECKS", "rounding"]
 
 Values = npt.NDArray[Any]
 
@@ -132,7 +132,7 @@ def levels_of_detail(run: Run) -> Iterator[Finding]:
     yield Finding(name="coarse levels finite", worst=float(lost), limit=0.0, unit="values")
 
 
-CHECKS = (regions, key_times, between, points, levels_of_detail)
+ACCESS_CHECKS = (regions, key_times, between, points, levels_of_detail)
 
 
 def rounding(run: Run, one: Values, other: Values) -> float:

@@ -15,7 +15,7 @@ from fhash_codec.compact.goal import promise
 from fhash_codec.selftest.case import Finding, Run
 from fhash_formats.support.values import is_wide_integer
 
-__all__ = ["CHECKS", "expected_coreset", "largest_difference"]
+__all__ = ["ACCURACY_CHECKS", "expected_coreset", "largest_difference"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -113,7 +113,7 @@ def within_range(run: Run) -> Iterator[Finding]:
     )
 
 
-CHECKS = (presence, bound, quality, constants, within_range)
+ACCURACY_CHECKS = (presence, bound, quality, constants, within_range)
 
 
 def expected_coreset(run: Run) -> Mask:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from fhash_codec.selftest.case import Finding, Run
 from fhash_formats.errors import InputError
 
-__all__ = ["CHECKS"]
+__all__ = ["PICTURES_CHECKS"]
 
 SIZE = (48, 48)
 """Width and height of the picture in pixels."""
@@ -42,7 +42,7 @@ def picture(run: Run) -> Iterator[Finding]:
             yield _finite(f"finite pixels, {mode}", _rendered(run, mode))
 
 
-CHECKS = (picture,)
+PICTURES_CHECKS = (picture,)
 
 
 def _finite(name: str, picture: npt.NDArray[np.float32]) -> Finding:

@@ -92,7 +92,7 @@ def blocks(run: Run) -> Iterator[Finding]:
 
     Compositing is associative, so this holds wherever the volume is cut between two samples.
     """
-    cut_scene = scene(camera={"view": "xy", "projection": "parallel"}, transfer_function=FOG)
+    cut_scene = scene(camera={"view": "xy", "projection": "parallel"}, transfer_function=THIN_FOG)
     plan = plan_picture(run.volume, cut_scene)
     frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
     uncut = march(frame, plan.task).rgba
@@ -118,8 +118,8 @@ def key_times(run: Run) -> Iterator[Finding]:
     renderer = Renderer(run.volume)
     times = run.volume.coords["t"].values
     for step in range(run.volume.shape[0]):
-        at_step = renderer.render(scene(step=step, transfer_function=FOG)).rgba
-        at_time = renderer.render(scene(time=float(times[step]), transfer_function=FOG)).rgba
+        at_step = renderer.render(scene(step=step, transfer_function=THIN_FOG)).rgba
+        at_time = renderer.render(scene(time=float(times[step]), transfer_function=THIN_FOG)).rgba
         unlike = float(np.count_nonzero(at_step != at_time))
         yield Finding(
             name="picture at a key time",
@@ -132,7 +132,7 @@ def key_times(run: Run) -> Iterator[Finding]:
         for place in beside:
             off = float(
                 np.abs(
-                    renderer.render(scene(step=place, transfer_function=FOG)).rgba - at_step
+                    renderer.render(scene(step=place, transfer_function=THIN_FOG)).rgba - at_step
                 ).max()
             )
             yield Finding(
@@ -144,7 +144,7 @@ def key_times(run: Run) -> Iterator[Finding]:
             )
 
 
-FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
+THIN_FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
 """A transfer function through which all of the volume is seen."""
 
 

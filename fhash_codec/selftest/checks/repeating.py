@@ -12,7 +12,7 @@ from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Finding, Run
 from fhash_codec.selftest.environment import environment
 
-__all__ = ["CHECKS"]
+__all__ = ["REPEATING_CHECKS"]
 
 THREADS = (1, 2)
 """Numbers of threads to compare with `case.RUN_THREADS`, with which the file of a run was made."""
@@ -53,7 +53,7 @@ def sound(run: Run) -> Iterator[Finding]:
     )
 
 
-CHECKS = (same_bytes, sound)
+REPEATING_CHECKS = (same_bytes, sound)
 
 
 def _count_unequal_bytes(written: bytes, path: Path) -> float:

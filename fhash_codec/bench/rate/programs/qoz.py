@@ -13,9 +13,9 @@ from fhash_codec.bench.rate.layouts import Values
 from fhash_codec.bench.rate.programs.program import ProgramVariant, called
 from fhash_codec.bench.rate.programs.raw_files import as_float, read_raw, write_raw
 
-__all__ = ["NAMES", "variants"]
+__all__ = ["QOZ_NAMES", "qoz_variants"]
 
-NAMES = {"qoz": "QoZ", "hpez": "HPEZ", "sz3": "SZ3 program"}
+QOZ_NAMES = {"qoz": "QoZ", "hpez": "HPEZ", "sz3": "SZ3 program"}
 """Names of the programs, and of the codecs."""
 FULL_SEARCH = {"qoz": ("-q", "4"), "hpez": ("-q", "4"), "sz3": ()}
 """Options of each program for its strongest mode."""
@@ -61,11 +61,11 @@ def _lengths(shape: tuple[int, ...]) -> list[str]:
     return [f"-{len(lengths)}", *(str(n) for n in reversed(lengths))]
 
 
-def variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
-    """Every layout of a program of NAMES."""
+def qoz_variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
+    """Every layout of a program of QOZ_NAMES."""
     return tuple(
         ProgramVariant(
-            peer=NAMES[name],
+            peer=QOZ_NAMES[name],
             mode="tolerance",
             layout=layout,
             goals=("psnr", "bound"),

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fhash_codec.bench.rate.programs import qoz, tthresh, video
 from fhash_codec.bench.rate.programs.program import ProgramVariant, executable
+from fhash_codec.bench.rate.programs.qoz import QOZ_NAMES, qoz_variants
+from fhash_codec.bench.rate.programs.tthresh import tthresh_variants
+from fhash_codec.bench.rate.programs.video import VIDEO_NAMES, video_variants
 from fhash_formats.errors import InputError
 
 __all__ = ["PROGRAMS", "programs"]
 
-PROGRAMS = ("tthresh", *qoz.NAMES, *video.NAMES)
+PROGRAMS = ("tthresh", *QOZ_NAMES, *VIDEO_NAMES)
 """Names that can be given."""
 
 
@@ -40,7 +42,7 @@ def programs(
 
 def _variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
     if name == "tthresh":
-        return tthresh.variants(path)
-    if name in qoz.NAMES:
-        return qoz.variants(name, path)
-    return video.variants(name, path)
+        return tthresh_variants(path)
+    if name in QOZ_NAMES:
+        return qoz_variants(name, path)
+    return video_variants(name, path)

@@ -16,7 +16,7 @@ from fhash_codec.bench.rate.layouts import Values
 from fhash_codec.bench.rate.programs.program import ProgramVariant, called
 from fhash_codec.bench.rate.programs.raw_files import as_float, read_raw, write_raw
 
-__all__ = ["variants"]
+__all__ = ["tthresh_variants"]
 
 UNIFORM = 20 * math.log10(math.sqrt(3))
 """dB by which the RMSE of a uniformly distributed error lies below the tolerance of a level."""
@@ -66,7 +66,7 @@ class Tthresh:
         return values
 
 
-def variants(path: str) -> tuple[ProgramVariant, ...]:
+def tthresh_variants(path: str) -> tuple[ProgramVariant, ...]:
     """All of the series together, four axes or three."""
     return tuple(
         ProgramVariant(

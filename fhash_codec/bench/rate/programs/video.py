@@ -18,7 +18,7 @@ from fhash_codec.bench.rate.programs.program import ProgramVariant, called
 from fhash_codec.bench.rate.programs.raw_files import read_raw, write_raw
 from fhash_formats.errors import InputError
 
-__all__ = ["ENCODERS", "Encoder", "Video", "variants"]
+__all__ = ["ENCODERS", "Encoder", "Video", "video_variants"]
 
 LEAST = 64
 """Vertices of a picture along each axis; shorter ones are filled up with their last value."""
@@ -93,7 +93,7 @@ ENCODERS = {
     ),
 }
 """Encoders of each video codec. All that a program has are tried."""
-NAMES = {"hevc": "HEVC", "av1": "AV1", "vvc": "VVC"}
+VIDEO_NAMES = {"hevc": "HEVC", "av1": "AV1", "vvc": "VVC"}
 """Names of the codecs."""
 FINEST = 70.0
 """Level in dB of the finest quantiser."""
@@ -146,7 +146,7 @@ class Video:
         return f"yuv420p{self.bits}le"
 
 
-def variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
+def video_variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
     """The films of a video codec, for each encoder that an ffmpeg has.
 
     Raises InputError where it has none, or is no ffmpeg.
@@ -162,7 +162,7 @@ def variants(name: str, path: str) -> tuple[ProgramVariant, ...]:
         raise InputError(f"peer {name}: {path} has no encoder {wanted}")
     return tuple(
         ProgramVariant(
-            peer=NAMES[name],
+            peer=VIDEO_NAMES[name],
             mode=f"{encoder.name} {bits} bit",
             layout=layout,
             goals=("psnr",),
