@@ -1,4 +1,4 @@
-"""Reads that disagree with the decoded values are seen."""
+"""Checks hold for an easy case, and see values, bytes and pictures that are spoiled."""
 
 from __future__ import annotations
 
@@ -7,32 +7,23 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.selftest import (
-    checks as access,
-)
-from fhash_codec.selftest import (
-    checks as accuracy,
-)
-from fhash_codec.selftest import (
-    checks as pictures,
-)
-from fhash_codec.selftest import (
-    checks as repeating,
-)
-from fhash_codec.selftest import (
-    ray_cases as ray_checks,
-)
+from fhash_codec.selftest import checks, ray_cases, value_cases
 from fhash_codec.selftest.case import Check, Run
+from fhash_codec.selftest.field_cases import TIME_CASES
 
 Broken = Callable[[Run, Check], set[str]]
+Spoiled = Callable[..., Run]
+COMMON = [*checks.ACCESS_CHECKS, *checks.ACCURACY_CHECKS, *checks.REPEATING_CHECKS, checks.picture]
+PART = (slice(1, None), slice(2, 7), slice(3, 8), slice(4, 9))
 
 
-@pytest.mark.parametrize("check", access.CHECKS)
+@pytest.mark.parametrize("check", COMMON)
 def test_the_easy_case_keeps_every_property(run: Run, broken: Broken, check: Check) -> None:
     assert broken(run, check) == set()
 
@@ -40,149 +31,116 @@ def test_the_easy_case_keeps_every_property(run: Run, broken: Broken, check: Che
 @pytest.mark.parametrize(
     ("check", "properties"),
     [
-        (access.regions, {"region = slice"}),
-        (access.key_times, {"exact at key times"}),
-        (access.points, {"points = read"}),
+        (checks.regions, {"region = slice"}),
+        (checks.key_times, {"exact at key times"}),
+        (checks.points, {"points = read"}),
     ],
 )
 def test_a_read_of_other_values_is_seen(
-    run: Run,
-    broken: Broken,
-    spoiled: Callable[..., Run],
-    check: Check,
-    properties: set[str],
+    run: Run, broken: Broken, spoiled: Spoiled, check: Check, properties: set[str]
 ) -> None:
     assert broken(spoiled(run, run.decoded + np.float32(1e-3)), check) == properties
 
 
-@pytest.mark.parametrize(
-    ("check", "properties"),
-    [
-        (access.between, {"even between steps"}),
-        (access.levels_of_detail, {"level 0 = read", "coarse levels finite"}),
-        (access.points, {"points: finite as read"}),
-    ],
-)
-def test_missing_or_other_values_between_reads_are_seen(
-    compact_run: Run,
-    broken: Broken,
-    spoiled: Callable[..., Run],
-    check: Check,
-    properties: set[str],
-) -> None:
-    values = compact_run.decoded.copy()
+def holed(values: np.ndarray) -> np.ndarray:
+    """Other values, some of them missing."""
     values[:2] += np.float32(1e-3)
     values[2:, ::2] = np.nan
-    assert broken(spoiled(compact_run, values), check) >= properties
+    return values
 
 
-def test_bits_are_compared_not_values() -> None:
-    zeros = np.zeros(3, np.float32)
-    assert access._count_unequal(zeros, zeros) == 0
-    assert access._count_unequal(zeros, -zeros) == 3
-    assert access._count_unequal(np.full(2, np.nan), np.full(2, np.nan)) == 0
-    assert access._count_unequal(zeros, zeros[:2]) == 3
-    assert access._count_unequal(zeros, zeros.astype(np.float64)) == 3
+def part(change: Callable[[np.ndarray], object]) -> Callable[[np.ndarray], np.ndarray]:
+    """A change of a part of the values."""
 
+    def changed(values: np.ndarray) -> np.ndarray:
+        values[PART] = change(values[PART])
+        return values
 
-def test_rounding_is_a_multiple_of_what_is_allowed(run: Run) -> None:
-    off = np.float32(1e-5 * run.data_range)
-    assert access.rounding(run, run.decoded, run.decoded) == 0
-    assert 0.5 < access.rounding(run, run.decoded + off, run.decoded) < 1.1
-    assert access.rounding(run, run.decoded + 10 * off, run.decoded) > 1
-
-
-@pytest.mark.parametrize("check", accuracy.CHECKS)
-def test_the_easy_case_keeps_every_property_accuracy(
-    run: Run, broken: Broken, check: Check
-) -> None:
-    assert broken(run, check) == set()
-
-
-REGION = (slice(1, None), slice(2, 7), slice(3, 8), slice(4, 9))
+    return changed
 
 
 @pytest.mark.parametrize(
     ("check", "change", "properties"),
     [
-        (accuracy.presence, lambda values: np.nan, {"finite in the coreset"}),
-        (accuracy.bound, lambda values: values + 0.02, {"strict bound"}),
+        (checks.between, holed, {"even between steps"}),
+        (checks.levels_of_detail, holed, {"level 0 = read", "coarse levels finite"}),
+        (checks.points, holed, {"points: finite as read"}),
+        (checks.presence, part(lambda values: np.nan), {"finite in the coreset"}),
+        (checks.bound, part(lambda values: values + 0.02), {"strict bound"}),
         (
-            accuracy.quality,
-            lambda values: values + 0.02,
+            checks.quality,
+            part(lambda values: values + 0.02),
             {"beyond the stated error", "below the stated PSNR"},
         ),
-        (accuracy.within_range, lambda values: 1.02, {"beyond the range"}),
+        (checks.within_range, part(lambda values: 1.02), {"beyond the range"}),
     ],
 )
-def test_a_value_that_decodes_wrongly_is_seen(
+def test_values_that_decode_wrongly_are_seen(
     compact_run: Run,
     broken: Broken,
-    spoiled: Callable[..., Run],
+    spoiled: Spoiled,
     check: Check,
-    change: Callable[[np.ndarray], object],
+    change: Callable[[np.ndarray], np.ndarray],
     properties: set[str],
 ) -> None:
-    values = compact_run.decoded.copy()
-    values[REGION] = change(values[REGION])
-    assert broken(spoiled(compact_run, values), check) == properties
+    seen = broken(spoiled(compact_run, change(compact_run.decoded.copy())), check)
+    assert seen >= properties
+    assert seen == properties or change is holed
 
 
-def test_a_filled_hole_is_seen(
-    compact_run: Run, broken: Broken, spoiled: Callable[..., Run]
+def test_holes_promises_constants_and_bounds_of_0_are_checked(
+    compact_run: Run, broken: Broken, spoiled: Spoiled
 ) -> None:
     values = compact_run.values.copy()
     values[1, 2, 3, 4] = np.inf
-    run = spoiled(replace(compact_run, values=values), compact_run.decoded)
-    assert broken(run, accuracy.presence) == {"NaN outside of it"}
+    filled = spoiled(replace(compact_run, values=values), compact_run.decoded)
+    assert broken(filled, checks.presence) == {"NaN outside of it"}
 
-
-def test_a_promise_that_was_missed_is_seen(compact_run: Run, broken: Broken) -> None:
     config = replace(compact_run.config, max_error_rel=None, psnr=120.0)
-    assert broken(replace(compact_run, config=config), accuracy.quality) == {"promised PSNR"}
+    assert broken(replace(compact_run, config=config), checks.quality) == {"promised PSNR"}
 
-
-def test_a_constant_that_changed_is_seen(
-    compact_run: Run, broken: Broken, spoiled: Callable[..., Run]
-) -> None:
     ones = np.ones_like(compact_run.values)
     decoded = ones.copy()
-    run = replace(compact_run, values=ones)
-    assert broken(spoiled(run, decoded), accuracy.constants) == set()
+    constant = replace(compact_run, values=ones)
+    assert broken(spoiled(constant, decoded), checks.constants) == set()
     decoded[0, 0, 0, 0] = np.nextafter(np.float32(1), np.float32(2))
-    assert broken(spoiled(run, decoded), accuracy.constants) == {"exact constant"}
+    assert broken(spoiled(constant, decoded), checks.constants) == {"exact constant"}
 
-
-def test_a_bound_of_0_counts_the_values_that_differ(compact_run: Run) -> None:
     lossless = replace(compact_run.config, max_error_rel=None, max_error=0.0)
-    (finding,) = accuracy.bound(replace(compact_run, config=lossless))
+    (finding,) = checks.bound(replace(compact_run, config=lossless))
     assert finding.name == "lossless"
     assert finding.worst == np.count_nonzero(compact_run.values != compact_run.decoded) > 0
+
+
+def test_bits_rounding_and_differences_are_counted_exactly(run: Run) -> None:
+    zeros = np.zeros(3, np.float32)
+    assert checks._count_unequal(zeros, zeros) == 0
+    assert checks._count_unequal(zeros, -zeros) == 3
+    assert checks._count_unequal(np.full(2, np.nan), np.full(2, np.nan)) == 0
+    assert checks._count_unequal(zeros, zeros[:2]) == 3
+    assert checks._count_unequal(zeros, zeros.astype(np.float64)) == 3
+
+    off = np.float32(1e-5 * run.data_range)
+    assert checks.rounding(run, run.decoded, run.decoded) == 0
+    assert 0.5 < checks.rounding(run, run.decoded + off, run.decoded) < 1.1
+    assert checks.rounding(run, run.decoded + 10 * off, run.decoded) > 1
+
+    everywhere = np.ones(2, dtype=bool)
+    large = np.array([2**63 - 1, 5], dtype=np.int64)
+    huge, tiny = np.array([1.7e308, 0.0]), np.array([5e-324, 0.0])
+    assert checks.largest_difference(large, np.array([2.0**63, 5.0]), everywhere) == 1
+    assert checks.largest_difference(huge, -huge, everywhere) == 2 * Fraction(1.7e308)
+    assert checks.largest_difference(tiny, np.zeros(2), everywhere) == Fraction(5e-324)
+    assert checks.largest_difference(huge, -huge, ~everywhere) == 0
 
 
 def test_the_coreset_of_an_interval_is_grown_and_spans_key_frames(compact_run: Run) -> None:
     values = np.zeros_like(compact_run.values)
     values[1, 4, 5, 6] = 10.0
     config = replace(compact_run.config, features=("interval:9:11",), dilation=1)
-    mask = accuracy.expected_coreset(replace(compact_run, values=values, config=config))
+    mask = checks.expected_coreset(replace(compact_run, values=values, config=config))
     assert mask.sum(axis=(1, 2, 3)).tolist() == [0, 27, 0, 0]
     assert mask[1, 3:6, 4:7, 5:8].all()
-
-
-def test_differences_are_exact() -> None:
-    everywhere = np.ones(2, dtype=bool)
-    large = np.array([2**63 - 1, 5], dtype=np.int64)
-    assert accuracy.largest_difference(large, np.array([2.0**63, 5.0]), everywhere) == 1
-    huge = np.array([1.7e308, 0.0])
-    assert accuracy.largest_difference(huge, -huge, everywhere) == 2 * Fraction(1.7e308)
-    tiny = np.array([5e-324, 0.0])
-    assert accuracy.largest_difference(tiny, np.zeros(2), everywhere) == Fraction(5e-324)
-    assert accuracy.largest_difference(huge, -huge, ~everywhere) == 0
-
-
-def drawn(cached: float, others: float) -> Callable[[Run, str], np.ndarray]:
-    """Pictures of one value for the cache, and of another one for all other marches."""
-    return lambda run, mode: np.full((4, 4, 4), cached if mode == "cache" else others, np.float32)
 
 
 @pytest.mark.parametrize(
@@ -196,58 +154,100 @@ def drawn(cached: float, others: float) -> Callable[[Run, str], np.ndarray]:
 )
 def test_wrong_pixels_are_seen(
     paper_run: Run,
-    broken: Callable[[Run, Check], set[str]],
+    broken: Broken,
     monkeypatch: pytest.MonkeyPatch,
     cached: float,
     others: float,
     properties: set[str],
 ) -> None:
-    monkeypatch.setattr(pictures, "_rendered", drawn(cached, others))
-    assert broken(paper_run, pictures.picture) == properties
+    def drawn(run: Run, mode: str) -> np.ndarray:
+        return np.full((4, 4, 4), cached if mode == "cache" else others, np.float32)
+
+    monkeypatch.setattr(checks, "_rendered", drawn)
+    assert broken(paper_run, checks.picture) == properties
 
 
 def test_a_picture_that_differs_from_that_of_float64_is_seen(
-    compact_run: Run,
-    broken: Callable[[Run, Check], set[str]],
-    monkeypatch: pytest.MonkeyPatch,
+    compact_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reference = ray_checks.reference_picture
-    monkeypatch.setattr(ray_checks, "reference_picture", lambda *given: reference(*given) + 2e-3)
-    assert broken(compact_run, pictures.picture) == {"float64 picture"}
-
-
-def test_the_easy_case_keeps_every_property_pictures(
-    run: Run, broken: Callable[[Run, Check], set[str]]
-) -> None:
-    assert broken(run, pictures.picture) == set()
-
-
-@pytest.mark.parametrize("check", repeating.CHECKS)
-def test_the_easy_case_keeps_every_property_repeating(
-    run: Run, broken: Broken, check: Check
-) -> None:
-    assert broken(run, check) == set()
+    reference = ray_cases.reference_picture
+    monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: reference(*given) + 2e-3)
+    assert broken(compact_run, checks.picture) == {"float64 picture"}
 
 
 @pytest.mark.parametrize("thorough", [False, True])
 def test_bytes_that_depend_on_the_threads_are_seen(
-    compact_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch, thorough: bool
+    compact_run: Run,
+    broken: Broken,
+    monkeypatch: pytest.MonkeyPatch,
+    thorough: bool,
+    tmp_path: Path,
 ) -> None:
-    encode = repeating.encode
+    encode = checks.encode
     counts = []
 
     def other(source: object, path: object, config: EncodeConfig, **rest: object) -> object:
         counts.append(int(os.environ["FHASH_THREADS"]))
         return encode(source, path, replace(config, seed=counts[-1]), **rest)
 
-    monkeypatch.setattr(repeating, "encode", other)
+    monkeypatch.setattr(checks, "encode", other)
     run = replace(compact_run, thorough=thorough)
-    assert broken(run, repeating.same_bytes) == {"same bytes by other threads"}
+    assert broken(run, checks.same_bytes) == {"same bytes by other threads"}
     assert counts == [1, 2] if thorough else len(counts) == 1
 
-
-def test_bytes_that_differ_are_counted(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abcd")
-    assert repeating._count_unequal_bytes(b"abcd", tmp_path / "a") == 0
-    assert repeating._count_unequal_bytes(b"abxd", tmp_path / "a") == 1
-    assert repeating._count_unequal_bytes(b"axc", tmp_path / "a") == 2
+    for data, count in ((b"abcd", 0), (b"abxd", 1), (b"axc", 2)):
+        assert checks._count_unequal_bytes(data, tmp_path / "a") == count
+
+
+def test_answers_outside_the_series_are_counted(compact_run: Run, broken: Broken) -> None:
+    (outside,) = next(case for case in TIME_CASES if case.name == "tiny").checks
+    assert broken(compact_run, outside) == set()
+    volume = compact_run.volume
+    clamped = SimpleNamespace(
+        shape=volume.shape,
+        key_times=volume.key_times,
+        read=lambda step: volume.read(0),
+        step_of_time=volume.step_of_time,
+        sample=volume.sample,
+    )
+    assert broken(replace(compact_run, volume=clamped), outside) == {"outside is refused"}
+
+
+@pytest.mark.parametrize(
+    ("check", "error", "growth", "properties"),
+    [
+        (value_cases.powers_of_two, 0.0, 1.0, set()),
+        (value_cases.powers_of_two, 1e-6, 1.0, {"times a power of two"}),
+        (value_cases.powers_of_two, 0.0, 1.01, {"times a power of two, size"}),
+        (value_cases.affine, 0.0, 1.0, set()),
+        (value_cases.affine, 1e-3, 1.0, {"scaled and shifted, errors"}),
+        (value_cases.affine, 0.0, 1.1, {"same size in any guise"}),
+        (value_cases.affine, 1.0, 1.0, {"scaled and shifted, errors", "same PSNR in any guise"}),
+        (value_cases.guises, 0.0, 1.0, set()),
+        (value_cases.guises, 0.0, 0.9, {"same size in any guise"}),
+        (value_cases.guises, 0.02, 1.0, {"same PSNR in any guise", "bound in any guise"}),
+    ],
+)
+def test_a_guise_with_other_errors_or_another_size_is_seen(
+    compact_run: Run,
+    broken: Broken,
+    monkeypatch: pytest.MonkeyPatch,
+    check: Check,
+    error: float,
+    growth: float,
+    properties: set[str],
+) -> None:
+    """Gives every guise the errors of the run, and a share of the range more."""
+    own = compact_run.decoded - compact_run.values.astype(np.float64)
+
+    def encoded(run: Run, values: np.ndarray, factor: float, **_: object) -> tuple:
+        exact = values.astype(np.float64)
+        extra = error * (exact.max() - exact.min())
+        same = own if values.shape == own.shape else np.resize(own, values.shape)
+        return exact + same * factor + extra, value_cases._size(run) * growth
+
+    monkeypatch.setattr(value_cases, "_encoded", encoded)
+    seen = broken(compact_run, check)
+    assert properties <= seen
+    assert properties or not seen

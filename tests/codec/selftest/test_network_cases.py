@@ -1,4 +1,4 @@
-"""Cases of networks train small networks on the CPU, and reach every size that they name."""
+"""Checks of networks see wrong values, slopes and trainings; the oracle is the definition."""
 
 from __future__ import annotations
 
@@ -9,18 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fhash_codec.config import EncodeConfig
 from fhash_codec.paper.model import sample_points
 from fhash_codec.paper.network import ArrayTable, Network
-from fhash_codec.selftest import (
-    network_cases as network_checks,
-)
-from fhash_codec.selftest import (
-    network_cases as networks,
-)
-from fhash_codec.selftest import (
-    network_cases as oracle,
-)
+from fhash_codec.selftest import network_cases
 from fhash_codec.selftest.case import Case, Check, Run
 from fhash_codec.selftest.network_cases import (
     Oracle,
@@ -34,40 +25,6 @@ from fhash_codec.selftest.network_cases import (
 )
 from fhash_codec.selftest.run import run_case
 
-CASES = {case.name: case for case in networks.CASES}
-
-
-def configs(name: str) -> list[EncodeConfig]:
-    return [*CASES[name].settings.values(), *CASES[name].more.values()]
-
-
-def test_all_settings_are_of_the_profile_paper_on_the_cpu() -> None:
-    for name in CASES:
-        assert {(config.profile, config.device) for config in configs(name)} == {("paper", "cpu")}
-
-
-@pytest.mark.parametrize(
-    ("name", "field", "sizes"),
-    [
-        ("folds", "fold", {2, 3, 4, 5, 6, 7, 8}),
-        ("layers", "hidden_layers", {0, 1, 2, 3, 8}),
-        ("embeddings", "embedding_size", {1, 2, 3, 4, 5, 6, 7, 8}),
-        ("widths", "width", {1, 2, 63, 64, 65, 257}),
-    ],
-)
-def test_every_size_is_tried(name: str, field: str, sizes: set[int]) -> None:
-    assert {getattr(config, field) for config in configs(name)} == sizes
-    assert len(configs(name)) == len(sizes)
-
-
-def test_wild_rates_are_tried_with_every_depth_and_schedule() -> None:
-    tried = {(config.hidden_layers, config.schedule) for config in configs("wild-rates")}
-    schedules = {config.schedule for config in configs("wild-rates")}
-    assert len(schedules) == 2
-    assert tried == {(layers, schedule) for layers in (0, 1, 2) for schedule in schedules}
-    assert {config.learning_rate for config in configs("wild-rates")} == {1.0}
-
-
 Broken = Callable[[Run, Check], set[str]]
 ALONE = (constant_tables, ends_of_half_precision, kinks, large_tables)
 """Checks that make networks of their own and do not look at the run."""
@@ -80,7 +37,7 @@ def test_sound_networks_keep_every_property(broken: Broken, check: Check) -> Non
 
 def shifted(value: float, slope: float) -> Callable[..., object]:
     """`sample_points` with an error in values and slopes."""
-    sample_points = network_checks.sample_points
+    sample_points = network_cases.sample_points
 
     def sample(*given: object, gradient: bool = False) -> object:
         if not gradient:
@@ -109,7 +66,7 @@ def test_wrong_values_and_slopes_are_seen(
     slope: float,
     properties: set[str],
 ) -> None:
-    monkeypatch.setattr(network_checks, "sample_points", shifted(value, slope))
+    monkeypatch.setattr(network_cases, "sample_points", shifted(value, slope))
     assert broken(None, check) >= properties
 
 
@@ -124,7 +81,7 @@ def test_a_number_type_that_accepts_too_much_is_seen(
         def stored(self, table: np.ndarray) -> np.ndarray:
             return np.minimum(table, 65_000)
 
-    monkeypatch.setattr(network_checks, "NumberType", Careless)
+    monkeypatch.setattr(network_cases, "NumberType", Careless)
     assert broken(None, ends_of_half_precision) == {"too large for float16", "largest of float16"}
 
 
@@ -153,26 +110,26 @@ def test_an_engine_that_trains_another_network_is_seen(
     paper_run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another seed stands for another engine."""
-    encode = network_checks.encode
+    encode = network_cases.encode
 
     def other(source: object, path: object, config: object, **rest: object) -> object:
         assert config.engine == "slab"
         return encode(source, path, replace(config, seed=1), **rest)
 
     assert [finding.holds for finding in engines(paper_run)] == [True]
-    monkeypatch.setattr(network_checks, "encode", other)
+    monkeypatch.setattr(network_cases, "encode", other)
     assert [finding.holds for finding in engines(paper_run)] == [False]
 
 
 @pytest.fixture(scope="module")
 def layers() -> Case:
     """A network of one hidden layer, hardly trained."""
-    case = next(case for case in networks.CASES if case.name == "layers")
+    case = next(case for case in network_cases.NETWORK_CASES if case.name == "layers")
     config = replace(case.settings["hidden-layers-1"], epochs=5)
     return replace(case, settings={"hidden-layers-1": config})
 
 
-def broken(case: Case) -> set[str]:
+def broken_of(case: Case) -> set[str]:
     result = run_case(case, checks=())
     assert not result.errors
     return {finding.name for finding in result.findings if not finding.holds}
@@ -216,19 +173,19 @@ def test_the_oracle_is_the_definition(point: tuple[float, ...], table_value: flo
 
 
 def test_a_sound_network_keeps_the_bounds(layers: Case) -> None:
-    assert broken(layers) == set()
+    assert broken_of(layers) == set()
 
 
 def test_an_error_beyond_the_bound_of_rounding_is_seen(
     layers: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        oracle,
+        network_cases,
         "sample_points",
         lambda *given, **more: sample_points(*given, **more) + np.float32(1e-3),
     )
-    case = replace(layers, checks=(oracle.agrees,))
-    assert broken(case) == {"float64 oracle", "float64 oracle, error"}
+    case = replace(layers, checks=(network_cases.agrees,))
+    assert broken_of(case) == {"float64 oracle", "float64 oracle, error"}
 
 
 def turned(sample: Callable[..., object]) -> Callable[..., object]:
@@ -242,6 +199,6 @@ def turned(sample: Callable[..., object]) -> Callable[..., object]:
 
 
 def test_wrong_gradients_are_seen(layers: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(oracle, "sample_points", turned(sample_points))
-    case = replace(layers, checks=(oracle.gradients,))
-    assert broken(case) == {"gradient = differences"}
+    monkeypatch.setattr(network_cases, "sample_points", turned(sample_points))
+    case = replace(layers, checks=(network_cases.gradients,))
+    assert broken_of(case) == {"gradient = differences"}

@@ -1,4 +1,4 @@
-"""Cases of rays aim at vertices, faces and corners; their volumes are small."""
+"""Checks of rays see pictures that differ; the float64 picture has its closed forms."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march_task import Frame, Surface, Table, Task
 from fhash_codec.rendering.scenes import Camera
-from fhash_codec.selftest import ray_cases as ray_checks
-from fhash_codec.selftest import ray_cases as rays
+from fhash_codec.selftest import ray_cases
 from fhash_codec.selftest.case import Check, Run
 from fhash_codec.selftest.field_cases import series, waves
 from fhash_codec.selftest.ray_cases import (
@@ -29,36 +28,6 @@ from fhash_codec.selftest.ray_cases import (
     scene,
     scenes,
 )
-
-CASES = {case.name: case for case in rays.CASES}
-GRID = Grid(counts=rays.SHAPE[:0:-1], origin=np.zeros(3), spacing=np.ones(3))
-
-
-@pytest.mark.parametrize("view", rays.AXES)
-def test_the_camera_along_an_axis_aims_at_vertices(view: str) -> None:
-    camera = Camera.from_dict(rays._grid_camera(view))
-    eyes, directions = Rays.of(camera, GRID, (9, 9)).pixels()
-    along = int(np.argmax(np.abs(directions[4, 4])))
-    across = [axis for axis in range(3) if axis != along]
-    np.testing.assert_allclose(eyes[..., across], np.rint(eyes[..., across]), atol=1e-12)
-    np.testing.assert_allclose(directions[..., across], 0.0, atol=1e-12)
-
-
-def test_stairs_have_surfaces_through_vertices_and_along_faces() -> None:
-    values = np.stack(list(CASES["surfaces-on-vertices"].make().frames()))
-    assert set(values.ravel().tolist()) == set(map(float, range(8)))
-    assert (values[0, -1] == 6.0).all()
-
-
-def test_thin_volumes_have_one_vertex_along_their_axis() -> None:
-    for axis, name in enumerate(("thin-z", "thin-y", "thin-x"), 1):
-        assert CASES[name].make().shape[axis] == 1
-    assert CASES["thin-all"].make().shape[1:] == (1, 1, 1)
-
-
-def test_volumes_are_small() -> None:
-    assert max(np.prod(case.make().shape) for case in rays.CASES) <= np.prod(rays.SHAPE)
-
 
 Broken = Callable[[Run, Check], set[str]]
 FOG = {"opacity": [[0.0, 0.02], [1.0, 0.5]]}
@@ -103,49 +72,49 @@ def test_an_even_volume_has_its_closed_form(even_run: Run, broken: Broken) -> No
 def test_a_longer_path_breaks_the_closed_form(
     even_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = ray_checks._path
-    monkeypatch.setattr(ray_checks, "_path", lambda plan: 2 * path(plan))
+    path = ray_cases._path
+    monkeypatch.setattr(ray_cases, "_path", lambda plan: 2 * path(plan))
     assert broken(even_run, closed_form({"even": EVEN}, 1.0)) == {"closed form"}
 
 
 def test_a_picture_that_differs_from_the_oracle_is_seen(
     waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reference = ray_checks.reference_picture
-    monkeypatch.setattr(ray_checks, "reference_picture", lambda *given: reference(*given) + 2e-3)
+    reference = ray_cases.reference_picture
+    monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: reference(*given) + 2e-3)
     assert broken(waves_run, scenes({"small": SMALL})) == {"float64 picture"}
 
 
 def test_an_empty_picture_proves_nothing(
     waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ray_checks, "reference_picture", lambda *given: np.zeros((5, 6, 4)))
+    monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: np.zeros((5, 6, 4)))
     assert "empty pictures" in broken(waves_run, scenes({"small": SMALL}))
 
 
 def test_a_part_that_is_drawn_too_bright_is_seen(
     waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    march = ray_checks.march
+    march = ray_cases.march
 
     def brighter(frame: object, task: object) -> object:
         marched = march(frame, task)
         return replace(marched, rgba=marched.rgba * np.float32(1 + 1e-4 * (frame.first[0] > 0)))
 
-    monkeypatch.setattr(ray_checks, "march", brighter)
+    monkeypatch.setattr(ray_cases, "march", brighter)
     assert broken(waves_run, blocks) == {"blocks = whole"}
 
 
 def test_pictures_that_depend_on_the_name_of_the_step_are_seen(
     waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    render = ray_checks.Renderer.render
+    render = ray_cases.Renderer.render
 
     def other(renderer: object, given: object) -> object:
         image = render(renderer, given)
         return image if given.time is None else replace(image, rgba=image.rgba + np.float32(1e-6))
 
-    monkeypatch.setattr(ray_checks.Renderer, "render", other)
+    monkeypatch.setattr(ray_cases.Renderer, "render", other)
     assert broken(waves_run, key_times) == {"picture at a key time"}
 
 
