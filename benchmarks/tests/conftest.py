@@ -17,9 +17,11 @@ import pytest
 from fhash_bench import engines, train
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "helpers"))
+# pytest's importlib mode puts no folder of tests on the path.
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = map(str, (HERE.parents[1] / "tests" / "helpers", HERE / "paper", HERE / "pictures"))
 
-from command_line import data, fhash, refused, run  # noqa: F401
+from command_line import data, fhash, refused, run  # noqa: E402, F401
 
 
 @pytest.fixture

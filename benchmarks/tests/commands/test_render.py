@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from fhash_bench.pictures import vtk as beside_vtk
+from fhash_bench.pictures import vtk
 
 Fhash = Callable[..., Result]
 
@@ -17,8 +17,8 @@ QUICK = ["--size", "16", "--turns", "1", "-q"]
 
 
 def test_prints_tables(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(beside_vtk, "FINE_SIZE", 16)
-    monkeypatch.setattr(beside_vtk, "EXPLAINED_SIZE", 16)
+    monkeypatch.setattr(vtk, "FINE_SIZE", 16)
+    monkeypatch.setattr(vtk, "EXPLAINED_SIZE", 16)
     result = fhash(
         "bench",
         "render",

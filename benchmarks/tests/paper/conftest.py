@@ -1,21 +1,12 @@
-"""A small series with a feature, for training in milliseconds.
-
-Tests of this folder import the module `made_cells` beside them; pytest's importlib mode puts no
-folder of tests on the path.
-"""
+"""A small series with a feature, for training in milliseconds."""
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fhash_bench.paper.data import Data, gather_data
 from fhash_formats.series import ArraySeries
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 def blob(steps: int = 5) -> ArraySeries:

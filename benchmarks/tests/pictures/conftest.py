@@ -1,28 +1,19 @@
-"""A container of the blobs, and everything that is measured of it.
-
-Tests of this folder import the module `blobs` beside them; pytest's importlib mode puts no folder
-of tests on the path.
-"""
+"""A container of the blobs, and everything that is measured of it."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from blobs import axes, field
 
 import fhash_codec
-from fhash_bench.pictures import shell as orbit
-from fhash_bench.pictures import vtk as beside_vtk
+from fhash_bench.pictures import shell, vtk
 from fhash_bench.pictures.render import bench_render
 from fhash_bench.pictures.results import RenderBench
 from fhash_codec import EncodeConfig, Volume
 from fhash_codec.rendering.scenes import Scene
 from fhash_formats.series import ArraySeries
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +30,7 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Volume]:
 def result(volume: Volume) -> RenderBench:
     """Every part measured once, with small pictures where their size is fixed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(orbit, "SIDE", 40)
-        patch.setattr(beside_vtk, "FINE_SIZE", 64)
-        patch.setattr(beside_vtk, "EXPLAINED_SIZE", 48)
+        patch.setattr(shell, "SIDE", 40)
+        patch.setattr(vtk, "FINE_SIZE", 64)
+        patch.setattr(vtk, "EXPLAINED_SIZE", 48)
         return bench_render(volume, Scene(step=1.0), size=24, turns=1)

@@ -14,18 +14,24 @@ import pytest
 
 from fhash_bench.rate.peers import (
     ENCODERS,
-    NAMES,
     PROGRAMS,
+    QOZ_NAMES,
     PeerFiles,
     ProgramVariant,
+    all_filters,
     as_float,
     called,
     executable,
     folder_of,
     programs,
+    qoz_variants,
     read_raw,
+    read_region,
+    spans_of,
     there_and_back,
-    variants,
+    touched_bytes,
+    tthresh_variants,
+    video_variants,
     write_raw,
 )
 from fhash_bench.rate.rate import bench_rate
@@ -37,13 +43,9 @@ from fhash_codec.cost.peers import (
     filled,
     joined,
     parts_of,
-    peers,
     read_all,
-    read_region,
-    spans_of,
     stored,
     stored_bytes,
-    touched_bytes,
 )
 from fhash_formats.errors import InputError
 
@@ -143,7 +145,7 @@ def test_temporary_files_go_away(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", QOZ_NAMES)
 @pytest.mark.parametrize("shape", [(4, 6, 20, 24), (1, 6, 20, 24), (3, 1, 1, 9)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_level_is_a_tolerance(
@@ -155,11 +157,11 @@ def test_the_level_is_a_tolerance(
     dtype: type,
 ) -> None:
     values = field(shape).astype(dtype) + dtype(0.1)
-    for variant in variants(name, qoz):
+    for variant in qoz_variants(name, qoz):
         coded = variant.encode(values, 3.0, 40.0, tmp_path)
         difference = variant.decode(coded).astype(float) - values
         assert 0 < np.abs(difference).max() <= 0.03 * (1 + 1e-6)
-        assert variant.peer == NAMES[name]
+        assert variant.peer == QOZ_NAMES[name]
 
 
 def test_values_are_float32_where_that_holds_them() -> None:
@@ -253,21 +255,21 @@ def test_the_psnr_is_that_of_the_level(
 ) -> None:
     values = (100 * field(shape)).astype(dtype)
     data_range = float(np.ptp(values))
-    for variant in variants(tthresh):
+    for variant in tthresh_variants(tthresh):
         coded = variant.encode(values, data_range, 40.0, tmp_path)
         difference = variant.decode(coded).astype(float) - values
         # A uniform error of that tolerance has a PSNR 4.8 dB above the level.
         reached = 20 * np.log10(data_range / np.sqrt(np.mean(difference**2)))
         assert 43 < reached < 48
         assert 0 < coded.bytes < 8 * values.size + 600
-    assert {variant.goals for variant in variants(tthresh)} == {("psnr", "bound")}
+    assert {variant.goals for variant in tthresh_variants(tthresh)} == {("psnr", "bound")}
 
 
 def test_a_constant_part_is_kept_without_the_program(tmp_path: Path) -> None:
     """The program takes minutes on it, and megabytes."""
     values = np.linspace(0, 1, 2 * 3 * 4 * 5).reshape(2, 3, 4, 5)
     values[0] = 0.3
-    frames = next(variant for variant in variants("/nowhere") if variant.layout == "frame")
+    frames = next(variant for variant in tthresh_variants("/nowhere") if variant.layout == "frame")
     file = tmp_path / "part"
     frames.program.encode(values[0], file, (0.0, 1.0), 45.0)
     assert file.stat().st_size == 8
@@ -288,7 +290,7 @@ def test_a_finer_level_is_better(
 ) -> None:
     values = field(shape)
     data_range = float(np.ptp(values))
-    found = variants("hevc", ffmpeg)
+    found = video_variants("hevc", ffmpeg)
     assert {variant.program.bits for variant in found} == {10, 12}
     for variant in found:
         assert variant.goals == ("psnr",)
@@ -305,9 +307,9 @@ def test_a_finer_level_is_better(
 
 def test_an_encoder_that_is_not_there_is_named(ffmpeg: str) -> None:
     with pytest.raises(InputError, match="has no encoder libvvenc"):
-        variants("vvc", ffmpeg)
+        video_variants("vvc", ffmpeg)
     with pytest.raises(InputError, match="has no encoder libaom-av1 or libsvtav1"):
-        variants("av1", ffmpeg)
+        video_variants("av1", ffmpeg)
 
 
 def real() -> str | None:
@@ -326,7 +328,7 @@ def test_an_ffmpeg_codes_what_it_is_given(field: Field, tmp_path: Path, name: st
     if path is None:
         pytest.skip("there is no ffmpeg")
     try:
-        found = variants(name, path)
+        found = video_variants(name, path)
     except InputError as error:
         pytest.skip(str(error))
     values = field()
@@ -340,7 +342,7 @@ def test_files_of_a_filter_are_read_by_regions(
     field: Callable[..., np.ndarray], tmp_path: Path
 ) -> None:
     values = field()
-    for variant in peers()["SZ3"]:
+    for variant in all_filters()["SZ3"]:
         decoded, count = there_and_back(values, variant, 3.0, 40.0, tmp_path)
         assert np.abs(decoded - values).max() <= 0.03 * (1 + 1e-4)
         files = PeerFiles(values, variant, 3.0, 40.0, tmp_path)
@@ -367,7 +369,7 @@ def test_parts_come_back_and_regions_are_found(layout: str) -> None:
     np.testing.assert_array_equal(np.concatenate(found), VALUES_LAYOUTS[2, 1:3, 0:2, 2:6].ravel())
 
 
-VARIANTS = [variant for chosen in peers().values() for variant in chosen]
+VARIANTS = [variant for chosen in all_filters().values() for variant in chosen]
 """Every variant of every peer."""
 CUT = [replace(variant, chunk=8) for variant in VARIANTS if variant.layout == "frame"]
 """Variants with chunks of a frame, cut into small ones."""
@@ -416,7 +418,7 @@ def test_sperr_is_given_the_axes_in_its_own_order() -> None:
     values = values + np.sin(np.linspace(0, 3, 90, dtype=np.float32))
     variant = next(
         variant
-        for variant in peers()["SPERR"]
+        for variant in all_filters()["SPERR"]
         if variant.layout == "frame" and variant.mode == "tolerance"
     )
     other = replace(

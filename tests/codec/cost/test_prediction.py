@@ -159,7 +159,7 @@ class _Known:
         return Prediction(seconds=seconds, bytes=1234, psnr=50.0, basis="known")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
     def predictor(_: Any) -> Iterator[_Known]:
@@ -172,6 +172,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
     ("seconds", "effort", "fits"),
     [(5, 1, False), (20, 1, True), (60, 2, True), (240, 4, True), (5000, MAX_EFFORT, True)],
 )
+@pytest.mark.usefixtures("known")
 def test_the_highest_effort_that_fits_is_chosen(seconds: float, effort: int, fits: bool) -> None:
     choice = choose(SERIES, EncodeConfig(psnr=44.0), seconds)
     assert choice.config == EncodeConfig(psnr=44.0, effort=effort)
@@ -182,6 +183,7 @@ def test_the_highest_effort_that_fits_is_chosen(seconds: float, effort: int, fit
         assert f"--effort {effort + 1} would take" in choice.why
 
 
+@pytest.mark.usefixtures("known")
 def test_an_effort_that_is_given_is_the_most() -> None:
     assert choose(SERIES, EncodeConfig(effort=3), 5000, capped=True).config.effort == 3
     assert choose(SERIES, EncodeConfig(effort=3), 60, capped=True).config.effort == 2
@@ -191,17 +193,20 @@ def test_an_effort_that_is_given_is_the_most() -> None:
 @pytest.mark.parametrize(
     ("seconds", "epochs", "fits"), [(10, 1, False), (230, 99, True), (10_000, MAX_EPOCHS, True)]
 )
+@pytest.mark.usefixtures("known")
 def test_the_most_epochs_that_fit_are_chosen(seconds: float, epochs: int, fits: bool) -> None:
     choice = choose(SERIES, PAPER, seconds)
     assert (choice.config.epochs, choice.fits) == (epochs, fits)
     assert choice.option == f"--epochs {epochs}"
 
 
+@pytest.mark.usefixtures("known")
 def test_epochs_that_are_given_are_the_most() -> None:
     config = EncodeConfig(profile="paper", epochs=30)
     assert choose(SERIES, config, 10_000, capped=True).config.epochs == 30
 
 
+@pytest.mark.usefixtures("known")
 def test_a_budget_that_cannot_be_kept_is_told() -> None:
     choice = choose(SERIES, EncodeConfig(), 5)
     assert "time budget of 5 s may not be kept: even --effort 1" in choice.why
