@@ -128,7 +128,8 @@ def _of_distribution(name: str) -> click.Command:
 
     def missing() -> None:
         raise MissingDependencyError(
-            f"{name} is a package of its own; pip install '{DISTRIBUTIONS[name]}'"
+            f"{name} is a package of its own; pip install '{DISTRIBUTIONS[name]}',"
+            " in the sources ./benchmarks"
         )
 
     words = {"ignore_unknown_options": True, "allow_extra_args": True}
