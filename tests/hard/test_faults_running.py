@@ -1,7 +1,8 @@
-"""Two writers of one output, folders without permission to write, and memory that runs out."""
+"""Signals, sources that change, and commands at once leave whole outputs and one line."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import shutil
@@ -12,9 +13,173 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from faulty import COMPACT, Bench, listing, moments
-from forks import Server
+from faulty import COMMANDS, COMPACT, PROFILES, Bench, Server, listing, moments, values
 from reporting import LONG, record
+from sources import FORMS
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+EACH_ALONE = ("render pictures",)
+"""Commands with several outputs, each of which is complete or absent by itself."""
+COMMITTED = (
+    "encode compact",
+    "encode paper",
+    "encode several",
+    "merge",
+    "append",
+    "decode npy",
+    "decode h5",
+    "decode zarr",
+    "decode pvd",
+    "render png",
+    "render gif",
+)
+
+
+def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
+    """Return the first and the last report of each stage of a command; in the long set, all
+    reports."""
+    noted.unlink(missing_ok=True)
+    words = [word for word in bench.words(name) if word != "-q"]
+    ended = bench.server.run(*words, inject=[("note_stages", noted)])
+    assert ended.code == 0, ended.output
+    reports_of_all = [
+        (line.rpartition(" ")[0], int(line.rpartition(" ")[2]))
+        for line in noted.read_text().splitlines()
+    ]
+    chosen = []
+    for _, group in itertools.groupby(dict.fromkeys(reports_of_all), key=lambda report: report[0]):
+        reports = list(group)
+        chosen += reports if LONG else dict.fromkeys([reports[0], reports[-1]])
+    return list(dict.fromkeys(chosen))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_signal_at_each_stage_leaves_the_older_output(
+    bench: Bench, name: str, tmp_path: Path
+) -> None:
+    bench.old(name)
+    moments_of_stages = stages(bench, name, tmp_path / "stages")
+    assert moments_of_stages or name.startswith("decode vtp")
+    if name in [f"encode {profile}" for profile in PROFILES]:
+        assert {stage for stage, _ in moments_of_stages} >= {
+            "scanning",
+            "measuring",
+            "training" if "paper" in name else "coding",
+        }
+    for turn, (stage, done) in enumerate(moments_of_stages):
+        number = SIGNALS[turn % len(SIGNALS)]
+        before = bench.old(name)
+        ended = bench.run(name, ("signal_at", stage, done, number))
+        assert ended.code == 130, (stage, done, ended.output)
+        assert ended.line.startswith("fhash: error: interrupted"), (stage, done)
+        now = bench.now()
+        kept = {place: data for place, data in now.items() if not place.endswith(".checkpoint")}
+        assert kept.keys() == before.keys(), (stage, done)
+        # The last report of writing comes when the new file has its name, and the line says so.
+        written = stage == "writing" and "was written" in ended.line
+        assert written == (stage == "writing" and done > 0), (stage, done, ended.line)
+        assert name in EACH_ALONE or written or kept == before, (stage, done)
+        assert len(now) == len(kept) or stage in ("training", "coding tables", "measuring"), (
+            stage,
+            done,
+        )
+    ended = bench.run(name)  # resumes from the checkpoint, if there is one
+    assert ended.code == 0, ended.output
+    assert bench.now() == bench.new(name)
+    record(
+        "a signal at each stage",
+        {
+            "command": name,
+            "stages": len({stage for stage, _ in moments_of_stages}),
+            "signals": len(moments_of_stages),
+        },
+    )
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, name: str) -> None:
+    count = bench.operations(name)
+    for turn, place in enumerate(moments(count)):
+        before = bench.old(name)
+        ended = bench.run(name, ("at_operation", bench.out, place, -SIGNALS[turn % len(SIGNALS)]))
+        now = bench.now()
+        if ended.code == 0:  # the signal came after the end of the work
+            assert now == bench.new(name), place
+            continue
+        assert ended.code == 130, (place, ended.output)
+        assert ended.line.startswith("fhash: error: interrupted"), place
+        kept = {name: data for name, data in now.items() if not name.endswith(".checkpoint")}
+        assert kept in (before, bench.new(name)), place
+    record(
+        "a signal at an operation",
+        {"command": name, "operations": count, "signals": len(moments(count))},
+    )
+
+
+STAGES = {
+    "compact": ["scanning", "selecting", "planning", "coding", "measuring"],
+    "paper": ["scanning", "selecting", "gathering", "training", "measuring"],
+}
+HOW = ("vanish", "shrink", "grow", "touch", "other")
+QUICK = {
+    ("compact", "scanning", "other"),
+    ("compact", "selecting", "touch"),
+    ("compact", "coding", "shrink"),
+    ("compact", "measuring", "vanish"),
+    ("paper", "training", "other"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_source_that_changes_is_refused(bench: Bench, tmp_path: Path, form: str) -> None:
+    module = {"NetCDF": "h5netcdf", "NetCDF 3": "scipy"}.get(form)
+    if module:
+        pytest.importorskip(module)
+    tried = 0
+    for profile, stages in STAGES.items():
+        for stage in stages:
+            for how in HOW:
+                if not LONG and (profile, stage, how) not in QUICK:
+                    continue
+                if form == "a mask" and stage != "selecting":
+                    continue  # it is read in this stage only
+                check(bench, tmp_path / "source", form, profile, stage, how)
+                tried += 1
+    assert tried > 0
+    record("a source that changes", {"form": form, "changes": tried})
+
+
+def check(bench: Bench, folder: Path, form: str, profile: str, stage: str, how: str) -> None:
+    what = (profile, stage, how)
+    for place in (folder / "here", folder / "other"):
+        place.mkdir(parents=True)
+    other, _ = FORMS[form](folder / "other", values(7))
+    target, words = FORMS[form](folder / "here", values(0))
+    before = bench.old(f"encode {profile}")
+    act = str(other) if how == "other" else how
+    if target.is_dir() and how in ("shrink", "grow", "touch"):
+        target = target / "c" / "1" / "0" / "0" / "0"  # a chunk
+    ended = bench.server.run(
+        "encode",
+        *words,
+        "-o",
+        bench.out / "a.fhz",
+        "--force",
+        *PROFILES[profile],
+        inject=[("change_at", stage, 0 if stage == "planning" else 1, target, act)],
+    )
+    assert ended.code == 2, (what, ended.output)
+    assert ended.line.startswith("fhash: error: "), what
+    assert "changed while it was being read" in ended.line or "cannot be read" in ended.line, (
+        what,
+        ended.line,
+    )
+    assert "please report" not in ended.line
+    assert {
+        place: data for place, data in bench.now().items() if not place.endswith(".checkpoint")
+    } == before, what
+    shutil.rmtree(folder)
+
 
 NOBODY = 65534
 
