@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from fhash_bench import ablate
-from fhash_bench import ablate as axes
 from fhash_bench.ablate import (
     AXES,
     POINTS,
@@ -41,13 +40,13 @@ FEW = (
 )
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def few_axes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(axes, "AXES", FEW)
+    monkeypatch.setattr(ablate, "AXES", FEW)
 
 
 @pytest.fixture
-def waves() -> np.ndarray:
+def waves(few_axes: None) -> np.ndarray:
     t, z, y, x = np.indices((3, 6, 8, 10))
     return np.sin(0.4 * x + 0.2 * t).astype("f4") * np.cos(0.3 * y - 0.1 * z).astype("f4")
 
@@ -114,7 +113,7 @@ def test_a_variation_that_cannot_be_encoded_is_told(
         varied=({"key_frames": "0,1"}, {"key_frames": "0,7"}),
         why="steps",
     )
-    monkeypatch.setattr(axes, "AXES", (frames,))
+    monkeypatch.setattr(ablate, "AXES", (frames,))
     result = measured(waves)
     assert len(result.runs) == 1
     assert len(result.left_out) == 1
@@ -147,9 +146,6 @@ def test_axes_are_chosen_by_name_in_their_own_order() -> None:
     assert [axis.name for axis in axes_named(["tile", "batch"])] == ["batch", "tile"]
     with pytest.raises(InputError, match="unknown axis 'bricks'; did you mean 'brick'"):
         axes_named(["bricks"])
-
-
-pytest.importorskip("matplotlib")
 
 
 def run(axis: str, number: int, curve: bool) -> Run:

@@ -15,20 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_bench import train as bench
-from fhash_bench import train as decode
-from fhash_bench import train as points
+from fhash_bench import train
 from fhash_bench.engines import GOALS
 from fhash_bench.rate import generated as made
 from fhash_bench.train import (
     DECODE_TURNS,
+    TURNS,
     bench_decode,
     bench_points,
     bench_train,
     plot,
-)
-from fhash_bench.train import (
-    TURNS as TURNS_BENCH,
 )
 from fhash_codec import EncodeConfig
 from fhash_codec.features.bricks import build_coreset
@@ -43,7 +39,7 @@ from fhash_formats.series import ArraySeries
 
 
 def test_both_ways_decode_the_same_key_frames(
-    field: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A clock of one second a call to the decoder, two for the whole box."""
     values = np.zeros((7, 8, 40, 70), np.float32)
@@ -65,8 +61,8 @@ def test_both_ways_decode_the_same_key_frames(
         seen.append((key, requested))
         assert network.levels == architecture.levels
 
-    monkeypatch.setattr(decode, "decode_region", decoded)
-    monkeypatch.setattr(decode, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(train, "decode_region", decoded)
+    monkeypatch.setattr(train, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     figures = bench_decode(architecture, coreset, layers)
     assert figures["decode_ratio"] == 2.0
     assert figures["decode_msamples_s"] == pytest.approx(33e-6)
@@ -81,8 +77,10 @@ CONFIG = EncodeConfig(profile="paper", width=4, hidden_layers=1)
 
 
 @pytest.fixture
-def series(field: Callable[..., np.ndarray], quick: None) -> ArraySeries:
-    return ArraySeries(field())
+def series(quick: None) -> ArraySeries:
+    """A smooth moving field, values -100 .. 200."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 8, 10, 18)), indexing="ij")
+    return ArraySeries((100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32))
 
 
 def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
@@ -95,10 +93,8 @@ def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
     assert list(dict.fromkeys(engines)) == (["native"] if paths else []) + ["slab"]
     assert {run["path"] for run in entry["engines"] if run["engine"] == "native"} == set(paths)
     measured = [words for words in calls if words[0] == "measuring"]
-    assert len(measured) == TURNS_BENCH * len(engines)
-    assert [words[3] for words in measured[: len(engines)]] * TURNS_BENCH == [
-        w[3] for w in measured
-    ]
+    assert len(measured) == TURNS * len(engines)
+    assert [words[3] for words in measured[: len(engines)]] * TURNS == [w[3] for w in measured]
     assert all(later[1] == before[1] + 1 for before, later in pairwise(measured))
     slab = next(run for run in entry["engines"] if run["engine"] == "slab")
     assert (slab["train_ratio"], slab["infer_ratio"]) == (1.0, 1.0)
@@ -108,7 +104,7 @@ def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
         assert min(run["fraction_of_peak"], run["fraction_of_bandwidth"]) > 0
         assert run["epochs"] > 0
         assert np.isfinite(run["psnr"])
-        assert len(run["curve"]) == TURNS_BENCH
+        assert len(run["curve"]) == TURNS
         assert run["curve"][-1]["psnr"] == run["psnr"]
         assert [goal["psnr"] for goal in run["seconds_to"]] == list(GOALS)
     assert 0 < entry["batch_samples"] <= entry["samples"] == series.values.size
@@ -176,7 +172,7 @@ def test_there_is_no_ratio_without_the_slab_engine(series: ArraySeries) -> None:
 def test_several_threads_are_beside_one(
     series: ArraySeries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "threads_for", lambda _: nullcontext_of(2))
+    monkeypatch.setattr(train, "threads_for", lambda _: nullcontext_of(2))
     (entry,) = bench_train(series, CONFIG, engines=("slab", "native"), seconds=0.01)["series"]
     slab, slab_2, native, native_2 = entry["engines"][:4]
     assert [run["threads"] for run in entry["engines"][:4]] == [1, 2, 1, 2]
@@ -228,7 +224,7 @@ def test_a_machine_that_stalls_at_the_first_steps_is_measured_all_the_same(
             yield 1e6 + tick / 1e6
 
     ticking(times())
-    monkeypatch.setattr(bench, "INFER_SECONDS", 1e-5)
+    monkeypatch.setattr(train, "INFER_SECONDS", 1e-5)
     report = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)
     run = report["series"][0]["engines"][0]
     assert run["train_msamples_s"] > 0
@@ -240,7 +236,7 @@ def test_it_runs_without_zarr() -> None:
     code = (
         "import sys; sys.modules['zarr'] = None\n"
         "from fhash_codec import EncodeConfig\n"
-        "from fhash_bench.commands import made\n"
+        "from fhash_bench.rate import generated as made\n"
         "from fhash_bench.train import bench_train\n"
         "made.MADE = {'front': made.Made('front', (2, 8, 16, 16), '', False)}\n"
         "config = EncodeConfig(profile='paper', width=4, hidden_layers=1)\n"
@@ -248,9 +244,6 @@ def test_it_runs_without_zarr() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1"]
-
-
-pytest.importorskip("matplotlib")
 
 
 def run(engine: str, path: str | None) -> dict[str, Any]:
@@ -307,10 +300,10 @@ def test_rays_are_straight_and_inside() -> None:
     layers = [
         (np.ones((n, m), np.float32), np.zeros(n, np.float32)) for n, m in architecture.layer_shapes
     ]
-    network = points._network(architecture, layers)
-    rays = points._rays(network).reshape(3, -1, points.RAY_POINTS)
+    network = train._network(architecture, layers)
+    rays = train._rays(network).reshape(3, -1, train.RAY_POINTS)
     np.testing.assert_allclose(np.diff(rays, n=2, axis=2), 0, atol=1e-12)
-    for places in (points._rays(network), points._random(network)):
-        assert places.shape == (3, points.POINTS)
+    for places in (train._rays(network), train._random(network)):
+        assert places.shape == (3, train.POINTS)
         assert (places >= 0).all()
         assert (places <= np.array(network.box_size)[:, None] - 1).all()

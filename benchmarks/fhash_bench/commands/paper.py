@@ -23,15 +23,14 @@ if TYPE_CHECKING:
 class NameType(click.ParamType[str]):
     """A name of the bench, looked up only when one is given: --help loads nothing."""
 
-    def __init__(self, name: str, module: str, constant: str) -> None:
-        self.name, self._module, self._constant = name, module, constant
+    def __init__(self, name: str, constant: str) -> None:
+        self.name, self._constant = name, constant
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The name; refuses one that is unknown."""
-        from importlib import import_module
+        from fhash_bench.paper import data
 
-        package = "fhash_codec.bench.paper"
-        allowed = tuple(getattr(import_module(f"{package}.{self._module}"), self._constant))
+        allowed = tuple(getattr(data, self._constant))
         if value not in allowed:
             self.fail(f"'{value}' is no {self.name}; allowed: {', '.join(allowed)}", param, ctx)
         return str(value)
@@ -47,14 +46,14 @@ class NameType(click.ParamType[str]):
 )
 @click.option(
     "--scale",
-    type=NameType("scale", "sets", "SCALES"),
+    type=NameType("scale", "SCALES"),
     metavar="NAME",
     help="Of the scenes: full, half, quarter or eighth of the paper's lengths. Default: full.",
 )
 @click.option(
     "--protocol",
     "protocols",
-    type=NameType("protocol", "protocols", "PROTOCOLS"),
+    type=NameType("protocol", "PROTOCOLS"),
     metavar="NAME",
     multiple=True,
     help="published, released, equal or best; repeat. Default: all.",
@@ -62,7 +61,7 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--data-set",
     "data_sets",
-    type=NameType("data set", "sets", "SETS"),
+    type=NameType("data set", "SETS"),
     metavar="NAME",
     multiple=True,
     help="flame, bubble or shell; repeat. Default: all.",
@@ -70,7 +69,7 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--encoding",
     "encodings",
-    type=NameType("encoding", "protocols", "ENCODINGS"),
+    type=NameType("encoding", "ENCODINGS"),
     metavar="NAME",
     multiple=True,
     help="dense, dense-multi, hash, tcnn or fhash; repeat. Default: all.",

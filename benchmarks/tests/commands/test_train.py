@@ -86,7 +86,6 @@ def test_it_measures_each_engine(fhash: Fhash, data: Path) -> None:
 def test_it_prints_a_row_for_each_engine_and_draws_curves(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip("matplotlib")
     picture = tmp_path / "curves.png"
     words = (*WORDS, data, "--engines", "native,slab", "--bricks-per-step", "1", "--plot", picture)
     result = fhash(*words)
