@@ -19,7 +19,9 @@ from fhash_bench import engines, train
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # pytest's importlib mode puts no folder of tests on the path.
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = map(str, (HERE.parents[1] / "tests" / "helpers", HERE / "paper", HERE / "pictures"))
+TESTS = HERE.parents[1] / "tests"
+PATHS = (TESTS / "helpers", TESTS / "codec", HERE / "paper", HERE / "pictures")
+sys.path[:0] = map(str, PATHS)
 
 from command_line import data, fhash, refused, run  # noqa: E402, F401
 
