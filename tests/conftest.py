@@ -43,7 +43,7 @@ LONG_ROOMS = (
     "benchmarks/tests/pictures/",
     "benchmarks/tests/rate/",
     "benchmarks/tests/test_ablate.py",
-    "benchmarks/tests/test_engines.py",
+    "benchmarks/tests/test_train.py",
     "benchmarks/tests/test_train.py",
     "tests/codec/cost/",
     "tests/codec/selftest/",
