@@ -54,9 +54,9 @@ wheel/%: .venv/.stamp
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
 # the choice is made before any other requirement counts. Python compiles what it imports; pip would compile all of torch,
 # and vtk, which takes minutes.
-.venv/.stamp: pyproject.toml constraints.txt | .venv/bin/python
+.venv/.stamp: pyproject.toml benchmarks/pyproject.toml constraints.txt | .venv/bin/python
 	$(INSTALL) torch
-	$(INSTALL) -e '.[dev]'
+	$(INSTALL) -e '.[dev]' -e ./benchmarks
 	touch $@ .venv/.plain
 
 .venv/.plain: pyproject.toml constraints.txt | .venv/bin/python
@@ -68,5 +68,5 @@ wheel/%: .venv/.stamp
 	$(PYTHON) -m venv .venv
 
 clean:
-	rm -rf .venv build dist demo *.egg-info .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist demo *.egg-info benchmarks/*.egg-info benchmarks/build .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

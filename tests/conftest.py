@@ -40,13 +40,14 @@ SLOW_ROOMS = ("fresh", "hard", "golden")
 QUICK_HARD_FILES = ("test_names.py", "test_summary.py")
 """Files of the room `hard` that take no time."""
 LONG_ROOMS = (
-    "codec/bench/ablate",
-    "codec/bench/pictures",
-    "codec/bench/rate",
-    "codec/bench/train",
-    "codec/cost",
-    "codec/selftest",
-    "codec/paper/engines/fused",
+    "benchmarks/tests/pictures/",
+    "benchmarks/tests/rate/",
+    "benchmarks/tests/test_ablate.py",
+    "benchmarks/tests/test_train.py",
+    "benchmarks/tests/test_train.py",
+    "tests/codec/cost/",
+    "tests/codec/selftest/",
+    "tests/codec/paper/engines/fused/",
 )
 """Rooms of measuring tools, and of kernels that are emulated, which the long set alone runs. Not
 that of the published figures: what they are wrong in is read by others."""
@@ -58,10 +59,9 @@ SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Puts slow files first, and keeps the order of all others; see `_keep_some_cases`."""
-    root = Path(__file__).parent
 
     def rank(item: pytest.Item) -> int:
-        room = item.path.relative_to(root).parts[0]
+        room = item.path.relative_to(HERE.parent).parts[1]
         if room in SLOW_ROOMS:
             return SLOW_ROOMS.index(room)
         return len(SLOW_ROOMS) + (item.path.name not in SLOW_FILES)
@@ -92,10 +92,10 @@ def _keep_some_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
 
 def _is_long(item: pytest.Item) -> bool:
     """Whether a test belongs to the long set: faults, hostile files, sanitizers, LONG_ROOMS."""
-    place = item.path.relative_to(Path(__file__).parent).as_posix()
-    if place.startswith(tuple(f"{room}/" for room in LONG_ROOMS)):
+    place = item.path.relative_to(HERE.parent).as_posix()
+    if place.startswith(LONG_ROOMS):
         return True
-    if not place.startswith("hard/"):
+    if not place.startswith("tests/hard/"):
         return False
     compiles = item.path.name == "test_fuzz.py" and "folder" in getattr(item, "fixturenames", ())
     return compiles or item.path.name not in ("test_fuzz.py", *QUICK_HARD_FILES)

@@ -21,18 +21,21 @@ PACKAGES = {
     "fhash_formats": ROOT / "formats" / "fhash_formats",
     "fhash_codec": ROOT / "fhash_codec",
     "fhash_cli": ROOT / "cli" / "fhash_cli",
+    "fhash_bench": ROOT / "benchmarks" / "fhash_bench",
 }
 ALLOWED = {
     "fhash_formats": {"fhash_formats"},
     "fhash_codec": {"fhash_codec", "fhash_formats"},
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
+    "fhash_bench": {"fhash_bench", "fhash_cli", "fhash_codec", "fhash_formats"},
 }
-TORCH_FILES = re.compile(
-    r"paper/(train|fit|engines/.+)\.py|devices\.py|bench/train/.+\.py"
-    r"|rendering/torch_arrays\.py|bench/paper/(bench|between|training)\.py"
-    r"|bench/paper/encodings/.+\.py"
-)
-"""Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""
+TORCH_FILES = {
+    "fhash_codec": re.compile(
+        r"paper/(train|fit|engines/.+)\.py|devices\.py|rendering/torch_arrays\.py"
+    ),
+    "fhash_bench": re.compile(r"(engines|train|paper/(bench|encodings|measures|trained))\.py"),
+}
+"""Modules that train or evaluate tensors, march through them, or start training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy", "asyncio")
 
 
@@ -58,7 +61,7 @@ def test_dependencies_point_one_way(package: str) -> None:
         own = {name.split(".")[0] for name in imports(path)}
         wrong = {name for name in own if name.startswith("fhash")} - ALLOWED[package]
         assert not wrong, f"{path} imports {wrong}"
-        assert not own & {"cli", "formats", "fhash"}, f"{path} imports a source root"
+        assert not own & {"cli", "formats", "benchmarks", "fhash"}, f"{path} imports a source root"
 
 
 def test_torch_stays_where_tensors_are_trained() -> None:
@@ -66,19 +69,22 @@ def test_torch_stays_where_tensors_are_trained() -> None:
         for path in modules(package):
             if any(name.split(".")[0] in ("torch", "triton") for name in imports(path)):
                 inside = path.relative_to(PACKAGES[package]).as_posix()
-                assert package == "fhash_codec", f"{path} imports torch"
-                assert TORCH_FILES.fullmatch(inside), f"{path} imports torch"
+                assert package in TORCH_FILES, f"{path} imports torch"
+                assert TORCH_FILES[package].fullmatch(inside), f"{path} imports torch"
 
 
-@pytest.mark.parametrize("folder", ["cli", "formats"])
+@pytest.mark.parametrize("folder", ["cli", "formats", "benchmarks"])
 def test_source_roots_are_no_packages(folder: str) -> None:
     assert not (ROOT / folder / "__init__.py").exists()
 
 
 def test_every_package_folder_is_installed_and_typed() -> None:
-    listed = set(
-        tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
-    )
+    projects = (ROOT / "pyproject.toml", ROOT / "benchmarks" / "pyproject.toml")
+    listed = {
+        name
+        for project in projects
+        for name in tomllib.loads(project.read_text())["tool"]["setuptools"]["packages"]
+    }
     found = {
         ".".join([package, *path.parent.relative_to(PACKAGES[package]).parts])
         for package in PACKAGES
@@ -93,6 +99,9 @@ def test_version_is_the_same_everywhere() -> None:
 
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert declared == importlib.metadata.version("fhash") == fhash_codec.__version__
+    benchmarks = tomllib.loads((ROOT / "benchmarks" / "pyproject.toml").read_text())["project"]
+    assert benchmarks["version"] == declared
+    assert f"fhash=={declared}" in benchmarks["dependencies"]
     assert f"## [{declared}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
@@ -131,13 +140,15 @@ def test_constraints_pin_every_requirement_and_name_no_place() -> None:
     )
     pinned = {re.sub(r"[-_.]+", "-", line.split("==")[0]) for line in lines}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    benchmarks = tomllib.loads((ROOT / "benchmarks" / "pyproject.toml").read_text())["project"]
     required = [
         *project["dependencies"],
         *(name for extra in project["optional-dependencies"].values() for name in extra),
+        *benchmarks["dependencies"],
     ]
     names = {
         re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", line)[0].lower()) for line in required
-    } - {"fhash"}  # type: ignore[index]
+    } - {"fhash", "fhash-bench"}  # type: ignore[index]
     assert names <= pinned
 
 

@@ -14,6 +14,7 @@ PACKAGES = {
     "fhash_formats": ROOT / "formats" / "fhash_formats",
     "fhash_codec": ROOT / "fhash_codec",
     "fhash_cli": ROOT / "cli" / "fhash_cli",
+    "fhash_bench": ROOT / "benchmarks" / "fhash_bench",
 }
 
 LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
@@ -61,7 +62,6 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("encoding",),
         ("plain", "views", "xarray_backend"),
         ("selftest",),
-        ("bench",),
         ("cost",),
     ),
     "fhash_codec.appending": (("growing", "series_plan"), ("parts", "writer"), ("cluster",)),
@@ -81,7 +81,13 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("options", "output"),
         ("selection",),
-        ("peer_options", "variables"),
+        ("variables",),
+        ("commands",),
+        ("main",),
+    ),
+    "fhash_bench": (
+        ("ablate", "engines", "labels", "pictures", "rate"),
+        ("paper", "train"),
         ("commands",),
         ("main",),
     ),

@@ -20,7 +20,7 @@ from typing import Any, cast
 import click
 
 from fhash_cli.output import describe_error, error_object, print_json, printed, say, warn
-from fhash_formats.errors import InterruptedEncodingError
+from fhash_formats.errors import InterruptedEncodingError, MissingDependencyError
 
 COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
@@ -43,6 +43,9 @@ COMMANDS = {
     "completion": "print the shell code that completes fhash's words on Tab",
 }
 """Help line of each command; its module of `fhash_cli.commands` is imported only on use."""
+DISTRIBUTIONS = {"bench": "fhash[bench]"}
+"""Commands of other distributions, entry points of the group `fhash.commands`, and what installs
+them."""
 FILES = {
     **dict.fromkeys(("plan", "merge", "append"), "parts"),
     **dict.fromkeys(("pack", "unpack", "export", "serve"), "zarr"),
@@ -65,6 +68,8 @@ class Program(click.Group):
         """The click command of a name; None for a name that is unknown."""
         if name not in COMMANDS:
             return None
+        if name in DISTRIBUTIONS:
+            return _of_distribution(name)
         module = importlib.import_module(f"fhash_cli.commands.{FILES.get(name, name)}")
         return cast(
             click.Command, getattr(module, f"{name}_command" if name in FILES else "command")
@@ -109,6 +114,26 @@ class Program(click.Group):
             sys.exit(code)
         # click returns the exit code of commands that end early (--help, --version), else None.
         sys.exit(result if isinstance(result, int) else 0)
+
+
+def _of_distribution(name: str) -> click.Command:
+    """The command that another distribution gives.
+
+    Where none is installed, a command that takes any words and raises MissingDependencyError.
+    """
+    from importlib.metadata import entry_points
+
+    for point in entry_points(group="fhash.commands", name=name):
+        return cast(click.Command, point.load())
+
+    def missing() -> None:
+        raise MissingDependencyError(
+            f"{name} is a package of its own; pip install '{DISTRIBUTIONS[name]}',"
+            " in the sources ./benchmarks"
+        )
+
+    words = {"ignore_unknown_options": True, "allow_extra_args": True}
+    return click.Command(name, callback=missing, context_settings=words, add_help_option=False)
 
 
 def _asks_for_json(words: Sequence[str]) -> bool:

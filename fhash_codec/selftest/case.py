@@ -1,13 +1,14 @@
-"""The records of the self-test: a hard case, a run of it under one of its settings, and a finding.
-
-The catalogue makes cases, the runner makes runs of them, and checks turn runs into findings.
-"""
+"""Records of the self-test: a hard case, a run of it under one of its settings, and a finding."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import os
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.volume import Volume
 from fhash_formats.series import Series
-
-__all__ = ["RUN_THREADS", "Case", "Check", "Finding", "Run"]
+from fhash_formats.support.threads import usable_threads
 
 RUN_THREADS = 4
 """Threads with which every case is encoded. A check repeats the encoding with other numbers of
@@ -123,3 +124,36 @@ class Case:
     checks: tuple[Check, ...] = ()
     quick: bool = True
     refused: str | None = None
+
+
+def describe_machine() -> str:
+    """Versions, machine and the parts of it that are used, in one line. Loads torch if it can."""
+    facts = [
+        f"fhash {version('fhash')}",
+        f"Python {platform.python_version()}",
+        f"numpy {version('numpy')}",
+        f"torch {version('torch')}" if has_torch() else "no torch",
+        f"{platform.system()} {platform.machine()}",
+        f"{usable_threads()} processors",
+        "CUDA" if has_torch() and choose_device("auto").type == "cuda" else "no CUDA",
+    ]
+    return ", ".join(facts)
+
+
+@contextmanager
+def environment(**variables: str) -> Iterator[None]:
+    """Sets environment variables of this process, such as FHASH_THREADS, within a `with`
+    block.
+
+    Not for several threads at once: the environment belongs to the process.
+    """
+    previous = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in previous.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

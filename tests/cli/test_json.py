@@ -17,10 +17,11 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
+from fhash_bench import engines as clock
+from fhash_bench import train as bench
+from fhash_bench.pictures.results import RenderBench
+from fhash_bench.rate.measuring import Access, Point, RateBench, Speed, TilePrice
 from fhash_cli.main import COMMANDS
-from fhash_codec.bench.pictures.results import RenderBench
-from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed, TilePrice
-from fhash_codec.bench.train import bench, clock
 from fhash_codec.cost.results import (
     Advice,
     CostReport,
@@ -33,7 +34,7 @@ from fhash_codec.cost.results import (
 )
 from fhash_codec.cost.results import Stage as StageOfCost
 from fhash_codec.selftest.case import Finding
-from fhash_codec.selftest.results import CaseResult, Summary
+from fhash_codec.selftest.run import CaseResult, Summary
 from fhash_codec.views.server import Server
 
 Fhash = Callable[..., Result]
@@ -256,7 +257,7 @@ def test_selftest(fhash: Fhash, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     result = CaseResult(name="a", group="b", about="c", under=("psnr",), findings=findings)
     monkeypatch.setattr(
-        "fhash_codec.selftest.workers.run_cases", lambda *_, **__: Summary(results=[result])
+        "fhash_codec.selftest.run.run_cases", lambda *_, **__: Summary(results=[result])
     )
     check("selftest", parsed(fhash("selftest", "--json", "-q"), code=1))
 

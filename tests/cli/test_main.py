@@ -39,6 +39,20 @@ def test_every_command_has_its_file_and_help(fhash: Fhash, name: str) -> None:
     assert result.stdout.startswith(f"Usage: fhash {name}")
 
 
+def test_a_command_of_a_distribution_that_is_missing_says_what_to_install(
+    fhash: Fhash, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line, whatever the words; the shell still completes the name."""
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
+    for words in ([], ["--help"], ["rate", "run.npy", "--target", "40"]):
+        result = fhash("bench", *words)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert len(result.stderr.splitlines()) == 1
+        assert "pip install 'fhash[bench]'" in result.stderr
+    found = program.shell_complete(click.Context(program), "b")
+    assert [item.value for item in found] == ["bench"]
+
+
 def test_version(fhash: Fhash) -> None:
     assert fhash("--version").stdout == f"fhash {fhash_codec.__version__}\n"
 

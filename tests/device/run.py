@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "formats"), str(ROOT / "cli"), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT / name) for name in ("", "formats", "cli", "benchmarks", "tests/device")]
 sys.path.append(str(ROOT / "tests" / "codec"))  # the readable paper
 NEEDED = ("zarr", "numcodecs")
 """Packages without which no file can be written."""
@@ -98,21 +98,21 @@ def main() -> int:
 
 
 def described(folder: Path) -> Path:
-    """Write what an installation would say of the package, whose version is asked for; return it.
+    """Write what installations would say of the packages, whose versions are asked for; return it.
 
     The working tree alone, which is all that a lent machine has, says nothing.
     """
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    info = folder / f"fhash-{project['version']}.dist-info"
-    info.mkdir(parents=True, exist_ok=True)
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: fhash\nVersion: {project['version']}\n"
-    )
-    points = "".join(
-        f"[{group}]\n" + "".join(f"{name} = {place}\n" for name, place in entries.items())
-        for group, entries in project["entry-points"].items()
-    )
-    (info / "entry_points.txt").write_text(points)
+    for file in (ROOT / "pyproject.toml", ROOT / "benchmarks" / "pyproject.toml"):
+        project = tomllib.loads(file.read_text())["project"]
+        name, number = project["name"], project["version"]
+        info = folder / f"{name.replace('-', '_')}-{number}.dist-info"
+        info.mkdir(parents=True, exist_ok=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {number}\n")
+        points = "".join(
+            f"[{group}]\n" + "".join(f"{name} = {place}\n" for name, place in entries.items())
+            for group, entries in project["entry-points"].items()
+        )
+        (info / "entry_points.txt").write_text(points)
     return folder
 
 

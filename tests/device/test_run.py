@@ -59,7 +59,9 @@ def test_a_part_that_fails_is_recorded_and_the_others_run(tmp_path) -> None:
 
 def test_a_working_tree_that_is_not_installed_is_described(tmp_path) -> None:
     folder = runpy.run_path(str(SCRIPT))["described"](tmp_path / "site")
-    (found,) = distributions(path=[str(folder)])
-    assert (found.name, found.version) == ("fhash", fhash_codec.__version__)
-    names = {(point.group, point.name) for point in found.entry_points}
-    assert ("zarr.codecs", "fhash.transform") in names
+    found = list(distributions(path=[str(folder)]))
+    assert {(each.name, each.version) for each in found} == {
+        (name, fhash_codec.__version__) for name in ("fhash", "fhash-bench")
+    }
+    names = {(point.group, point.name) for each in found for point in each.entry_points}
+    assert {("zarr.codecs", "fhash.transform"), ("fhash.commands", "bench")} <= names

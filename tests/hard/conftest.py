@@ -13,8 +13,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from faulty import Bench
-from forks import Server, build_faults
+from faulty import Bench, Server, build_faults
 
 
 @pytest.fixture(scope="session")

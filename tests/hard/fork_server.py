@@ -1,5 +1,5 @@
 """A process that imports fhash once and runs each command line in a fork; started by
-`forks.Server`.
+`faulty.Server`.
 
 It reads one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]}
 starts a command line; the answer is its process id. {"wait": pid} waits for that process; the

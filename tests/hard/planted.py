@@ -135,7 +135,7 @@ def tests_of(path: str) -> list[str]:
 
 def run(python: Path, folder: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
     """Run Python with the packages of a folder."""
-    roots = os.pathsep.join(str(folder / root) for root in ("", "formats", "cli"))
+    roots = os.pathsep.join(str(folder / root) for root in ("", "formats", "cli", "benchmarks"))
     environment = {**os.environ, "PYTHONPATH": roots, "PYTHONDONTWRITEBYTECODE": "1"}
     command, plain = [str(python), *words], {"capture_output": True, "text": True}
     try:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import mutations
 from fuzz import run
-from test_faults_together import PLACES
+from test_faults_running import PLACES
 
 import fhash_cli.main
 from fhash_cli.output import Progress

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 import summary
 
-from fhash_codec.selftest.cases.catalogue import cases
-from fhash_codec.selftest.report import markdown
-from fhash_codec.selftest.results import Summary
+from fhash_codec.selftest.run import Summary, cases, markdown
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "stability.md"
 

@@ -19,7 +19,7 @@ from reporting import LONG
 from specs import MIXES, spec_of
 
 from fhash_codec import EncodeConfig, FhashError, encode
-from fhash_codec.selftest.cases.catalogue import cases
+from fhash_codec.selftest.run import cases
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.coder import MaskLevels

@@ -63,7 +63,7 @@ def command(
     check_report_folder(folder, force, data)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.cost.cost import measure_cost
-        from fhash_codec.cost.files import write_report
+        from fhash_codec.cost.report import write_report
 
         report = measure_cost(series, budget=budget, progress=progress)
         paths = write_report(report, folder, force=force)
@@ -78,7 +78,7 @@ def command(
 
 def check_report_folder(folder: Path, force: bool, data: str) -> None:
     """Refuse the folder of a report before any work; raises InputError and what imports raise."""
-    from fhash_codec.cost.files import check_folder
+    from fhash_codec.cost.report import check_folder
 
     try:
         check_folder(folder, force, sources=(Path(data),))
@@ -88,7 +88,7 @@ def check_report_folder(folder: Path, force: bool, data: str) -> None:
 
 def report_text(report: CostReport, paths: list[Path]) -> str:
     """The recommendation, what was left out, and where the report is."""
-    from fhash_codec.cost.advice import told
+    from fhash_codec.cost.results import told
 
     lines = [told(entry) for entry in report.advice]
     late = [entry.what for entry in report.left_out if entry.late]

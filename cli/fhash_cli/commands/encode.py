@@ -47,7 +47,7 @@ from fhash_formats.errors import FhashWarning, InterruptedEncodingError, Quality
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
-    from fhash_codec.cost.time_budget import Choice
+    from fhash_codec.cost.prediction import Choice
     from fhash_formats.series import Series
 
 MAX_LABELS = 64
@@ -278,7 +278,7 @@ def _choose(
     quiet: bool,
 ) -> Choice:
     """Choose effort or epochs by a budget in seconds, and say so in one line."""
-    from fhash_codec.cost.time_budget import choose
+    from fhash_codec.cost.prediction import choose
 
     name = "epochs" if config.profile == "paper" else "effort"
     given = click.get_current_context().get_parameter_source(name)
@@ -325,8 +325,8 @@ def _write_report(
 
     The error that is returned says that Ctrl-C ended the measurements; None where it did not.
     """
-    from fhash_codec.cost.files import write_report
-    from fhash_codec.cost.one import report_on_encode
+    from fhash_codec.cost.cost import report_on_encode
+    from fhash_codec.cost.report import write_report
 
     costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
     page, *_ = write_report(costs, folder, force=force)

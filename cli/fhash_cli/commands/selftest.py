@@ -12,7 +12,7 @@ from fhash_cli.options import BaseCommand, check_writable, force_option, json_op
 from fhash_cli.output import Progress, emit, table
 
 if TYPE_CHECKING:
-    from fhash_codec.selftest.results import Summary
+    from fhash_codec.selftest.run import Summary
 
 
 @click.command("selftest", cls=BaseCommand)
@@ -62,16 +62,15 @@ def command(
     """
     if report is not None:
         check_writable(report, force)
-    from fhash_codec.selftest.cases.catalogue import choose_cases
-    from fhash_codec.selftest.workers import run_cases
+    from fhash_codec.selftest.run import choose_cases, run_cases
 
     begun = time.perf_counter()
     cases = choose_cases(names=names, groups=groups, everything=everything)
     with Progress(quiet=quiet) as progress:
         summary = run_cases(cases, everything=everything, processes=processes, progress=progress)
     if report is not None:
-        from fhash_codec.selftest.environment import describe_machine
-        from fhash_codec.selftest.report import markdown
+        from fhash_codec.selftest.case import describe_machine
+        from fhash_codec.selftest.run import markdown
         from fhash_formats.support.files import replacing
 
         given = "".join(
@@ -91,7 +90,7 @@ def command(
 
 def _text(summary: Summary) -> str:
     """A table of the groups, the worst figures, and what does not hold."""
-    from fhash_codec.selftest.results import relative
+    from fhash_codec.selftest.run import relative
 
     groups = [("group", "cases", "figures", "failed")]
     for name, results in summary.groups.items():

@@ -13,7 +13,9 @@ import pytest
 from click.testing import Result
 
 from fhash_cli.options import DurationType
-from fhash_codec.cost import cost, files, pictures
+from fhash_codec.cost import cost
+from fhash_codec.cost import report as files
+from fhash_codec.cost import uses as pictures
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction
 

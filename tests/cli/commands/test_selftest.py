@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from fhash_codec.selftest import workers
+from fhash_codec.selftest import run as workers
 from fhash_codec.selftest.case import Case, Finding
-from fhash_codec.selftest.results import CaseResult, Summary
+from fhash_codec.selftest.run import CaseResult, Summary
 
 
 @pytest.fixture

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost import cost, own, pictures
-from fhash_codec.cost.cost import measure_cost
+from fhash_codec.cost import cost
+from fhash_codec.cost import encodings as own
+from fhash_codec.cost import uses as pictures
+from fhash_codec.cost.cost import measure_cost, report_on_encode
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction
+from fhash_codec.encoding import encode
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
@@ -96,3 +100,21 @@ def test_unsuitable_budgets_and_series_are_refused(series: ArraySeries) -> None:
         measure_cost(series, budget=0.0)
     with pytest.raises(InputError, match="is constant"):
         measure_cost(np.ones((2, 3, 4, 5)), budget=10.0)
+
+
+def test_stages_steps_reads_and_the_file_itself(
+    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures.PictureCosts, "measure", lambda self, series, files: None)
+    config = EncodeConfig(effort=2, psnr=45.0)
+    path = tmp_path / "run.fhz"
+    figures = encode(series, path, config)
+    report = report_on_encode(series, figures, config, budget=100.0)
+    (point,) = report.encodings
+    assert (point.name, point.options) == ("run.fhz", "--psnr 45 --effort 2")
+    assert point.bytes == path.stat().st_size
+    assert [step["step"] for step in report.per_step] == [0, 1, 2, 3]
+    assert sum(stage.seconds for stage in report.stages) <= report.seconds
+    assert report.gains[-1].bytes > 0
+    assert {read.file for read in report.reads} == {"run.fhz"}
+    assert report.seconds >= figures["seconds"]

@@ -12,7 +12,7 @@ import fhash_codec
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Case, Check, Finding, Run
-from fhash_codec.selftest.cases.fields import series, waves
+from fhash_codec.selftest.field_cases import series, waves
 
 CASE = Case(
     name="easy",

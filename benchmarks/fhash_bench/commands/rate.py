@@ -1,0 +1,473 @@
+"""The commands `fhash bench rate`, `table` and `labels`: options, and results as text."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from fhash_cli.options import (
+    BaseCommand,
+    RealRange,
+    SourceOptions,
+    check_writable,
+    force_option,
+    json_option,
+    quiet_option,
+    series_options,
+    setting_options,
+)
+from fhash_cli.output import Progress, emit, extent, number, size, table
+
+if TYPE_CHECKING:
+    from fhash_bench.labels import LabelBench
+    from fhash_bench.rate.measuring import RateBench
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+NONE = "none"
+"""Name that stands for no peer at all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Peer:
+    """A peer that was named.
+
+    Attributes:
+        name: of a filter, of a program, or NONE.
+        path: of the program; empty for a filter.
+    """
+
+    name: str
+    path: str = ""
+
+
+class PeerType(click.ParamType[Peer]):
+    """A filter of HDF5 by its name, a program as NAME=PATH, or 'none'.
+
+    Names are looked up only when one is given, so that --help loads nothing.
+    """
+
+    name = "NAME[=PATH]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Peer:
+        """The peer; refuses a name that is unknown, and a program without a path."""
+        from fhash_bench.rate.measuring import PEERS
+        from fhash_bench.rate.peers import PROGRAMS
+
+        if isinstance(value, Peer):
+            return value
+        name, equals, path = str(value).partition("=")
+        if name in (PROGRAMS if equals else (*PEERS, NONE)):
+            return Peer(name=name, path=path)
+        allowed = f"{', '.join((*PEERS, NONE))}, and as NAME=PATH {', '.join(PROGRAMS)}"
+        self.fail(f"'{value}' is no peer; allowed: {allowed}", param, ctx)
+
+
+peer_option = click.option(
+    "--peer",
+    "peers",
+    type=PeerType(),
+    multiple=True,
+    help="SZ3, SPERR, ZFP, BitRound, Blosc or none; repeat. Default: all. Besides, as NAME=PATH,"
+    " a program: tthresh, qoz, hpez, sz3, or an ffmpeg for hevc, av1 or vvc.",
+)
+"""Option for the codecs to compare with."""
+
+
+def quality_options(command: Command) -> Command:
+    """Add the options for qualities that are compared at: PSNRs and bounds."""
+    for option in (
+        click.option(
+            "--bound",
+            "bounds",
+            type=RealRange(1e-9, 0.5),
+            multiple=True,
+            metavar="X",
+            help="Largest error as a share of the range; repeat.",
+        ),
+        click.option(
+            "--target",
+            "targets",
+            type=RealRange(5, 200),
+            multiple=True,
+            metavar="X",
+            help="PSNR over all frames in dB; repeat.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def filters_of(peers: Sequence[Peer]) -> list[str]:
+    """Names of the filters among the peers, once each; all there are where none was named."""
+    from fhash_bench.rate.measuring import PEERS
+
+    given = [peer.name for peer in peers if not peer.path]
+    return [name for name in dict.fromkeys(given or PEERS) if name != NONE]
+
+
+def programs_of(peers: Sequence[Peer]) -> dict[str, str]:
+    """Paths of the programs among the peers by name."""
+    return {peer.name: peer.path for peer in peers if peer.path}
+
+
+@contextmanager
+def opened(
+    data: str, source: SourceOptions | None, progress: Callable[[str, int, int, str], None]
+) -> Iterator[Any]:
+    """The series of a file, or a generated one.
+
+    source: options of files, which are refused for a generated series; None where there are none.
+    """
+    from fhash_bench.rate.generated import generated, is_generated
+
+    if is_generated(data):
+        if source is not None:
+            source.refuse_without_data()
+        yield generated(data)
+        return
+    assert source is not None
+    with source.open(data, progress) as series:
+        yield series
+
+
+class ProfileType(click.ParamType[str]):
+    """A profile, or 'none'.
+
+    Names are looked up only when one is given, so that --help loads nothing.
+    """
+
+    name = "profile"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The name; refuses one that is unknown."""
+        from fhash_codec.config import EncodeConfig
+
+        profiles = next(
+            field for field in dataclasses.fields(EncodeConfig) if field.name == "profile"
+        ).metadata["choices"]
+        allowed = (*profiles, "none")
+        if value not in allowed:
+            self.fail(f"'{value}' is no profile; allowed: {', '.join(allowed)}", param, ctx)
+        return str(value)
+
+
+@click.command(
+    "rate",
+    cls=BaseCommand,
+    short_help="size, speed and access beside other codecs, at equal quality",
+)
+@click.argument("data", type=click.Path())
+@series_options
+@quality_options
+@peer_option
+@click.option(
+    "--profile",
+    "profiles",
+    type=ProfileType(),
+    multiple=True,
+    help="Of fhash, or none; repeat. Default: all.",
+)
+@click.option(
+    "--speed/--no-speed",
+    default=True,
+    show_default=True,
+    help="Measure speed and access too, at the target nearest to 50 dB.",
+)
+@setting_options("effort", "tile", "epochs", "width", "device", "seed")
+@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw bytes against quality.")
+@force_option
+@json_option
+@quiet_option
+def rate(
+    data: str,
+    source: SourceOptions,
+    targets: tuple[float, ...],
+    bounds: tuple[float, ...],
+    peers: tuple[Peer, ...],
+    profiles: tuple[str, ...],
+    speed: bool,
+    settings: dict[str, Any],
+    plot: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Compare fhash with other codecs: bytes that DATA needs at equal quality, and speed.
+
+    Without --target and --bound: 35, 40, 45, 50 and 60 dB, and bounds of 5, 2, 1, 0.5 and 0.1 % of
+    the range. Quality is measured on the decoded values. DATA is held in memory, and may be
+    generated:KIND: plateau, noise, labels, smooth, thin, long or short. The other codecs come with
+    pip install 'fhash[bench]'; programs are named by their paths.
+    """
+    if plot is not None:
+        check_writable(plot, force, sources=[data])
+    with Progress(quiet=quiet) as progress, opened(data, source, progress) as series:
+        from fhash_bench.rate.measuring import PROFILES
+        from fhash_bench.rate.rate import BOUNDS, TARGETS, bench_rate
+        from fhash_bench.rate.rate import plot as draw
+        from fhash_codec.cost.report import require_matplotlib
+
+        if plot is not None:
+            require_matplotlib()
+        every = not (targets or bounds)
+        result = bench_rate(
+            series,
+            settings,
+            targets=TARGETS if every else targets,
+            bounds=BOUNDS if every else bounds,
+            names=filters_of(peers),
+            named=programs_of(peers),
+            profiles=[name for name in profiles or PROFILES if name != "none"],
+            speed=speed,
+            progress=progress,
+        )
+    if plot is not None:
+        from fhash_formats.support.files import replacing
+
+        with replacing(Path(plot), force=force) as temporary:
+            draw(result, temporary)
+    emit(result.to_dict(), _rate_text(result), as_json)
+
+
+def _rate_text(result: RateBench) -> str:
+    """Tables of bytes, speed and access, and notes on how they were measured."""
+    lines = [_bytes_table(result)]
+    if any(point.as_asked is False for point in result.points):
+        lines.append(
+            "* its own tolerance of this bound does not keep it;"
+            " a tighter one was taken where one does"
+        )
+    short = {point.codec: point for point in result.points if not point.reached}
+    lines += [
+        f"{codec} does not reach all: {number(point.psnr, 'dB')} in {point.bytes:,} bytes"
+        for codec, point in short.items()
+    ]
+    if result.speeds:
+        lines.append("\n" + _speed_table(result))
+    if result.access:
+        lines.append("\n" + _access_table(result))
+    if result.tiles:
+        lines.append("\n" + _tiles_table(result))
+    lines += [
+        "",
+        f"{result.series}, {result.dtype} {extent(result.shape)}, {size(result.raw_bytes)}",
+        *result.notes,
+    ]
+    if result.missing:
+        lines.append(
+            f"{result.missing:,} values are not finite;"
+            " lossy peers were given neighbouring values in their place"
+        )
+    lines += [f"not measured: {reason}" for reason in result.refused.values()]
+    return "\n".join(lines)
+
+
+def _bytes_table(result: RateBench) -> str:
+    """A row for each quality: bytes of each codec, and how many times larger the best peer is."""
+    codecs = list(dict.fromkeys(point.codec for point in result.points))
+    points = {(point.goal, point.asked, point.codec): point for point in result.points}
+    best = result.best_peers()
+    own = list(best[0]["ratios"]) if any(row["peer"] for row in best) else []
+    rows = [("bytes", *codecs, *(f"best / {codec}" for codec in own))]
+    for row in best:
+        goal, asked = row["goal"], row["asked"]
+        cells = []
+        for codec in codecs:
+            point = points.get((goal, asked, codec))
+            broken = "*" if point is not None and point.as_asked is False else ""
+            cells.append(f"{point.bytes:,}{broken}" if point is not None and point.reached else "-")
+        name = _quality(goal, asked)
+        rows.append((name, *cells, *(number(row["ratios"][codec], "x", digits=3) for codec in own)))
+    return table(rows)
+
+
+def _speed_table(result: RateBench) -> str:
+    """A row for each codec: PSNR, and speed of encoding and decoding."""
+    rows = [
+        (
+            speed.codec,
+            number(speed.psnr, "dB"),
+            number(speed.encode_mb_s, digits=3),
+            number(speed.decode_mb_s, digits=3),
+            number(speed.encode_core_mb_s, digits=3),
+            number(speed.decode_core_mb_s, digits=3),
+        )
+        for speed in result.speeds
+    ]
+    header = ("speed", "PSNR", "encode MB/s", "decode MB/s", "encode, a core", "decode, a core")
+    return table([header, *rows])
+
+
+def _tiles_table(result: RateBench) -> str:
+    """A row for each quality: bytes of the default tiles beside those of one tile."""
+    rows = [
+        (
+            _quality(price.goal, price.asked),
+            f"{price.bytes:,}",
+            f"{price.one_tile_bytes:,}",
+            number(price.price, "x", digits=4),
+            "all" if price.steps == result.shape[0] else f"{price.steps} in the middle",
+        )
+        for price in result.tiles
+    ]
+    return table([("tiles", "bytes", "one tile", "price", "steps"), *rows])
+
+
+def _quality(goal: str, asked: float) -> str:
+    """A quality in words."""
+    return f"{asked:g} dB" if goal == "psnr" else f"within {100 * asked:g} %"
+
+
+def _access_table(result: RateBench) -> str:
+    """A row for each codec and layout: time and bytes that a small region takes."""
+    rows = [
+        (
+            entry.setting,
+            number(entry.psnr, "dB"),
+            f"{entry.bytes:,}",
+            number(entry.milliseconds, digits=3),
+            f"{entry.bytes_read:,}",
+        )
+        for entry in result.access
+    ]
+    region = f"{extent(result.access[0].region)} of a step"
+    return table([(region, "PSNR", "bytes", "ms", "bytes read"), *rows])
+
+
+@click.command(
+    "table", cls=BaseCommand, short_help="bench rate on many series, as one table; goes on"
+)
+@click.argument("data", type=click.Path(), nargs=-1)
+@series_options
+@click.option(
+    "--generated", "with_generated", is_flag=True, help="Add every generated series to DATA."
+)
+@quality_options
+@peer_option
+@click.option(
+    "--speed/--no-speed",
+    default=True,
+    show_default=True,
+    help="Measure speed and access too, of every codec at every quality.",
+)
+@setting_options("effort", "tile", "seed")
+@click.option(
+    "-o",
+    "folder",
+    metavar="DIR",
+    type=click.Path(file_okay=False),
+    default="bench-table",
+    show_default=True,
+    help="Folder of the cells, one JSON file each; finished cells are not measured again.",
+)
+@json_option
+@quiet_option
+def rate_table(
+    data: tuple[str, ...],
+    source: SourceOptions,
+    with_generated: bool,
+    targets: tuple[float, ...],
+    bounds: tuple[float, ...],
+    peers: tuple[Peer, ...],
+    speed: bool,
+    settings: dict[str, Any],
+    folder: str,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Compare the profile compact with other codecs on each DATA; the table is in Markdown.
+
+    Without --target and --bound: 35, 45 and 60 dB, and bounds of 5, 1 and 0.1 % of the range. A row
+    has the bytes, those of one tile, the best peer in its best layout, and speed and access of
+    both. DATA may be generated:KIND: plateau, noise, labels, smooth, thin, long or short.
+    """
+    if not data and not with_generated:
+        raise click.UsageError("Missing DATA; or give --generated")
+    with Progress(quiet=quiet) as progress:
+        from fhash_bench.rate.generated import GENERATED, PREFIX, is_generated
+        from fhash_bench.rate.table import BOUNDS, TARGETS, bench_table
+
+        if all(is_generated(name) for name in data):
+            source.refuse_without_data()
+        names = [*data, *(PREFIX + kind for kind in GENERATED if with_generated)]
+        every = not (targets or bounds)
+        result = bench_table(
+            {
+                name: partial(opened, name, None if is_generated(name) else source, progress)
+                for name in names
+            },
+            Path(folder),
+            settings,
+            targets=TARGETS if every else targets,
+            bounds=BOUNDS if every else bounds,
+            names=filters_of(peers),
+            named=programs_of(peers),
+            speed=speed,
+            progress=progress,
+        )
+    emit(result.to_dict(), result.markdown(), as_json)
+
+
+@click.command("labels", cls=BaseCommand, short_help="sizes of labels without loss, beside xz")
+@click.argument("data", type=click.Path(), required=False)
+@series_options
+@click.option(
+    "--kind",
+    "kinds",
+    metavar="NAME",
+    multiple=True,
+    help="A made series, such as basins; repeat. Default: all.",
+)
+@setting_options("effort")
+@json_option
+@quiet_option
+def labels(
+    data: str | None,
+    source: SourceOptions,
+    kinds: tuple[str, ...],
+    settings: dict[str, Any],
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Compare the bytes of labels in a container with those of xz -9e, all without loss.
+
+    Without DATA: made series of many kinds, from connected regions to random numbers. The worst
+    ratio stands first; below 1, fhash is smaller. DATA is held in memory.
+    """
+    with Progress(quiet=quiet) as progress:
+        from fhash_bench.labels import bench_labels
+
+        effort = settings.get("effort")
+        if data is None:
+            result = bench_labels(kinds=kinds, effort=effort, progress=progress)
+        else:
+            with source.open(data, progress) as series:
+                result = bench_labels(series, kinds=kinds, effort=effort, progress=progress)
+    emit(result.to_dict(), _text(result), as_json)
+
+
+def _text(result: LabelBench) -> str:
+    """A row of figures for each series, and how they were measured."""
+    header = ("labels", "array", "values", "xz -9e", "fhash", "fhash / xz", "codec", "seconds")
+    rows = [
+        (
+            size.kind,
+            f"{size.dtype} {extent(size.shape)}",
+            f"{size.distinct:,}",
+            f"{size.xz_bytes:,}",
+            f"{size.fhash_bytes:,}",
+            f"{size.ratio:.3f}",
+            f"{size.codec_bytes:,}",
+            number(size.seconds, digits=2),
+        )
+        for size in result.sizes
+    ]
+    return "\n".join([table([header, *rows]), "", *result.notes])

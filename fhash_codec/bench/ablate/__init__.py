@@ -1,1 +1,0 @@
-"""`fhash bench ablate`: what each setting changes, one axis at a time."""

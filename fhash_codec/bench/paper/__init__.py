@@ -1,1 +1,0 @@
-"""The input encodings of the F-Hash paper's evaluation, trained side by side."""

@@ -1,1 +1,0 @@
-"""Input encodings: what turns a place into the inputs of a small network."""

@@ -1,1 +1,0 @@
-"""Pictures: what each effect costs, and VTK beside."""

@@ -1,1 +1,0 @@
-"""Bytes and speed beside other codecs."""

@@ -1,1 +1,0 @@
-"""Peers that are programs of their own, which the user names: one file for each kind."""

@@ -1,1 +1,0 @@
-"""`fhash bench train`: training engines on a series, in turns, beside what the machine can do."""

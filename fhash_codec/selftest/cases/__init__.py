@@ -1,1 +1,0 @@
-"""The hard cases of the self-test."""

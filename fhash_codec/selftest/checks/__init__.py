@@ -1,1 +1,0 @@
-"""The properties that must hold for the cases of the self-test."""

@@ -1,0 +1,320 @@
+"""Cases of the catalogue hold what their names say, and are chosen by name and group."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from math import prod
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.scenes import Camera
+from fhash_codec.selftest import field_cases, network_cases, ray_cases, value_cases
+from fhash_codec.selftest.field_cases import (
+    COMPACT,
+    EXACT,
+    MORE,
+    PAPER,
+    QUICK,
+    SHAPE,
+    lattice,
+    noise,
+    of_all,
+    series,
+    waves,
+)
+from fhash_codec.selftest.run import cases, choose_cases
+from fhash_formats.errors import InputError
+
+CASES = {case.name: case for case in cases()}
+GROUPS = {"values", "shapes", "fronts", "features", "times", "networks", "rays"}
+
+
+@cache
+def values_of(name: str) -> np.ndarray:
+    """All frames of a case, (t, z, y, x)."""
+    return np.stack(list(CASES[name].make().frames()))
+
+
+def coordinate(name: str, axis: str) -> np.ndarray:
+    return np.asarray(CASES[name].make().coords[axis].values)
+
+
+def in_feature(name: str) -> np.ndarray:
+    """The vertices (t, z, y, x) in the interval of a case."""
+    (config, *_) = CASES[name].settings.values()
+    (feature,) = config.features
+    low, high = map(float, feature.removeprefix("interval:").split(":"))
+    return (values_of(name) >= low) & (values_of(name) <= high)
+
+
+def test_every_case_has_a_name_a_reason_and_a_series_that_comes_again() -> None:
+    assert len(CASES) == len(cases())
+    assert {case.group for case in cases()} == GROUPS
+    for case in cases():
+        assert case.name == case.name.lower().replace(" ", "-")
+        assert case.about
+        assert case.settings
+        for name in case.settings.keys() & case.more.keys():
+            assert case.settings[name] == case.more[name], (case.name, name)
+        first, second = case.make(), case.make()
+        assert first.shape == second.shape
+        assert first.read(0).tobytes() == second.read(0).tobytes()
+
+
+def test_cases_are_chosen_by_name_and_group() -> None:
+    assert [case.name for case in choose_cases(names=["spike"])] == ["spike"]
+    assert {case.group for case in choose_cases(groups=["times"])} == {"times"}
+    assert choose_cases() == tuple(case for case in cases() if case.quick)
+    assert choose_cases(everything=True) == cases()
+    with pytest.raises(InputError, match="unknown case 'spikey'; did you mean 'spike'"):
+        choose_cases(names=["spikey"])
+    with pytest.raises(InputError, match="unknown group 'time'; did you mean 'times'"):
+        choose_cases(groups=["time"])
+
+
+def steps(values: np.ndarray, axis: int) -> np.ndarray:
+    return np.diff(values.astype(float), axis=axis)
+
+
+def alone(chosen: np.ndarray, axes: range) -> bool:
+    """Whether vertices are chosen, and no two neighbours along any of some axes."""
+    moved = [np.moveaxis(chosen, axis, 0) for axis in axes]
+    return bool(chosen.any()) and not any((each[1:] & each[:-1]).any() for each in moved)
+
+
+def crossed(values: np.ndarray) -> float:
+    """Share of the vertices that change their side of a front from one step to the next."""
+    return float(((values[1:] > 0) != (values[:-1] > 0)).mean())
+
+
+def ends(values: np.ndarray) -> tuple[int, int]:
+    return np.iinfo(values.dtype).min, np.iinfo(values.dtype).max
+
+
+TINY = np.finfo("float32").smallest_normal, np.finfo("float64").smallest_normal
+LAWS: list[tuple[str, Callable[[np.ndarray], Any]]] = [
+    ("checkerboard", lambda v: all((abs(steps(v, axis)) == 1).all() for axis in range(4))),
+    ("checkerboard-uint8", lambda v: all((abs(steps(v, axis)) == 1).all() for axis in range(4))),
+    ("flicker", lambda v: (v[1:] * v[:-1] < 0).all()),
+    ("spike", lambda v: np.count_nonzero(v) == 1),
+    ("spikes", lambda v: alone(v != 0, range(1, 4))),
+    ("step-on-vertex", lambda v: set(v.ravel().tolist()) == {0.0, 0.5, 1.0}),
+    ("step-between", lambda v: set(v.ravel().tolist()) == {0.0, 1.0}),
+    ("creeping-front", lambda v: crossed(v) <= 1e-3),
+    ("slow-front", lambda v: 0 < crossed(v) <= 0.15),
+    ("fast-front", lambda v: 0 < crossed(v) <= 1.0),
+    ("nearly-constant-float32", lambda v: np.unique(v).size == 2),
+    ("range-float32", lambda v: np.abs(v).min() < 2e-38 and np.abs(v).max() > 9e37),
+    ("range-overflows", lambda v: np.isinf(v.max() - v.min())),
+    ("denormals-float32", lambda v: 0 < v.max() < TINY[0]),
+    ("denormals-float64", lambda v: 0 < v.max() < TINY[1]),
+    ("signed-zero", lambda v: np.signbit(v[v == 0]).any()),
+    ("isolated-missing", lambda v: np.count_nonzero(~np.isfinite(v)) == 6),
+    ("missing-frames", lambda v: np.isfinite(v).any(axis=(1, 2, 3)).tolist()[1:3]),
+    ("missing-checkerboard", lambda v: np.isinf(v).mean() == 0.5),
+    ("one-finite-value", lambda v: np.isfinite(v).sum() == 1),
+    ("nothing-finite", lambda v: not np.isfinite(v).any()),
+    ("beyond-float64", lambda v: np.unique(v).size > np.unique(v * 1.0).size),
+    ("declared-range", lambda v: np.isnan(v[0, :, 0, 0]).all()),
+    ("declared-range", lambda v: np.nanmin(v) < 0.25 and np.nanmax(v) > 0.5),
+    ("surfaces-on-vertices", lambda v: set(v.ravel().tolist()) == set(map(float, range(8)))),
+    ("surfaces-on-vertices", lambda v: (v[0, -1] == 6.0).all()),
+    *[(name, lambda v: np.unique(v).size == 1) for name in CASES if name.startswith("constant-")],
+    *[(f"all-of-{kind}", lambda v: (v.min(), v.max()) == ends(v)) for kind in value_cases.INTEGERS],
+]
+
+
+@pytest.mark.parametrize(("name", "holds"), LAWS)
+def test_values_are_as_their_name_says(name: str, holds: Callable[[np.ndarray], Any]) -> None:
+    with np.errstate(over="ignore"):
+        assert holds(values_of(name))
+
+
+@pytest.mark.parametrize("kind", value_cases.INTEGERS)
+def test_integers_are_of_the_type_of_their_name(kind: str) -> None:
+    assert CASES[f"all-of-{kind}"].make().read(0).dtype == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("one-vertex", [1, 1, 1, 1]),
+        ("whole-box", [2, 2, 2, 2]),
+        ("opposite-corners", [8, 8, 8, 16]),
+        ("empty-key-frames", [0, 0, 630, 0]),
+        ("one-key-frame-filled", [0, 0, 0, 99]),
+        ("nothing-selected", [0, 0, 0, 0]),
+        ("everything", [990] * 4),
+        ("open-interval", [990] * 4),
+    ],
+)
+def test_a_feature_has_the_stated_number_of_vertices(name: str, counts: list[int]) -> None:
+    assert in_feature(name).sum(axis=(1, 2, 3)).tolist() == counts
+
+
+def test_features_lie_where_their_names_say() -> None:
+    for case in field_cases.FEATURE_CASES:
+        configs = [*case.settings.values(), *case.more.values()]
+        assert len({(config.features, config.dilation) for config in configs}) == 1, case.name
+    surface = np.ones(SHAPE, dtype=bool)
+    surface[:, 1:-1, 1:-1, 1:-1] = False
+    np.testing.assert_array_equal(in_feature("at-every-border"), surface)
+    assert alone(in_feature("every-second-vertex"), range(4))
+    _, _, y, _ = lattice()
+    assert (in_feature("beside-missing") & (np.abs(y - 5) == 1)).any()
+    assert np.isnan(values_of("beside-missing"))[y == 5].all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("one-voxel", (1, 1, 1, 1)),
+        ("one-frame", (1, 9, 10, 11)),
+        ("one-along-y", (4, 9, 1, 11)),
+        ("twos", (2, 2, 2, 2)),
+        ("primes", (5, 7, 11, 13)),
+    ],
+)
+def test_a_case_has_the_shape_of_its_name(name: str, shape: tuple[int, ...]) -> None:
+    assert CASES[name].make().shape == shape
+
+
+def test_shapes_are_long_thin_and_small_and_tiles_do_not_divide_them() -> None:
+    for axis, name in enumerate(("long-t", "long-z", "long-y", "long-x")):
+        lengths = list(CASES[name].make().shape)
+        assert lengths.pop(axis) >= 200 * max(lengths)
+    for axis, name in enumerate(("thin-z", "thin-y", "thin-x"), 1):
+        assert CASES[name].make().shape[axis] == 1
+    assert CASES["thin-all"].make().shape[1:] == (1, 1, 1)
+    assert max(prod(case.make().shape) for case in field_cases.SHAPE_CASES) <= 10_000
+    rays = max(prod(case.make().shape) for case in ray_cases.RAY_CASES)
+    assert rays <= prod(ray_cases.SHAPE)
+    odd = CASES["odd-tiles"]
+    tile = [int(n) for n in odd.settings["tiles"].tile.split("x")]
+    rest = [length % n for length, n in zip(odd.make().shape, tile, strict=True)]
+    assert rest == [1, 1, 0, 4]
+
+
+def is_uneven(times: np.ndarray) -> bool:
+    return bool(np.diff(times).max() >= 1e5 * np.diff(times).min() > 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "axes", "holds"),
+    [
+        ("descending-positions", "zyx", lambda at: (np.diff(at) < 0).all()),
+        ("tiny-positions", "zyx", lambda at: np.ptp(at) < 1e-10),
+        ("huge-positions", "zyx", lambda at: np.ptp(at) > 1e300),
+        ("far-positions", "zyx", lambda at: np.ptp(at) < 1000 * np.spacing(at[0])),
+        ("uneven-positions", "zyx", lambda at: (at[1:] == 2 * at[:-1]).all()),
+        ("uneven", "t", is_uneven),
+        ("tiny", "t", lambda at: (np.diff(at) < 2e-12).all()),
+        ("denormal", "t", lambda at: (np.diff(at) == 5e-324).all()),
+        ("huge-and-fine", "t", lambda at: (np.nextafter(at[:-1], np.inf) == at[1:]).all()),
+        ("descending", "t", lambda at: (np.diff(at) < 0).all()),
+        ("negative", "t", lambda at: (at < 0).all()),
+        ("both-ends", "t", lambda at: not np.isfinite(at[-1] * 2 - at[0] * 2)),
+        ("repeated", "t", lambda at: (np.diff(at) == 0).sum() == 1),
+        ("not-a-time", "t", lambda at: (~np.isfinite(at)).sum() == 2),
+        ("one-time", "t", lambda at: at.tolist() == [1e5]),
+    ],
+)
+def test_coordinates_are_as_their_name_says(
+    name: str, axes: str, holds: Callable[[np.ndarray], Any]
+) -> None:
+    with np.errstate(over="ignore"):
+        assert all(holds(coordinate(name, axis)) for axis in axes)
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "sizes"),
+    [
+        ("folds", "fold", {2, 3, 4, 5, 6, 7, 8}),
+        ("layers", "hidden_layers", {0, 1, 2, 3, 8}),
+        ("embeddings", "embedding_size", {1, 2, 3, 4, 5, 6, 7, 8}),
+        ("widths", "width", {1, 2, 63, 64, 65, 257}),
+        ("wild-rates", "hidden_layers", {0, 1, 2}),
+        ("wild-rates", "learning_rate", {1.0}),
+    ],
+)
+def test_every_size_of_a_network_is_tried(name: str, field: str, sizes: set[float]) -> None:
+    configs = [*CASES[name].settings.values(), *CASES[name].more.values()]
+    assert {getattr(config, field) for config in configs} == sizes
+    if name == "wild-rates":
+        tried = {(config.hidden_layers, config.schedule) for config in configs}
+        assert len(tried) == 2 * len({config.hidden_layers for config in configs})
+    else:
+        assert len(configs) == len(sizes)
+
+
+def test_networks_are_trained_on_the_cpu() -> None:
+    for case in network_cases.NETWORK_CASES:
+        for config in (*case.settings.values(), *case.more.values()):
+            assert (config.profile, config.device) == ("paper", "cpu")
+
+
+@pytest.mark.parametrize("view", ray_cases.AXES)
+def test_the_camera_along_an_axis_aims_at_vertices(view: str) -> None:
+    grid = Grid(counts=ray_cases.SHAPE[:0:-1], origin=np.zeros(3), spacing=np.ones(3))
+    camera = Camera.from_dict(ray_cases._grid_camera(view))
+    eyes, directions = Rays.of(camera, grid, (9, 9)).pixels()
+    along = int(np.argmax(np.abs(directions[4, 4])))
+    across = [axis for axis in range(3) if axis != along]
+    np.testing.assert_allclose(eyes[..., across], np.rint(eyes[..., across]), atol=1e-12)
+    np.testing.assert_allclose(directions[..., across], 0.0, atol=1e-12)
+
+
+def test_fields_and_series_are_made_as_asked() -> None:
+    for shape in (SHAPE, (2, 2, 2, 2), (1, 1, 1, 5)):
+        assert waves(shape).shape == shape
+        assert (waves(shape).min(), waves(shape).max()) == (0.0, 1.0)
+    assert waves((1, 1, 1, 1)).tolist() == [[[[0.0]]]]
+    for axis, index in enumerate(lattice((2, 3, 4, 5))):
+        assert index.shape == (2, 3, 4, 5)
+        np.testing.assert_array_equal(np.diff(index, axis=axis), 1.0)
+    np.testing.assert_array_equal(noise(), noise())
+    assert not np.array_equal(noise(), noise(seed=1))
+    given = series(waves((2, 3, 1, 1)), times=[5.0, 7.0], units="K", z=np.array([1.0, 2.0, 4.0]))
+    assert given.units == "K"
+    assert [given.coords[axis].values.tolist() for axis in "tzx"] == [
+        [5.0, 7.0],
+        [1.0, 2.0, 4.0],
+        [0.0],
+    ]
+
+
+def test_the_settings_cover_profiles_promises_and_tables() -> None:
+    configs = [*QUICK.values(), *MORE.values()]
+    assert not QUICK.keys() & MORE.keys()
+    assert {config.profile for config in configs} == {"compact", "paper"}
+    assert {config.tables for config in configs if config.profile == "paper"} >= {
+        "float32",
+        "uint8",
+        "transform",
+    }
+    compact = [config for config in configs if config.profile == "compact"]
+    assert any(config.psnr is not None for config in compact)
+    assert any(config.max_error_rel is not None for config in compact)
+    assert any(config.max_error == 0 for config in compact)
+    changed = of_all({**COMPACT, **EXACT, **PAPER}, dilation=3)
+    assert changed.keys() == {*COMPACT, *EXACT, *PAPER}
+    assert {config.dilation for config in changed.values()} == {3}
+    assert changed["psnr"].psnr == COMPACT["psnr"].psnr
+
+
+def test_guises_keep_the_values_in_another_order() -> None:
+    values = waves(value_cases.GUISE_SHAPE)
+    for factor in value_cases.POWERS:
+        single = values.astype(np.float32)
+        np.testing.assert_array_equal(single * np.float32(factor) / np.float32(factor), single)
+    guises = dict(value_cases._guises(values))
+    assert len(guises) == 8
+    np.testing.assert_array_equal(guises.pop("negated"), -values)
+    for name, guise in guises.items():
+        np.testing.assert_array_equal(np.sort(guise, axis=None), np.sort(values, axis=None))
+        assert guise.shape != values.shape or not np.array_equal(guise, values), name
