@@ -63,17 +63,6 @@ def test_all_takes_what_can_be_encoded_as_it_is(fhash: Fhash, data: Path, tmp_pa
     assert info["bytes"] == path.stat().st_size
 
 
-def test_several_names_with_a_plain_promise(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    path = tmp_path / "run.fhz"
-    words = ["encode", data, "-o", path, *SMALL, "--var", "v, u", "--psnr", 60]
-    report = json.loads(fhash(*words, "--explain", "--json").stdout)
-    assert list(report["variables"]) == ["v", "u"]
-    for name, each in report["variables"].items():
-        assert each["psnr"] >= 60, name
-        assert each["stages"]
-    assert report["bytes"] == path.stat().st_size
-
-
 def test_components_become_variables(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.fhz"
     words = ["encode", data, "-o", path, *SMALL, "--components", "dim0", "--json"]

@@ -270,12 +270,7 @@ def _emit_several(
 
 
 def _choose(
-    series: Series,
-    config: EncodeConfig,
-    seconds: float,
-    progress: Progress,
-    *,
-    quiet: bool,
+    series: Series, config: EncodeConfig, seconds: float, progress: Progress, *, quiet: bool
 ) -> Choice:
     """Choose effort or epochs by a budget in seconds, and say so in one line."""
     from fhash_codec.cost.time_budget import choose

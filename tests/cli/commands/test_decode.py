@@ -15,29 +15,11 @@ from click.testing import Result
 
 import fhash_codec
 import fhash_formats
-from fhash_cli.commands.decode import (
-    TYPES,
-    RegionOptions,
-    Selection,
-    Statistics,
-    convert,
-)
+from fhash_cli.commands.decode import TYPES, RegionOptions, Selection, Statistics, convert
 from fhash_codec import EncodeConfig
 from fhash_codec.progress import silent
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
-
-
-def test_a_fill_value_stands_for_nan_in_any_type() -> None:
-    frame = np.array([1.4, np.nan, 2.6], "f4")
-    assert convert(frame, np.dtype("i2"), fill=-9).tolist() == [1, -9, 3]
-    assert convert(frame, np.dtype("f8"), fill=0.5)[1] == 0.5
-    assert np.isnan(convert(frame, np.dtype("f2"))[1])
-    assert np.isnan(frame[1])
-    with pytest.raises(InputError, match="--fill V"):
-        convert(frame, np.dtype("i2"))
-    with pytest.raises(InputError, match="at some vertices"):
-        convert(frame, np.dtype("i2"), background=True)
 
 
 @pytest.fixture(scope="module")
@@ -180,16 +162,6 @@ def test_a_region_is_that_part_of_the_whole(
     np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", *words), whole[index])
 
 
-def test_a_time_between_steps_is_the_volume_at_that_step(
-    fhash: Fhash, run: Path, tmp_path: Path
-) -> None:
-    with fhash_codec.open(run) as volume:
-        expected = volume.read(1.5)
-    np.testing.assert_array_equal(
-        saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None]
-    )
-
-
 def test_statistics_are_those_of_the_region(
     fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
 ) -> None:
@@ -264,12 +236,6 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
     assert "the data have no value" in refused(
         2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8"
     )
-
-
-def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    result = fhash("decode", run, "-o", tmp_path / "\udcff.npy")
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert (tmp_path / "\udcff.npy").exists()
 
 
 def test_a_level_of_detail_has_every_second_position(

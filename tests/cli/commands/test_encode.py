@@ -64,31 +64,6 @@ def test_coded_tables_are_reported_with_their_loss(
     assert fhash("diff", data, tmp_path / "coded", "--json").exit_code == 0
 
 
-def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
-    values = np.arange(4 * 5 * 6 * 7, dtype=">u2").reshape(4, 5, 6, 7)
-    (tmp_path / "values.bin").write_bytes(values.tobytes())
-    layout = ["--shape", "x=7,y=6,z=5,t=4", "--dtype", "uint16", "--endian", "big"]
-    words = [
-        "encode",
-        tmp_path / "values.bin",
-        "-o",
-        tmp_path / "run.fhz",
-        *layout,
-        "--t",
-        "1:4:2",
-        *SMALL,
-    ]
-    result = fhash(*words)
-    assert result.exit_code == 0
-    assert "than the whole source on disk" in result.stdout
-    with fhash_codec.open(tmp_path / "run.fhz") as volume:
-        assert volume.shape == (2, 5, 6, 7)
-        assert (volume.value_range.low, volume.value_range.high) == (
-            values[1].min(),
-            values[3].max(),
-        )
-
-
 def test_what_each_stage_bought_is_in_the_table_and_in_json(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:

@@ -6,14 +6,13 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.info import listing, tiling_text
+from fhash_cli.commands.info import listing
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
@@ -139,23 +138,6 @@ def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: 
     )
 
 
-@pytest.mark.parametrize("command", ["info", "verify", "decode"])
-@pytest.mark.parametrize("kept", [0, 1, 30, 1000, -1])
-def test_a_cut_file_is_found(
-    refused: Callable[..., str], run: Path, tmp_path: Path, command: str, kept: int
-) -> None:
-    (tmp_path / "cut.fhz").write_bytes(run.read_bytes()[:kept])
-    refused(4, command, tmp_path / "cut.fhz")
-
-
-@pytest.mark.parametrize("command", ["verify", "decode"])
-def test_what_is_no_container_is_refused(
-    refused: Callable[..., str], data: Path, tmp_path: Path, command: str
-) -> None:
-    refused(4, command, data)
-    refused(2, command, tmp_path / "missing.fhz")
-
-
 def test_info_of_data_lists_variables_and_their_commands(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -242,14 +224,6 @@ def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
     assert "series" not in whole
 
 
-def test_info_of_a_variable_that_cannot_be_encoded_says_why(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    path = several(tmp_path / "a.h5")
-    assert "1 dimensions (4,)" in fhash("info", path, "--var", "line", "--json").stdout
-    assert "it holds u" in refused(2, "info", path, "--var", "v")
-
-
 def test_steps_are_repeated_and_checked(
     fhash: Fhash, refused: Callable[..., str], tmp_path: Path
 ) -> None:
@@ -281,17 +255,3 @@ def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Pa
     printed = fhash("info", tmp_path / "a.fhz").stdout
     assert "wind.nc, SHA-256 " in printed
     assert "(lev, lat, lon); beside it height" in " ".join(printed.split())
-
-
-@pytest.mark.parametrize(
-    ("told", "text"),
-    [
-        ({}, ""),
-        ({"price": 1.25}, ", at most about 25% above one tile"),
-        ({"price": 1.25, "tried": 3}, ", 25% above one tile"),
-        ({"price": 1.0, "tried": 3, "best": [2, 3, 4, 5]}, ", the fewest bytes of all tried"),
-        ({"region_ms": 3.25, "price": None}, "; regions 3.2 ms"),
-    ],
-)
-def test_any_key_of_the_tiles_may_be_missing(told: dict[str, Any], text: str) -> None:
-    assert tiling_text({"model": {"levels": [[4, 3, 4, 5]], "tiling": told}}) == text

@@ -12,7 +12,6 @@ from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import named_map
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.layout import (
-    SMALLEST,
     TITLE_GAP,
     Layout,
     end_texts,
@@ -246,24 +245,6 @@ def test_nothing_covers_the_volume_or_is_cut(
     assert layout.time[3] <= top
 
 
-@pytest.mark.parametrize("kind", ["plain", "flat", "long"])
-@pytest.mark.parametrize("size", SIZES, ids=str)
-def test_no_scale_is_lost(kind: str, size: tuple[int, int]) -> None:
-    layout, _ = laid_out(kind, size, Effects(axes=True, colour_bar=True))
-    # Three axes of the longest names and numbers need more than a view of 90 pixels.
-    lost = 1 if (kind, size) == ("long", (256, 700)) else 0
-    assert len(layout.labels) >= (6 if kind == "flat" else 9) - lost
-    assert min(label.size for label in layout.labels) >= SMALLEST
-
-
-def test_without_overlays_the_view_is_the_picture() -> None:
-    for effects in (Effects(), Effects(box=True)):
-        layout, rays = laid_out("plain", (300, 200), effects)
-        assert layout.view == (0, 0, 300, 200)
-        assert rays.size == (300, 200)
-        assert (layout.labels, layout.bar, layout.time, layout.legend) == ((), None, None, None)
-
-
 def test_each_strip_takes_its_side() -> None:
     entry = LegendEntry(text="a", colour="red")
     bar, _ = laid_out("plain", (300, 200), Effects(colour_bar=True))
@@ -287,13 +268,3 @@ def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:
 def test_names_of_quantities() -> None:
     assert quantity_of("speed", "m s-1") == "speed [m s-1]"
     assert quantity_of("share", "1") == quantity_of("share", "") == "share"
-
-
-def test_a_colour_bar_has_two_ticks_or_more() -> None:
-    axes = coords("plain")
-    scene = Scene(size=(256, 256), effects=Effects(colour_bar=True))
-    for low, high in ((271.0, 289.0), (0.6, 1.9), (-1.0, 1.0)):
-        colours = named_map("viridis").rescaled(low, high)
-        layout, _ = lay_out(scene, Grid.of(axes), axes, colours, "q")
-        assert layout.bar is not None
-        assert len(layout.bar.marks) >= 2

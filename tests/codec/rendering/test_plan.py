@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from frame_field import by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Scene, Volume
@@ -60,23 +58,6 @@ def test_a_surface_beyond_the_values_is_told(volume: Volume) -> None:
             plan(volume, effects={"isosurfaces": [{"value": beyond}, {"value": high}]})
         assert len(told) == 1
     plan(volume, effects={"isosurfaces": [{"value": low}, {"value": high}]})  # and no warning
-
-
-def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
-    planned = plan(volume, effects={"shading": True, "shadows": True})
-    rays, spacing = planned.task.rays, planned.task.rays.grid.spacing
-    assert planned.lamp is not None
-    assert planned.lamp @ (rays.forward * spacing) < 0
-    assert planned.lamp @ (rays.up * spacing) > 0
-    assert planned.lamp @ (rays.right * spacing) < 0
-    assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
-
-
-def test_far_away_the_level_of_detail_is_coarse(volume: Volume) -> None:
-    assert plan(volume).lod == 0
-    assert plan(volume, size=[8, 8]).lod == 1
-    assert plan(volume, size=[4, 4]).lod == 2
-    assert plan(volume, size=[8, 8], march={"lod": 0}).lod == 0
 
 
 def test_a_network_has_no_levels_of_detail(files: dict[str, Path]) -> None:
@@ -175,20 +156,6 @@ def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> Non
         assert -2 <= table.low < table.high <= 2
 
 
-@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-def test_single_precision_with_a_large_offset_is_marched_without_it(tmp_path: Path) -> None:
-    z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
-    field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
-    fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
-    with fhash_codec.open(tmp_path / "far.fhz") as far:
-        assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
-        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("fhash_codec.rendering.march.march_native", by_stream)
-            other = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
-    np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
-
-
 def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
     volume: Volume, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,22 +225,6 @@ def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None
         table = plan_picture(volume, scene).task.table
         assert table is not None
         assert table.low == pytest.approx(low)
-
-
-def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
-    clip = {"z": [5, 7.5], "x": [9, 12]}
-    for effects in ({}, {"shadows": True}):
-        scene = Scene.from_dict({"effects": {"clip": clip, **effects}})
-        region = plan_picture(volume, scene).region
-        for (low, high), tile, ends in zip(
-            region, volume.chunks[1:], ((5, 8), (0, 23), (9, 12)), strict=True
-        ):
-            assert low == ends[0] // tile * tile
-            assert high >= ends[1] + 1
-            assert high - ends[1] <= tile
-        coarse = replace(scene, march=replace(scene.march, lod=2))
-        wide = plan_picture(volume, coarse).region
-        assert all(a <= c and d <= b for (a, b), (c, d) in zip(wide, region, strict=True))
 
 
 @pytest.mark.parametrize(
