@@ -20,12 +20,10 @@ from fhash_cli.commands.demo import SceneOptions, ShapeType
 from fhash_codec import gallery
 from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
-from fhash_codec.simulation.simulate import Simulation, simulate
-from fhash_formats import open_series
+from fhash_codec.simulation.simulate import Simulation
 
 Fhash = Callable[..., Result]
 SMALL = ("--shape", "6,7,8", "--steps", "3", "-q")
-SUFFIXES = ("h5", "nc", "zarr", "npy", "raw", "vtkhdf", "pvd")
 
 
 def options(**settings: Any) -> SceneOptions:
@@ -72,28 +70,6 @@ def test_other_shapes_are_refused(text: str) -> None:
 def test_options_that_exclude_each_other_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(click.UsageError, match="exclude"):
         options(**settings).open()
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_holds_the_simulated_values(fhash: Fhash, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"run.{suffix}"
-    result = fhash("demo", "--scene", "bubble", *SMALL, "--seed", "4", "-o", path, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    report = json.loads(result.stdout)
-    assert str(path) in report["paths"]
-    assert (report["shape"], report["seed"]) == ([3, 6, 7, 8], 4)
-    expected = simulate("bubble", (3, 6, 7, 8), 4)
-    shape = "x=8,y=7,z=6,t=3"
-    raw = ("run.raw", "--shape", shape, "--dtype", "float32") if suffix == "raw" else ()
-    if raw:
-        values = np.fromfile(path, dtype="<f4").reshape(expected.shape)
-        frames = list(values)
-    else:
-        with open_series(path) as series:
-            assert series.name == expected.name or suffix == "npy"
-            frames = [series.read(step) for step in range(3)]
-    for step, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame, expected.read(step))
 
 
 def test_a_file_of_a_scene_is_simulated_and_never_replaced(

@@ -163,25 +163,6 @@ def test_info_of_data_lists_variables_and_their_commands(
     assert shapes == [[3, 4, 5, 6], [16, 12, 12, 3], [1, 16, 12, 12]]
 
 
-def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["line"] = np.ones(4)
-        file["bad"] = np.ones((3, 4, 5), "i2")
-        file["bad"].attrs["_FillValue"] = "none"
-        file["good"] = np.ones((3, 4, 5), "i2")
-        file["good"].attrs.update({"_FillValue": np.int16(-9), "valid_min": h5py.Empty("f4")})
-        file["good"].attrs["missing_value"] = h5py.Empty("f4")
-    assert fhash("info", tmp_path / "a.h5").stdout == (
-        f"{tmp_path / 'a.h5'} holds 1 variable to encode\n\n"
-        "good: int16, dim0=3 (z), dim1=4 (y), dim2=5 (x), missing where -9\n"
-        f"  fhash encode {tmp_path / 'a.h5'} -o good.fhz --var good\n\n"
-        "not to be encoded:\n"
-        "  bad: the fill value 'none' is not a number; --raw-values reads the numbers as they are"
-        " stored\n"
-        "\nbelow 3 dimensions: line (4,)\n"
-    )
-
-
 def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:
     refusal = refused(2, "info", run, "--missing", "-9")
     assert "is encoded already; --missing is for data" in refusal
@@ -222,25 +203,6 @@ def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
     assert parsed["series"]["coordinates"][0]["dates"] == ["2001-02-03", "2001-02-03T18:00"]
     whole = json.loads(fhash("info", path, "--json").stdout)
     assert "series" not in whole
-
-
-def test_steps_are_repeated_and_checked(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    path = several(tmp_path / "a.h5")
-    result = json.loads(fhash("info", path, "--t", "-2:", "--json").stdout)
-    commands = [command for entry in result["variables"] for command in entry["commands"]]
-    assert [command.split()[-2:] for command in commands] == [["--t", "-2:"]] * 2
-    assert "selection of steps is empty" in refused(2, "info", path, "--t", "4:")
-    with h5py.File(path, "a") as file:
-        file["longer"] = np.zeros((5, 3, 2, 5))
-    result = json.loads(fhash("info", path, "--t", "4:", "--json").stdout)
-    good = [entry["name"] for entry in result["variables"] if entry["commands"]]
-    assert good == ["longer"]
-    for number in range(3):
-        np.save(tmp_path / f"step_{number}.npy", np.zeros((3, 2, 5), "f4"))
-    result = fhash("info", tmp_path / "step_*.npy", "--t", "2", "--json")
-    assert json.loads(result.stdout)["series"]["shape"] == [1, 3, 2, 5]
 
 
 def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Path) -> None:

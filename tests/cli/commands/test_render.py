@@ -24,7 +24,6 @@ from fhash_cli.commands.render import (
     SizeType,
     scene_options,
 )
-from fhash_codec.rendering.march_task import COUNTERS
 from fhash_codec.rendering.scenes import Scene, scene_in_png
 from fhash_formats.errors import InputError
 
@@ -211,38 +210,6 @@ def test_one_line_and_nothing_written(
     assert part in line
 
 
-def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    view = tmp_path / "view.png"
-    words = [
-        "--t",
-        "1",
-        "--size",
-        "60x48",
-        "--azimuth",
-        "30",
-        "--cmap",
-        "plasma",
-        "--effect",
-        "shading",
-        "--isosurface",
-        "7,red,0.5",
-    ]
-    result = fhash("render", run, "-o", view, *words, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    said = json.loads(result.stdout)
-    assert said["paths"] == [str(view)]
-    assert (said["size"], said["step"], said["time"], said["march"]) == ([60, 48], 1, 1, "cache")
-    assert list(said["counters"]) == list(COUNTERS)
-    assert said["seconds"] > 0
-    assert "plan" not in said
-    scene = scene_in_png(view)
-    assert scene.effects.isosurfaces[0].colour == "red"
-    with fhash_codec.open(run) as volume:
-        np.testing.assert_array_equal(
-            np.asarray(Pictures.open(view)), fhash_codec.render(volume, scene).to_uint8()
-        )
-
-
 def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     first, again, scene, changed = (
         tmp_path / name for name in ("a.png", "b.png", "s.json", "c.png")
@@ -376,19 +343,3 @@ def test_a_jpeg_says_where_its_scene_may_stay(fhash: Fhash, run: Path, tmp_path:
     assert "cannot be transparent" in clear.stderr
     other = fhash("render", run, "-o", tmp_path / "v.gif")
     assert ".png, .jpg or .jpeg" in other.stderr
-
-
-def test_tracked_features_have_a_box_and_a_legend(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    view = tmp_path / "v.png"
-    words = ["--size", "80x60", "--track", "interval:5:20", "--track", "isosurface:3=red"]
-    assert fhash("render", run, "-o", view, *words).exit_code == 0
-    effects = scene_in_png(view).effects
-    assert effects.box
-    assert [entry.text for entry in effects.legend] == [
-        "density: 5 to 20 kg m-3",
-        "density = 3 kg m-3",
-    ]
-    panels = tmp_path / "p.jpg"
-    assert fhash("render", run, "-o", panels, *words, "--evolution", "0:3").exit_code == 0
-    with Pictures.open(panels) as picture:
-        assert picture.height > 60

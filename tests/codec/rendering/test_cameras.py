@@ -36,16 +36,6 @@ def physical(rays: Rays, u: float, w: float) -> tuple[np.ndarray, np.ndarray]:
     return rays.grid.origin + origin * rays.grid.spacing, direction * rays.grid.spacing
 
 
-def test_an_axis_of_one_vertex_is_as_thick_as_the_others_mean() -> None:
-    flat = grid(z=[7.0], x=np.linspace(0, 30, 11))
-    np.testing.assert_allclose(flat.spacing, [3, 1, 2])
-    np.testing.assert_allclose(flat.bounds[2], [-0.5, 0.5])
-    np.testing.assert_allclose(flat.corners[2], [6, 8])
-    np.testing.assert_allclose(
-        grid(x=[1.0], y=[2.0], z=[3.0]).corners, [[0.5, 1.5], [1.5, 2.5], [2.5, 3.5]]
-    )
-
-
 def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() -> None:
     def in_units(
         z: str, x: str = "degrees", scale: tuple[float, float, float] | None = None

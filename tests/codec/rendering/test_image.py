@@ -14,7 +14,7 @@ from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import named_map
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.image import Image, Pen, overlay, surrounded, time_text
-from fhash_codec.rendering.layout import Label, Layout, lay_out, strips
+from fhash_codec.rendering.layout import Layout, lay_out, strips
 from fhash_codec.rendering.scenes import Camera, Effects, LegendEntry, Scene
 from fhash_codec.rendering.view import edges
 from fhash_formats.errors import InputError, OutputExistsError
@@ -69,22 +69,6 @@ def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="JPEG cannot be transparent"):
         clear.save(tmp_path / "view.jpg")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_label_is_written_where_it_says() -> None:
-    for upright in (False, True):
-        label = Label(
-            lines=("temperature", "[degree]"), centre=(60.0, 48.0), size=12, upright=upright
-        )
-        pen = Pen(128, 96, "white")
-        pen.write(label)
-        (_, halo), (_, letters) = pen.written()
-        rows, columns = np.nonzero(halo)
-        left, top, right, bottom = label.box
-        assert left - 1 <= columns.min() < columns.max() <= right + 1
-        assert top - 1 <= rows.min() < rows.max() <= bottom + 1
-        assert bool(np.ptp(rows) > np.ptp(columns)) is upright
-        assert 0 < letters.sum() < halo.sum()
 
 
 def test_a_colour_bar_and_a_legend_are_drawn_in_their_colours() -> None:
@@ -190,20 +174,6 @@ def test_from_inside_the_volume_the_overlay_is_finite() -> None:
         everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
     )
     assert np.all(np.isfinite(inside.rgba))
-
-
-def test_panels_get_their_bar_and_legend_outside() -> None:
-    panels = Image(rgba=np.ones((90, 200, 4), dtype=np.float32))
-    effects = Effects(
-        colour_bar=True, legend=(LegendEntry(text="a long meaning of it", colour="red"),), box=True
-    )
-    whole = surrounded(panels, effects, colours=named_map("plasma"), quantity="speed [m/s]")
-    height, width = whole.rgba.shape[:2]
-    assert height > 90
-    assert width > 200
-    assert np.all(whole.rgba[:90, :200] == 1)
-    assert whole.rgba[:90, 200:, 3].max() == 1
-    assert whole.rgba[90:, :, 3].max() == 1
 
 
 def test_the_text_of_a_time() -> None:

@@ -37,22 +37,6 @@ def test_lines_are_no_longer_than_their_limit_and_hold_every_letter(limit: float
     assert (len(lines) == 1) is (limit == 1000)
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "texts"),
-    [
-        (0.0, 10.0, ["0", "2", "4", "6", "8", "10"]),
-        (-1.0, 1.0, ["-1.0", "-0.5", "0.0", "0.5", "1.0"]),
-        (101325.001, 101325.0045, ["101325.001", "101325.002", "101325.003", "101325.004"]),
-        (0.0, 1e9, ["0", "2.0e+08", "4.0e+08", "6.0e+08", "8.0e+08", "1.0e+09"]),
-        (1e-9, 4e-9, ["1e-09", "2e-09", "3e-09", "4e-09"]),
-        (3.0, 3.0, ["3"]),
-        (0.0, 1.2, ["0.00", "0.25", "0.50", "0.75", "1.00"]),
-    ],
-)
-def test_ticks_are_round_and_told_apart(low: float, high: float, texts: list[str]) -> None:
-    assert [text for _, text in ticks(low, high, 5)] == texts
-
-
 @pytest.mark.parametrize("scale", [1e-300, 1e-12, 1.0, 3e7, 1e300])
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
 def test_ticks_lie_within_the_ends_at_any_scale(scale: float, count: int) -> None:
@@ -243,20 +227,6 @@ def test_nothing_covers_the_volume_or_is_cut(
     assert layout.bar.box[0] >= left + width
     assert layout.time is not None
     assert layout.time[3] <= top
-
-
-def test_each_strip_takes_its_side() -> None:
-    entry = LegendEntry(text="a", colour="red")
-    bar, _ = laid_out("plain", (300, 200), Effects(colour_bar=True))
-    assert bar.view[:2] == (0, 0)
-    assert bar.view[2] < 300
-    assert bar.view[3] == 200
-    label, _ = laid_out("plain", (300, 200), Effects(time_label=True))
-    assert label.view[0::2] == (0, 300)
-    assert label.view[1] + label.view[3] == 200
-    legend, _ = laid_out("plain", (300, 200), Effects(legend=(entry,)))
-    assert legend.view[:3] == (0, 0, 300)
-    assert legend.view[3] < 200
 
 
 def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Scene, Volume
-from fhash_codec.rendering.march_task import NUMPY, Units
+from fhash_codec.rendering.march_task import NUMPY
 from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_picture
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_formats.errors import FhashWarning, InputError, RegionError
@@ -141,21 +141,6 @@ def test_a_time_outside_is_refused(volume: Volume) -> None:
     assert plan(volume, time=1.5).step == 1.5
 
 
-@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> None:
-    field = 101325 + 1e-3 * np.random.default_rng(1).random((1, 6, 7, 8))
-    fhash_codec.encode(field, tmp_path / "wide.fhz", fhash_codec.EncodeConfig(effort=1))
-    with fhash_codec.open(tmp_path / "wide.fhz") as wide:
-        assert wide.dtype == np.float64
-        units = Units.of(wide)
-        marched = units.to(wide.read(0)).astype(np.float32)
-        assert np.abs(marched).max() <= 2
-        assert np.ptp(marched) > 0.5
-        table = plan(wide).task.table
-        assert table is not None
-        assert -2 <= table.low < table.high <= 2
-
-
 def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
     volume: Volume, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,30 +176,6 @@ def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Vo
         match=r"no ray can be placed that finely, at most 1e\+14 times; stretch the axes",
     ):
         plan(volume, scale=[8e29, 2.4e29, 1e-30])
-
-
-def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
-    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
-    return path
-
-
-@pytest.mark.parametrize("axis", [1, 2, 3])
-def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
-    shape = [2, 9, 10, 11]
-    shape[axis] = 1
-    values = np.random.default_rng(0).random(shape).astype(np.float32)
-    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
-        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
-        assert not lit.task.shaded
-        assert not lit.lights
-        assert lit.function.opacity(0.5) == 1
-        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
-        # What the user says goes before.
-        given = plan(
-            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
-        )
-        assert given.function.opacity(0.5) == 0.25
-        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
 
 
 def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
@@ -338,3 +299,27 @@ def test_a_line_says_what_the_scene_asks_for(
 ) -> None:
     assert words in lines(volume, **scene)[topic]
     assert all("\n" not in line for line in lines(volume, **scene).values())
+
+
+def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
+    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
+    return path
+
+
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
+    shape = [2, 9, 10, 11]
+    shape[axis] = 1
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
+        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
+        assert not lit.task.shaded
+        assert not lit.lights
+        assert lit.function.opacity(0.5) == 1
+        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
+        # What the user says goes before.
+        given = plan(
+            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
+        )
+        assert given.function.opacity(0.5) == 0.25
+        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3

@@ -54,19 +54,6 @@ def test_keys_are_met_and_their_settings_mixed(volume: Volume) -> None:
     assert scenes[4].transfer_function == keys[1].transfer_function
 
 
-def test_times_pass_evenly(volume: Volume) -> None:
-    scenes = dataclasses.replace(Animation.parse("time=0:8", volume), frames=5).scenes(
-        dataclasses.replace(SMALL, step=3.0), volume
-    )
-    assert [(scene.step, scene.time) for scene in scenes] == [
-        (None, 0),
-        (None, 2),
-        (None, 4),
-        (None, 6),
-        (None, 8),
-    ]
-
-
 def test_times_may_be_dates(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
     dated = dataclasses.replace(volume.coords["t"], attributes={"units": "days since 2001-02-10"})
     monkeypatch.setitem(volume.coords, "t", dated)

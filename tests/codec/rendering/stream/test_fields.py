@@ -160,14 +160,6 @@ def test_fused_kernels_are_taken_where_they_can_be_had(
     assert asked == 2 * [(network, 0.6, tensors.device)]
 
 
-def test_tensors_get_the_bits_of_arrays(network: Network, tensors: Arrays) -> None:
-    places = places_in(SIZE)
-    here, there = (HostInference(network, 0.6, arrays) for arrays in (NUMPY, tensors))
-    at = tensors.array(places)
-    np.testing.assert_array_equal(tensors.host(there.values(at)), here.values(places))
-    np.testing.assert_array_equal(tensors.host(there.slopes(at)), here.slopes(places))
-
-
 X = np.array([0, 1, 2, 4, 8, 16, 17, 18, 19, 20.0])
 COORDS = {
     axis: Coordinate(name=axis, values=values)

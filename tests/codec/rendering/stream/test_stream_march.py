@@ -214,21 +214,6 @@ def test_the_picture_of_a_network_is_near_that_of_its_vertices(
     assert np.mean(np.abs(streamed - cache)) < 0.02
 
 
-@pytest.mark.parametrize("budget", [1, 10**6])
-@pytest.mark.parametrize("value", [0.381, 0.395, 0.405, 0.81, 0.795, 0.99])
-@pytest.mark.parametrize(("count", "step"), [(11, 0.5), (10, 3.9)])
-def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
-    frame_task: FrameTask, value: float, count: int, step: float, budget: int
-) -> None:
-    ramp = np.broadcast_to(np.linspace(0, 1, count)[:, None, None], (count, 7, 7))
-    field, task = frame_task(
-        ramp, step=step, surfaces=(Surface(value=value, colour=np.ones(3), opacity=0.5),)
-    )
-    for skipping in (True, False):
-        found = stream(field, replace(task, skipping=skipping), adaptive=True, budget=budget)
-        np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
-
-
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:
     """Equal counters, but for the turns of the search for surfaces, which rounding decides."""
     searched = here.counters["evaluations"] - there.counters["evaluations"]
