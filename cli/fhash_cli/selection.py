@@ -67,11 +67,7 @@ def region_of(
     roi = roi if roi is not None else ((None, None),) * 3
     z, y, x = (
         _span(
-            f"--roi along {axis}",
-            low,
-            high,
-            count,
-            f"the domain has {count} vertices along {axis}",
+            f"--roi along {axis}", low, high, count, f"the domain has {count} vertices along {axis}"
         )
         for axis, (low, high), count in zip("zyx", roi, volume.shape[1:], strict=True)
     )

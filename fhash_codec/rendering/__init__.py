@@ -1,4 +1,8 @@
-"""Pictures of a volume: the function `render`, and one folder for each stage of rendering."""
+"""Pictures of a volume: a scene becomes a plan, the plan a task, and a marcher draws it.
+
+From outside: `render`, `renderer.Renderer`, `scenes`, `timeline`, `film`, `tracking`, `image`.
+Nothing that encodes or trains, no file of values, no click; torch in `torch_arrays` alone.
+"""
 
 from __future__ import annotations
 

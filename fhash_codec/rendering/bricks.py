@@ -164,10 +164,7 @@ class Bricks:
     def smoothed(self, deviation: float, error: float) -> Single:
         """The values smoothed by a Gaussian, as `smoothed` has them, kept."""
         return self.remembered(
-            "smoothed",
-            (deviation, error),
-            lambda: smoothed(self.values, deviation, error),
-            most=1,
+            "smoothed", (deviation, error), lambda: smoothed(self.values, deviation, error), most=1
         )
 
     def matters(self, task: Task) -> Mask:

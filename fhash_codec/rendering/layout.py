@@ -432,11 +432,7 @@ class Layout:
 
 
 def lay_out(
-    scene: Scene,
-    grid: Grid,
-    coords: Mapping[str, Coordinate],
-    colours: ColourMap,
-    quantity: str,
+    scene: Scene, grid: Grid, coords: Mapping[str, Coordinate], colours: ColourMap, quantity: str
 ) -> tuple[Layout, Rays]:
     """Lay a picture out, and place the rays of the part that shows the volume.
 
@@ -461,10 +457,7 @@ def lay_out(
             if tried[-1].complete and tried[-1].share >= GOOD_VIEW:
                 return tried[-1].layout, tried[-1].rays
     # Every text first, then the volume.
-    best = max(
-        tried,
-        key=lambda one: (one.fits, len(one.layout.labels), min(one.share, GOOD_VIEW)),
-    )
+    best = max(tried, key=lambda one: (one.fits, len(one.layout.labels), min(one.share, GOOD_VIEW)))
     return best.layout, best.rays
 
 
@@ -564,11 +557,7 @@ def strips(size: tuple[int, int], effects: Effects, colours: ColourMap, quantity
 
 
 def _bar(
-    colours: ColourMap,
-    quantity: str,
-    letters: int,
-    picture: tuple[int, int],
-    rows: tuple[int, int],
+    colours: ColourMap, quantity: str, letters: int, picture: tuple[int, int], rows: tuple[int, int]
 ) -> Bar:
     """The colour bar at the right of a picture, in a font that leaves room for the volume.
 

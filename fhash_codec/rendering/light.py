@@ -273,12 +273,7 @@ class _Kept:
 
 
 def _extinction_of(
-    frame: Frame,
-    grid: Grid,
-    table: Table,
-    across: int,
-    body: Body | None,
-    grading: Grading | None,
+    frame: Frame, grid: Grid, table: Table, across: int, body: Body | None, grading: Grading | None
 ) -> tuple[Single, Floats]:
     """Extinctions on the grid with a point every `across` vertices, and the first point (x, y, z).
 

@@ -20,9 +20,7 @@ from fhash_codec.features.features import (
     parse_feature,
     resolve_features,
 )
-from fhash_codec.features.features import (
-    Isosurface as SurfaceFeature,
-)
+from fhash_codec.features.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.colours import colour_code, parse_colour
 from fhash_codec.rendering.grid import Grid

@@ -303,16 +303,6 @@ ENTRIES = 4096
 """Entries of the table of a transfer function."""
 
 
-def alpha(extinction: npt.ArrayLike, length: npt.ArrayLike) -> Floats:
-    """Convert extinction per length to the opacity 0..1 of a length, in float64.
-
-    It is exact for tiny steps too, where 1 - (1 - opacity)^length would be 0 or noise.
-    """
-    return np.asarray(
-        -np.expm1(-np.multiply(extinction, length, dtype=np.float64)), dtype=np.float64
-    )
-
-
 def extinction_of(opacity: npt.ArrayLike, distance: float) -> Floats:
     """Convert an opacity 0..1 after `distance` to extinction per length.
 

@@ -111,13 +111,6 @@ def test_a_range_is_written_as_it_was_given(text: str) -> None:
     assert written(chosen.start, chosen.stop) == text
 
 
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("90s", 90), ("2m", 120), ("1.5h", 5400), ("45", 45), (" 3 m", 180)]
-)
-def test_a_time_is_a_number_of_seconds(text: str, seconds: float) -> None:
-    assert DurationType().convert(text, None, None) == seconds
-
-
 @pytest.mark.parametrize("text", ["soon", "2d", "-3s", "0s", "48h", ""])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is no time|allowed: 1s to 24h"):

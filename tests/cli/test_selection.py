@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_cli.selection import coordinates, region_of_box, steps_of
+from fhash_cli.selection import region_of_box, steps_of
 from fhash_formats.errors import RegionError
 from fhash_formats.series import Coordinate
 
@@ -26,13 +26,6 @@ VOLUME = cast(
 )
 def test_steps_are_those_of_a_python_slice(chosen: slice | None, steps: list[float]) -> None:
     assert steps_of(VOLUME, chosen) == steps
-
-
-def test_coordinates_of_steps_between_two_are_interpolated() -> None:
-    cut = coordinates(VOLUME, [0.5, 2.0], (range(0, 4, 2), range(1), range(2, 4)))
-    assert cut["t"].values.tolist() == [1.5, 4.0]
-    assert cut["z"].values.tolist() == [1.0, 4.0]
-    assert cut["x"].values.tolist() == [4.0, 8.0]
 
 
 @pytest.mark.parametrize(

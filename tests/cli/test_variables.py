@@ -63,17 +63,6 @@ def test_all_takes_what_can_be_encoded_as_it_is(fhash: Fhash, data: Path, tmp_pa
     assert info["bytes"] == path.stat().st_size
 
 
-def test_several_names_with_a_plain_promise(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    path = tmp_path / "run.fhz"
-    words = ["encode", data, "-o", path, *SMALL, "--var", "v, u", "--psnr", 60]
-    report = json.loads(fhash(*words, "--explain", "--json").stdout)
-    assert list(report["variables"]) == ["v", "u"]
-    for name, each in report["variables"].items():
-        assert each["psnr"] >= 60, name
-        assert each["stages"]
-    assert report["bytes"] == path.stat().st_size
-
-
 def test_components_become_variables(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.fhz"
     words = ["encode", data, "-o", path, *SMALL, "--components", "dim0", "--json"]
@@ -94,18 +83,6 @@ def test_components_become_variables(fhash: Fhash, data: Path, tmp_path: Path) -
     assert list(json.loads(result.stdout)["variables"]) == ["u", "members_0", "members_1"]
 
 
-def test_info_lists_the_variables_and_tells_all_of_one(fhash: Fhash, run: Path) -> None:
-    text = fhash("info", run).stdout
-    assert [line.split()[:2] for line in text.splitlines() if line[:2] in ("u ", "v ")] == [
-        ["u", "m"],
-        ["v", "-"],
-    ]
-    assert f"fhash info {run} --var u" in text
-    card = fhash("info", run, "--var", "v").stdout
-    assert "variable       v, float32" in card
-    assert "; v, fhash.transform" in card
-
-
 def test_decode_and_render_take_one(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     assert fhash("decode", run, "--var", "v", "-o", tmp_path / "v.npy").exit_code == 0
     assert np.abs(np.load(tmp_path / "v.npy") - values(2)).max() <= 0.01
@@ -122,17 +99,6 @@ def test_diff_compares_one_with_its_data(fhash: Fhash, run: Path, data: Path) ->
         assert result.exit_code == 0
         assert json.loads(result.stdout)["max_abs_error"] <= 0.01
         assert json.loads(result.stdout)["differences"] == []
-
-
-def test_verify_checks_all_or_one(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    assert fhash("verify", run).stdout == f"{run}: sound, 6 arrays checked\n"
-    assert fhash("verify", run, "--var", "v").stdout == f"{run}: sound, 5 arrays checked\n"
-    damaged = bytearray(run.read_bytes())
-    damaged[damaged.index(b"v/c/0") + 20] ^= 1
-    path = tmp_path / "bad.fhz"
-    path.write_bytes(damaged)
-    assert fhash("verify", path, "--var", "u").exit_code == 0
-    assert fhash("verify", path).exit_code == 4
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])

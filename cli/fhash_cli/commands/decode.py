@@ -452,10 +452,7 @@ class Part:
 def _result(paths: list[str], parts: Sequence[Part]) -> dict[str, Any]:
     if len(parts) == 1:
         return {"paths": paths, **parts[0].result()}
-    return {
-        "paths": paths,
-        "variables": {part.volume.variable: part.result() for part in parts},
-    }
+    return {"paths": paths, "variables": {part.volume.variable: part.result() for part in parts}}
 
 
 def _say_why_floats(part: Part) -> None:

@@ -213,7 +213,8 @@ def _say_remarks(
         if value == value and value not in series.occurring:
             say(f"--missing {value:.9g}: {series.source} holds no such value")
     integers = (series.source_dtype or series.dtype).kind in "iu"
-    if integers and looks_categorical(report):
+    few = report["data_range"] <= MAX_LABELS and report["max_abs_error"]
+    if integers and few:
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     if promise_kept and (line := decided_by_bulk(config, report)) is not None:
         say(line)
@@ -270,12 +271,7 @@ def _emit_several(
 
 
 def _choose(
-    series: Series,
-    config: EncodeConfig,
-    seconds: float,
-    progress: Progress,
-    *,
-    quiet: bool,
+    series: Series, config: EncodeConfig, seconds: float, progress: Progress, *, quiet: bool
 ) -> Choice:
     """Choose effort or epochs by a budget in seconds, and say so in one line."""
     from fhash_codec.cost.prediction import choose
@@ -337,11 +333,6 @@ def _write_report(
     )
 
 
-def looks_categorical(report: Mapping[str, Any]) -> bool:
-    """Whether integers are so few that they may be labels, and some of them were changed."""
-    return bool(report["data_range"] <= MAX_LABELS and report["max_abs_error"])
-
-
 def _stamp(path: str) -> tuple[int, int] | None:
     """Inode and time of a file, which one that replaces it has not; None without a file."""
     try:
@@ -399,15 +390,9 @@ def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
     All but the last are estimated from a sample.
     """
-    last = len(report["gains"]) - 1
-    return [
-        (
-            "  " + gain["what"],
-            f"{'' if stage == last else 'about '}{size(gain['bytes'])}{_after(gain)}",
-        )
-        for stage, gain in enumerate(report["gains"])
-    ]
-
-
-def _after(gain: Mapping[str, Any]) -> str:
-    return f" after {duration(gain['seconds'])}" if "seconds" in gain else ""
+    rows, last = [], len(report["gains"]) - 1
+    for stage, gain in enumerate(report["gains"]):
+        after = f" after {duration(gain['seconds'])}" if "seconds" in gain else ""
+        about = "" if stage == last else "about "
+        rows.append(("  " + gain["what"], f"{about}{size(gain['bytes'])}{after}"))
+    return rows

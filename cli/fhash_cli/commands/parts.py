@@ -190,12 +190,7 @@ def _given(config: EncodeConfig) -> dict[str, Any]:
 @json_option
 @quiet_option
 def append_command(
-    run: str,
-    data: str,
-    source: SourceOptions,
-    keep: int | None,
-    as_json: bool,
-    quiet: bool,
+    run: str, data: str, source: SourceOptions, keep: int | None, as_json: bool, quiet: bool
 ) -> None:
     """Code the steps of DATA behind those of RUN.fhz, in its tiles and to its bound of the error.
 

@@ -757,10 +757,7 @@ def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) 
     lines = [("written", path) for path in paths]
     if not explain:
         height, width = image.rgba.shape[:2]
-        lines += [
-            ("size", extent((width, height))),
-            ("step", f"{plan.step:g}, t = {time}"),
-        ]
+        lines += [("size", extent((width, height))), ("step", f"{plan.step:g}, t = {time}")]
     if Path(paths[-1]).suffix.lower() != ".png" and len(paths) == 1:
         lines.append(("scene", "not in a JPEG; --save-scene FILE.json keeps it"))
     lines.append(("seconds", number(image.seconds, digits=3)))

@@ -64,12 +64,7 @@ class PackOptions:
 @quiet_option
 @option_group(PackOptions, "chosen")
 def pack_command(
-    data: str,
-    output: str,
-    chosen: PackOptions,
-    force: bool,
-    as_json: bool,
-    quiet: bool,
+    data: str, output: str, chosen: PackOptions, force: bool, as_json: bool, quiet: bool
 ) -> None:
     """Put the arrays of a Zarr store that the codec fhash.transform wrote into RUN.fhz.
 

@@ -159,7 +159,7 @@ def test_differences_beside_the_values_are_told(
     assert "are of the variable u" in result.stderr
     other = both(tmp_path / "b.h5", units="km/h", x=np.arange(5.0))
     assert fhash("diff", other, run).stderr.splitlines() == [
-        f"fhash: {other}: the data are in km/h, {run} in m/s",
+        f"fhash: {other}: the data are in km/h, {run} in m/s"
     ]
     moved = both(tmp_path / "c.h5", x=np.arange(5.0) + 1)
     lines = json.loads(fhash("diff", moved, run, "--json").stdout)["differences"]

@@ -33,8 +33,7 @@ def test_another_shell_is_refused(refused: Callable[..., str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "found"),
-    [("fhash enc", "plain,encode"), ("fhash encode x --ps", "plain,--psnr")],
+    ("line", "found"), [("fhash enc", "plain,encode"), ("fhash encode x --ps", "plain,--psnr")]
 )
 def test_words_are_completed(line: str, found: str) -> None:
     words = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}

@@ -14,30 +14,11 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
-import fhash_formats
-from fhash_cli.commands.decode import (
-    TYPES,
-    RegionOptions,
-    Selection,
-    Statistics,
-    convert,
-)
+from fhash_cli.commands.decode import RegionOptions, Selection, Statistics, convert
 from fhash_codec import EncodeConfig
 from fhash_codec.progress import silent
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
-
-
-def test_a_fill_value_stands_for_nan_in_any_type() -> None:
-    frame = np.array([1.4, np.nan, 2.6], "f4")
-    assert convert(frame, np.dtype("i2"), fill=-9).tolist() == [1, -9, 3]
-    assert convert(frame, np.dtype("f8"), fill=0.5)[1] == 0.5
-    assert np.isnan(convert(frame, np.dtype("f2"))[1])
-    assert np.isnan(frame[1])
-    with pytest.raises(InputError, match="--fill V"):
-        convert(frame, np.dtype("i2"))
-    with pytest.raises(InputError, match="at some vertices"):
-        convert(frame, np.dtype("i2"), background=True)
 
 
 @pytest.fixture(scope="module")
@@ -180,16 +161,6 @@ def test_a_region_is_that_part_of_the_whole(
     np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", *words), whole[index])
 
 
-def test_a_time_between_steps_is_the_volume_at_that_step(
-    fhash: Fhash, run: Path, tmp_path: Path
-) -> None:
-    with fhash_codec.open(run) as volume:
-        expected = volume.read(1.5)
-    np.testing.assert_array_equal(
-        saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None]
-    )
-
-
 def test_statistics_are_those_of_the_region(
     fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
 ) -> None:
@@ -213,37 +184,12 @@ def test_statistics_are_those_of_the_region(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", [name for name in TYPES if "int" in name])
-def test_integers_are_clipped_to_the_limits_of_their_type(name: str) -> None:
-    kind = np.dtype(name)
-    limits = np.iinfo(kind)
-    wide = convert(np.array([-1e30, 1e30, 0.5, 1.5, 2.4]), kind)
-    assert wide.dtype == kind
-    assert wide.tolist() == [limits.min, limits.max, 0, 2, 2]
-    narrow = convert(np.array([-1e30, 1e30], dtype=np.float32), kind)
-    assert narrow.tolist() == [limits.min, limits.max]
-
-
 def test_conversions_that_would_lose_a_value_are_refused() -> None:
     with pytest.raises(InputError, match="add --outside background"):
         convert(np.array([1.0, np.nan]), np.dtype(np.int16))
     with pytest.raises(InputError, match="does not fit float16"):
         convert(np.array([1.0, 1e6]), np.dtype(np.float16))
     assert np.isnan(convert(np.array([np.nan]), np.dtype(np.float16))).all()
-
-
-def test_huge_values_are_decoded_to_valid_json(fhash: Fhash, tmp_path: Path) -> None:
-    np.save(tmp_path / "huge.npy", np.linspace(-5e307, 5e307, 120).reshape(2, 3, 4, 5))
-    assert (
-        fhash(
-            "encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q"
-        ).exit_code
-        == 0
-    )
-    result = fhash("decode", tmp_path / "run.fhz", "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    report = json.loads(result.stdout)
-    assert report["min"] <= report["mean"] <= report["max"]
 
 
 def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
@@ -264,43 +210,6 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
     assert "the data have no value" in refused(
         2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8"
     )
-
-
-def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    result = fhash("decode", run, "-o", tmp_path / "\udcff.npy")
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert (tmp_path / "\udcff.npy").exists()
-
-
-def test_a_level_of_detail_has_every_second_position(
-    fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path
-) -> None:
-    run, out = tmp_path / "run.fhz", tmp_path / "out.h5"
-    assert fhash("encode", data, "-o", run, "--effort", "1", "-q").exit_code == 0
-    result = fhash("decode", run, "--lod", "1", "--t", "1:3", "-o", out, "--json", "-q")
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert json.loads(result.stdout)["shape"] == [2, 3, 4, 4]
-    with fhash_formats.open_series(out) as series, fhash_codec.open(run) as volume:
-        assert series.shape == (2, 3, 4, 4)
-        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1))
-        for axis in "zyx":
-            np.testing.assert_array_equal(
-                series.coords[axis].values, volume.coords[axis].values[::2]
-            )
-    part = tmp_path / "part.h5"
-    result = fhash(
-        "decode", run, "--lod", "1", "--t", "1", "--roi", "1:5,:,3:7", "-o", part, "--json", "-q"
-    )
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert json.loads(result.stdout)["shape"] == [1, 2, 4, 2]
-    assert json.loads(result.stdout)["region"][0] == [2, 5]
-    with fhash_formats.open_series(part) as series, fhash_codec.open(run) as volume:
-        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1)[1:3, :, 2:4])
-        np.testing.assert_array_equal(series.coords["z"].values, volume.coords["z"].values[2:5:2])
-        np.testing.assert_array_equal(series.coords["x"].values, volume.coords["x"].values[4:7:2])
-    words = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
-    assert fhash("encode", data, "-o", tmp_path / "paper.fhz", *words).exit_code == 0
-    assert "no levels of detail" in refused(2, "decode", tmp_path / "paper.fhz", "--lod", "1")
 
 
 @pytest.mark.parametrize("suffix", ["vtp", "ply"])

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -18,19 +16,14 @@ from click.testing import Result
 from PIL import Image
 
 import fhash_codec
-from fhash_cli.commands.demo import (
-    SceneOptions,
-    ShapeType,
-)
+from fhash_cli.commands.demo import SceneOptions, ShapeType
 from fhash_codec import gallery
 from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
-from fhash_codec.simulation.simulate import Simulation, simulate
-from fhash_formats import open_series
+from fhash_codec.simulation.simulate import Simulation
 
 Fhash = Callable[..., Result]
 SMALL = ("--shape", "6,7,8", "--steps", "3", "-q")
-SUFFIXES = ("h5", "nc", "zarr", "npy", "raw", "vtkhdf", "pvd")
 
 
 def options(**settings: Any) -> SceneOptions:
@@ -79,28 +72,6 @@ def test_options_that_exclude_each_other_are_refused(settings: dict[str, Any]) -
         options(**settings).open()
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_holds_the_simulated_values(fhash: Fhash, tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"run.{suffix}"
-    result = fhash("demo", "--scene", "bubble", *SMALL, "--seed", "4", "-o", path, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    report = json.loads(result.stdout)
-    assert str(path) in report["paths"]
-    assert (report["shape"], report["seed"]) == ([3, 6, 7, 8], 4)
-    expected = simulate("bubble", (3, 6, 7, 8), 4)
-    shape = "x=8,y=7,z=6,t=3"
-    raw = ("run.raw", "--shape", shape, "--dtype", "float32") if suffix == "raw" else ()
-    if raw:
-        values = np.fromfile(path, dtype="<f4").reshape(expected.shape)
-        frames = list(values)
-    else:
-        with open_series(path) as series:
-            assert series.name == expected.name or suffix == "npy"
-            frames = [series.read(step) for step in range(3)]
-    for step, frame in enumerate(frames):
-        np.testing.assert_array_equal(frame, expected.read(step))
-
-
 def test_a_file_of_a_scene_is_simulated_and_never_replaced(
     fhash: Fhash, refused: Callable[..., str], tmp_path: Path
 ) -> None:
@@ -117,15 +88,6 @@ def test_a_file_of_a_scene_is_simulated_and_never_replaced(
     scene.write_text('{"effects": [{"effect": "blub"}]}')
     message = refused(2, "demo", "--scene", scene, "-o", tmp_path / "other.npy")
     assert message.startswith(f"{scene}: effect 1 is 'blub'; did you mean 'blob'")
-
-
-def test_a_full_disk_is_refused_before_any_work(
-    refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=10**9))
-    monkeypatch.setattr(Simulation, "read", None)
-    words = ("demo", "--scene", "shell", "--paper-shape", "-q", "-o", tmp_path / "run.h5")
-    assert "up to 5.48 GB are needed" in refused(1, *words)
 
 
 @pytest.mark.parametrize("suffix", ["npy", "h5", "zarr"])
@@ -223,8 +185,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("scene", PRESETS)
 def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, scene: str) -> None:
     folder = tmp_path / "demo"
-    result = fhash("demo", "--scene", scene, *SMALL_DEMO, "-o", folder, "--json", "-q")
-    assert (result.exit_code, result.stderr) == (0, "")
+    result = fhash("demo", "--scene", scene, *SMALL_DEMO, "-o", folder, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.startswith(f"fhash: simulating '{scene}'")
     report = json.loads(result.stdout)
     assert sorted(path.name for path in folder.iterdir()) == [
         f"{scene}.{suffix}" for suffix in ("fhz", "h5", "png")

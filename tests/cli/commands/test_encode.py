@@ -26,69 +26,6 @@ KEYS = {
 }  # fmt: skip
 
 
-def test_json_is_one_object_with_the_figures_of_the_file(
-    fhash: Fhash, data: Path, tmp_path: Path
-) -> None:
-    result = fhash(
-        "encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *PAPER
-    )
-    assert (result.exit_code, result.stderr) == (0, "")
-    report = json.loads(result.stdout)
-    assert set(report) >= KEYS
-    assert report["bytes"] == (tmp_path / "run.fhz").stat().st_size
-    assert report["raw_bytes"] == 3 * 6 * 7 * 8 * 4
-    assert report["source_bytes"] == data.stat().st_size
-    assert report["source_ratio"] == report["source_bytes"] / report["bytes"]
-    assert report["shape"] == [3, 6, 7, 8]
-    assert report["epochs"] == 2
-    assert [set(point) for point in report["curve"]] == [{"seconds", "epoch", "psnr"}] * 2
-
-
-def test_coded_tables_are_reported_with_their_loss(
-    fhash: Fhash, data: Path, tmp_path: Path
-) -> None:
-    for name, tables in {"plain": "float32", "coded": "transform"}.items():
-        result = fhash(
-            "encode", data, "-o", tmp_path / name, *PAPER, "--fold", 2, "--tables", tables
-        )
-        assert (result.exit_code, result.stderr) == (0, "")
-        assert ("coded, for" in result.stdout) == (name == "coded")
-    info = fhash("info", tmp_path / "coded")
-    assert "parts/0.tables.level_1 to parts/0.tables.level_" in info.stdout
-    assert "fhash.transform" in info.stdout
-    assert "of the PSNR" in info.stdout
-    assert "of the PSNR" not in fhash("info", tmp_path / "plain").stdout
-    model = json.loads(fhash("info", tmp_path / "coded", "--json").stdout)["model"]
-    assert model["tables_loss_db"] <= 0.1001
-    assert fhash("verify", tmp_path / "coded").exit_code == 0
-    assert fhash("diff", data, tmp_path / "coded", "--json").exit_code == 0
-
-
-def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
-    values = np.arange(4 * 5 * 6 * 7, dtype=">u2").reshape(4, 5, 6, 7)
-    (tmp_path / "values.bin").write_bytes(values.tobytes())
-    layout = ["--shape", "x=7,y=6,z=5,t=4", "--dtype", "uint16", "--endian", "big"]
-    words = [
-        "encode",
-        tmp_path / "values.bin",
-        "-o",
-        tmp_path / "run.fhz",
-        *layout,
-        "--t",
-        "1:4:2",
-        *SMALL,
-    ]
-    result = fhash(*words)
-    assert result.exit_code == 0
-    assert "than the whole source on disk" in result.stdout
-    with fhash_codec.open(tmp_path / "run.fhz") as volume:
-        assert volume.shape == (2, 5, 6, 7)
-        assert (volume.value_range.low, volume.value_range.high) == (
-            values[1].min(),
-            values[3].max(),
-        )
-
-
 def test_what_each_stage_bought_is_in_the_table_and_in_json(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:

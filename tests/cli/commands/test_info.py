@@ -6,14 +6,13 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.info import listing, tiling_text
+from fhash_cli.commands.info import listing
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
@@ -139,23 +138,6 @@ def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: 
     )
 
 
-@pytest.mark.parametrize("command", ["info", "verify", "decode"])
-@pytest.mark.parametrize("kept", [0, 1, 30, 1000, -1])
-def test_a_cut_file_is_found(
-    refused: Callable[..., str], run: Path, tmp_path: Path, command: str, kept: int
-) -> None:
-    (tmp_path / "cut.fhz").write_bytes(run.read_bytes()[:kept])
-    refused(4, command, tmp_path / "cut.fhz")
-
-
-@pytest.mark.parametrize("command", ["verify", "decode"])
-def test_what_is_no_container_is_refused(
-    refused: Callable[..., str], data: Path, tmp_path: Path, command: str
-) -> None:
-    refused(4, command, data)
-    refused(2, command, tmp_path / "missing.fhz")
-
-
 def test_info_of_data_lists_variables_and_their_commands(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
@@ -179,25 +161,6 @@ def test_info_of_data_lists_variables_and_their_commands(
         assert result.exit_code == 0, result.stderr
         shapes.append(json.loads(result.stdout)["shape"])
     assert shapes == [[3, 4, 5, 6], [16, 12, 12, 3], [1, 16, 12, 12]]
-
-
-def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["line"] = np.ones(4)
-        file["bad"] = np.ones((3, 4, 5), "i2")
-        file["bad"].attrs["_FillValue"] = "none"
-        file["good"] = np.ones((3, 4, 5), "i2")
-        file["good"].attrs.update({"_FillValue": np.int16(-9), "valid_min": h5py.Empty("f4")})
-        file["good"].attrs["missing_value"] = h5py.Empty("f4")
-    assert fhash("info", tmp_path / "a.h5").stdout == (
-        f"{tmp_path / 'a.h5'} holds 1 variable to encode\n\n"
-        "good: int16, dim0=3 (z), dim1=4 (y), dim2=5 (x), missing where -9\n"
-        f"  fhash encode {tmp_path / 'a.h5'} -o good.fhz --var good\n\n"
-        "not to be encoded:\n"
-        "  bad: the fill value 'none' is not a number; --raw-values reads the numbers as they are"
-        " stored\n"
-        "\nbelow 3 dimensions: line (4,)\n"
-    )
 
 
 def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:
@@ -242,33 +205,6 @@ def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
     assert "series" not in whole
 
 
-def test_info_of_a_variable_that_cannot_be_encoded_says_why(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    path = several(tmp_path / "a.h5")
-    assert "1 dimensions (4,)" in fhash("info", path, "--var", "line", "--json").stdout
-    assert "it holds u" in refused(2, "info", path, "--var", "v")
-
-
-def test_steps_are_repeated_and_checked(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
-) -> None:
-    path = several(tmp_path / "a.h5")
-    result = json.loads(fhash("info", path, "--t", "-2:", "--json").stdout)
-    commands = [command for entry in result["variables"] for command in entry["commands"]]
-    assert [command.split()[-2:] for command in commands] == [["--t", "-2:"]] * 2
-    assert "selection of steps is empty" in refused(2, "info", path, "--t", "4:")
-    with h5py.File(path, "a") as file:
-        file["longer"] = np.zeros((5, 3, 2, 5))
-    result = json.loads(fhash("info", path, "--t", "4:", "--json").stdout)
-    good = [entry["name"] for entry in result["variables"] if entry["commands"]]
-    assert good == ["longer"]
-    for number in range(3):
-        np.save(tmp_path / f"step_{number}.npy", np.zeros((3, 2, 5), "f4"))
-    result = fhash("info", tmp_path / "step_*.npy", "--t", "2", "--json")
-    assert json.loads(result.stdout)["series"]["shape"] == [1, 3, 2, 5]
-
-
 def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Path) -> None:
     import xarray as xr
 
@@ -281,17 +217,3 @@ def test_the_source_is_named_with_what_is_kept_beside(fhash: Fhash, tmp_path: Pa
     printed = fhash("info", tmp_path / "a.fhz").stdout
     assert "wind.nc, SHA-256 " in printed
     assert "(lev, lat, lon); beside it height" in " ".join(printed.split())
-
-
-@pytest.mark.parametrize(
-    ("told", "text"),
-    [
-        ({}, ""),
-        ({"price": 1.25}, ", at most about 25% above one tile"),
-        ({"price": 1.25, "tried": 3}, ", 25% above one tile"),
-        ({"price": 1.0, "tried": 3, "best": [2, 3, 4, 5]}, ", the fewest bytes of all tried"),
-        ({"region_ms": 3.25, "price": None}, "; regions 3.2 ms"),
-    ],
-)
-def test_any_key_of_the_tiles_may_be_missing(told: dict[str, Any], text: str) -> None:
-    assert tiling_text({"model": {"levels": [[4, 3, 4, 5]], "tiling": told}}) == text

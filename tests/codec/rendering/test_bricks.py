@@ -9,14 +9,7 @@ from frame_field import task_of as plain_task
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fhash_codec import native
-from fhash_codec.rendering.bricks import (
-    FARTHEST,
-    SIDE,
-    Bricks,
-    cells_of,
-    limits_of,
-    smoothed,
-)
+from fhash_codec.rendering.bricks import FARTHEST, SIDE, Bricks, cells_of, limits_of, smoothed
 from fhash_codec.rendering.march_task import Surface
 
 
@@ -42,16 +35,6 @@ def test_a_brick_has_the_extremes_of_its_vertices(shape) -> None:
         count == max(-(-(size - 1) // SIDE), 1)
         for count, size in zip(bricks.low.shape, shape, strict=True)
     )
-
-
-def test_what_is_infinite_has_no_value() -> None:
-    values = np.zeros((10, 10, 10))
-    values[1, 1, 1], values[2, 2, 2] = np.inf, -np.inf
-    bricks = bricks_of(values)
-    assert bricks.value_range == (0.0, 0.0)
-    assert np.isnan(bricks.values[1, 1, 1])
-    assert np.isnan(bricks.values[2, 2, 2])
-    assert bricks_of(np.full((3, 3, 3), np.nan)).value_range == (0.0, 0.0)
 
 
 def test_bricks_matter_where_something_can_be_seen() -> None:

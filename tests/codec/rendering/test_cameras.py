@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 
 from fhash_codec import Volume
-from fhash_codec.rendering.cameras import (
-    VIEWS,
-    CameraPath,
-    Rays,
-    from_matrix,
-    pchip,
-    to_matrix,
-)
+from fhash_codec.rendering.cameras import VIEWS, CameraPath, Rays, pchip
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import FhashWarning, InputError
@@ -41,16 +34,6 @@ UNEVEN = grid(x=np.linspace(100, 103, 7), y=np.linspace(5, -5, 21), z=[0.0, 0.5]
 def physical(rays: Rays, u: float, w: float) -> tuple[np.ndarray, np.ndarray]:
     origin, direction = rays.rays(u, w)
     return rays.grid.origin + origin * rays.grid.spacing, direction * rays.grid.spacing
-
-
-def test_an_axis_of_one_vertex_is_as_thick_as_the_others_mean() -> None:
-    flat = grid(z=[7.0], x=np.linspace(0, 30, 11))
-    np.testing.assert_allclose(flat.spacing, [3, 1, 2])
-    np.testing.assert_allclose(flat.bounds[2], [-0.5, 0.5])
-    np.testing.assert_allclose(flat.corners[2], [6, 8])
-    np.testing.assert_allclose(
-        grid(x=[1.0], y=[2.0], z=[3.0]).corners, [[0.5, 1.5], [1.5, 2.5], [2.5, 3.5]]
-    )
 
 
 def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() -> None:
@@ -254,25 +237,6 @@ def test_the_cubic_never_overshoots() -> None:
         assert pchip(at, values, share)[0] == pytest.approx(value)
 
 
-def turn(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
-    """The quaternion of a turn about a unit axis."""
-    half = np.radians(degrees) / 2
-    return np.array([np.cos(half), *(np.sin(half) * np.array(axis))])
-
-
-@pytest.mark.parametrize(
-    "axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, 0.8)]
-)
-@pytest.mark.parametrize("degrees", [0.0, 1e-9, 30.0, 179.0, 180.0])
-def test_a_matrix_comes_back_from_its_quaternion(
-    axis: tuple[float, float, float], degrees: float
-) -> None:
-    matrix = to_matrix(turn(axis, degrees))
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(matrix @ axis, axis, atol=1e-12)
-    np.testing.assert_allclose(to_matrix(from_matrix(matrix)), matrix, atol=1e-12)
-
-
 def eye(camera: Camera, grid: Grid) -> np.ndarray:
     rays = Rays.of(camera, grid, (40, 30))
     return rays.eye * grid.spacing + grid.origin
@@ -293,31 +257,6 @@ def test_two_poses_are_joined_at_one_speed(volume: Volume) -> None:
     np.testing.assert_allclose(turns, 15.0, rtol=1e-6)
     assert path.camera(0.0) is cameras[0]
     assert path.camera(2.0) is cameras[1]
-
-
-def test_a_way_through_poses_is_smooth(volume: Volume) -> None:
-    grid = Grid.of(volume.coords)
-    cameras = (
-        Camera(view="xz"),
-        Camera(position=(30.0, 2.0, 4.0)),
-        Camera(view="xy", zoom=2.0),
-        Camera(view="zx", elevation=20.0),
-    )
-    path = CameraPath(at=np.array([0.0, 0.2, 0.7, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
-    for share, camera in zip(path.at, cameras, strict=True):
-        for near in (max(share - 1e-7, 0), min(share + 1e-7, 1)):
-            np.testing.assert_allclose(eye(path.camera(near), grid), eye(camera, grid), atol=1e-3)
-    # Speeds on both sides of a pose are the same.
-    for share in path.at[1:-1]:
-        before, here, after = (
-            eye(path.camera(share + shift), grid) for shift in (-1e-5, 0.0, 1e-5)
-        )
-        np.testing.assert_allclose(
-            here - before, after - here, atol=2e-7 * np.linalg.norm(here), rtol=1e-2
-        )
-    zooms = [path.camera(share).zoom for share in np.linspace(0, 1, 50)]
-    assert min(zooms) >= 1 - 1e-12
-    assert max(zooms) <= 2 + 1e-12
 
 
 def test_cameras_with_the_same_above_them_stay_upright(volume: Volume) -> None:
@@ -347,3 +286,28 @@ def test_angles_are_followed_as_given(volume: Volume) -> None:
     cameras = (Camera(azimuth=0.0), Camera(azimuth=720.0, elevation=40.0))
     path = CameraPath(at=np.array([0.0, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
     assert path.camera(0.25) == Camera(azimuth=180.0, elevation=10.0)
+
+
+def test_a_way_through_poses_is_smooth(volume: Volume) -> None:
+    grid = Grid.of(volume.coords)
+    cameras = (
+        Camera(view="xz"),
+        Camera(position=(30.0, 2.0, 4.0)),
+        Camera(view="xy", zoom=2.0),
+        Camera(view="zx", elevation=20.0),
+    )
+    path = CameraPath(at=np.array([0.0, 0.2, 0.7, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
+    for share, camera in zip(path.at, cameras, strict=True):
+        for near in (max(share - 1e-7, 0), min(share + 1e-7, 1)):
+            np.testing.assert_allclose(eye(path.camera(near), grid), eye(camera, grid), atol=1e-3)
+    # Speeds on both sides of a pose are the same.
+    for share in path.at[1:-1]:
+        before, here, after = (
+            eye(path.camera(share + shift), grid) for shift in (-1e-5, 0.0, 1e-5)
+        )
+        np.testing.assert_allclose(
+            here - before, after - here, atol=2e-7 * np.linalg.norm(here), rtol=1e-2
+        )
+    zooms = [path.camera(share).zoom for share in np.linspace(0, 1, 50)]
+    assert min(zooms) >= 1 - 1e-12
+    assert max(zooms) <= 2 + 1e-12

@@ -96,16 +96,6 @@ def test_points_clipping_and_missing_values(space: str) -> None:
     assert np.all((mixed >= 0) & (mixed <= 1))
 
 
-def test_two_points_at_one_value_are_a_jump() -> None:
-    colours = ColourMap(
-        positions=np.array([0.0, 1.0, 1.0, 2.0]),
-        points=np.array([[0.0] * 3, [0.2] * 3, [0.8] * 3, [1.0] * 3]),
-    )
-    np.testing.assert_allclose(
-        colours([0.5, 1 - 1e-9, 1.0, 1.5])[:, 0], [0.1, 0.2, 0.8, 0.9], rtol=0, atol=1e-6
-    )
-
-
 def test_a_name_that_pillow_has_looked_up_is_still_known() -> None:
     assert ImageColor.getrgb("tomato") == (255, 99, 71)
     assert parse_colour("tomato") == (1.0, 99 / 255, 71 / 255)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from fhash_codec.rendering import grid as module
-from fhash_codec.rendering.cameras import view_of
 from fhash_codec.rendering.grid import Axis, Grid, downward, drawn_counts
 from fhash_formats.series import Coordinate
 
@@ -114,29 +113,3 @@ def test_an_uneven_axis_keeps_its_ends_and_needs_no_warning() -> None:
     assert uneven.series_spacing == pytest.approx((10 * 10**0.5 * 1) ** (1 / 3))
     assert grid().warp is None
     assert grid().series_spacing == grid().vertex_spacing
-
-
-def test_planes_lines_and_a_point_are_seen_from_above() -> None:
-    one = [3.0]
-    for axes, flat, view in (
-        ({}, False, "iso"),
-        ({"z": [0, 1]}, False, "iso"),
-        ({"z": one}, True, "xy"),
-        ({"y": one}, True, "xz"),
-        ({"x": one}, True, "yz"),
-        ({"z": one, "y": one}, True, "xy"),
-        ({"x": one, "y": one}, True, "xz"),
-        ({"x": one, "y": one, "z": one}, True, "xy"),
-    ):
-        made = grid(**axes)
-        assert made.flat is flat
-        assert view_of("auto", made) == view
-        assert view_of("yx", made) == "yx"
-
-
-def test_the_thinnest_axis_is_measured_in_vertex_spacings() -> None:
-    assert grid(z=[0, 1, 2]).thinnest == pytest.approx((3, 2))
-    assert grid(z=[5.0]).thinnest == pytest.approx((1, 1))
-    count, length = grid(z=[0, 10, 20]).thinnest
-    assert count == 3
-    assert length == pytest.approx(20 / 10 ** (1 / 3))

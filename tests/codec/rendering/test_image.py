@@ -13,8 +13,8 @@ from PIL import Image as Pictures
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import named_map
 from fhash_codec.rendering.grid import Grid
-from fhash_codec.rendering.image import DARK, LIGHT, Image, Pen, overlay, surrounded, time_text
-from fhash_codec.rendering.layout import Bar, Label, Layout, lay_out, strips
+from fhash_codec.rendering.image import Image, Pen, overlay, surrounded, time_text
+from fhash_codec.rendering.layout import Layout, lay_out, strips
 from fhash_codec.rendering.scenes import Camera, Effects, LegendEntry, Scene
 from fhash_codec.rendering.view import edges
 from fhash_formats.errors import InputError, OutputExistsError
@@ -39,17 +39,6 @@ def test_pixels_over_a_background() -> None:
     assert pixels[0, 0].tolist() == [144, 32, 48]
     assert pixels[1, 2].tolist() == [0, 255, 0]
     assert image().to_uint8("white")[0, 0].tolist() == [255, 128, 128]
-
-
-@pytest.mark.parametrize("background", ["white", "transparent"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3.0, -1.0])
-def test_no_value_gives_a_pixel_that_is_none(background: str, value: float) -> None:
-    rgba = np.full((1, 2, 4), 0.25, dtype=np.float32)
-    rgba[0, 0] = value
-    pixels = image(rgba=rgba).to_uint8(background)
-    if not np.isfinite(value):
-        assert pixels[0, 0].tolist() == ([255] * 3 if background == "white" else [0] * 4)
-    assert pixels[0, 1].tolist() == ([255] * 3 if background == "white" else [255, 255, 255, 64])
 
 
 def test_a_notebook_shows_the_picture() -> None:
@@ -80,41 +69,6 @@ def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="JPEG cannot be transparent"):
         clear.save(tmp_path / "view.jpg")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("background", "dark"),
-    [("white", True), ("transparent", True), ("#102030", False), ("yellow", True), ("blue", False)],
-)
-def test_the_ink_is_told_apart_from_the_background(background: str, dark: bool) -> None:
-    pen = Pen(64, 64, background)
-    np.testing.assert_array_equal(pen.ink, DARK if dark else LIGHT)
-    np.testing.assert_array_equal(pen.halo, LIGHT if dark else DARK)
-
-
-def test_a_label_is_written_where_it_says() -> None:
-    for upright in (False, True):
-        label = Label(
-            lines=("temperature", "[degree]"), centre=(60.0, 48.0), size=12, upright=upright
-        )
-        pen = Pen(128, 96, "white")
-        pen.write(label)
-        (_, halo), (_, letters) = pen.written()
-        rows, columns = np.nonzero(halo)
-        left, top, right, bottom = label.box
-        assert left - 1 <= columns.min() < columns.max() <= right + 1
-        assert top - 1 <= rows.min() < rows.max() <= bottom + 1
-        assert bool(np.ptp(rows) > np.ptp(columns)) is upright
-        assert 0 < letters.sum() < halo.sum()
-
-
-@pytest.mark.parametrize("side", [1, 2, 3, 9])
-def test_a_colour_bar_is_cut_at_the_edges_of_a_tiny_picture(side: int) -> None:
-    bar = Bar(box=(1, 2, 10, 18), marks=(), title=(), size=8)
-    part = Pen(side, side, "white").colour_bar(bar, named_map("viridis"))
-    whole = Pen(20, 20, "white").colour_bar(bar, named_map("viridis"))
-    for layer, of_whole in zip(part, whole, strict=True):
-        np.testing.assert_array_equal(layer, of_whole[:side, :side])
 
 
 def test_a_colour_bar_and_a_legend_are_drawn_in_their_colours() -> None:
@@ -220,20 +174,6 @@ def test_from_inside_the_volume_the_overlay_is_finite() -> None:
         everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
     )
     assert np.all(np.isfinite(inside.rgba))
-
-
-def test_panels_get_their_bar_and_legend_outside() -> None:
-    panels = Image(rgba=np.ones((90, 200, 4), dtype=np.float32))
-    effects = Effects(
-        colour_bar=True, legend=(LegendEntry(text="a long meaning of it", colour="red"),), box=True
-    )
-    whole = surrounded(panels, effects, colours=named_map("plasma"), quantity="speed [m/s]")
-    height, width = whole.rgba.shape[:2]
-    assert height > 90
-    assert width > 200
-    assert np.all(whole.rgba[:90, :200] == 1)
-    assert whole.rgba[:90, 200:, 3].max() == 1
-    assert whole.rgba[90:, :, 3].max() == 1
 
 
 def test_the_text_of_a_time() -> None:

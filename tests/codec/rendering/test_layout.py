@@ -12,7 +12,6 @@ from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import named_map
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.layout import (
-    SMALLEST,
     TITLE_GAP,
     Layout,
     end_texts,
@@ -36,22 +35,6 @@ def test_lines_are_no_longer_than_their_limit_and_hold_every_letter(limit: float
     assert all(length(line, 10) <= limit for line in lines)
     assert "".join(lines).replace(" ", "") == LONG.replace(" ", "")
     assert (len(lines) == 1) is (limit == 1000)
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "texts"),
-    [
-        (0.0, 10.0, ["0", "2", "4", "6", "8", "10"]),
-        (-1.0, 1.0, ["-1.0", "-0.5", "0.0", "0.5", "1.0"]),
-        (101325.001, 101325.0045, ["101325.001", "101325.002", "101325.003", "101325.004"]),
-        (0.0, 1e9, ["0", "2.0e+08", "4.0e+08", "6.0e+08", "8.0e+08", "1.0e+09"]),
-        (1e-9, 4e-9, ["1e-09", "2e-09", "3e-09", "4e-09"]),
-        (3.0, 3.0, ["3"]),
-        (0.0, 1.2, ["0.00", "0.25", "0.50", "0.75", "1.00"]),
-    ],
-)
-def test_ticks_are_round_and_told_apart(low: float, high: float, texts: list[str]) -> None:
-    assert [text for _, text in ticks(low, high, 5)] == texts
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-12, 1.0, 3e7, 1e300])
@@ -246,38 +229,6 @@ def test_nothing_covers_the_volume_or_is_cut(
     assert layout.time[3] <= top
 
 
-@pytest.mark.parametrize("kind", ["plain", "flat", "long"])
-@pytest.mark.parametrize("size", SIZES, ids=str)
-def test_no_scale_is_lost(kind: str, size: tuple[int, int]) -> None:
-    layout, _ = laid_out(kind, size, Effects(axes=True, colour_bar=True))
-    # Three axes of the longest names and numbers need more than a view of 90 pixels.
-    lost = 1 if (kind, size) == ("long", (256, 700)) else 0
-    assert len(layout.labels) >= (6 if kind == "flat" else 9) - lost
-    assert min(label.size for label in layout.labels) >= SMALLEST
-
-
-def test_without_overlays_the_view_is_the_picture() -> None:
-    for effects in (Effects(), Effects(box=True)):
-        layout, rays = laid_out("plain", (300, 200), effects)
-        assert layout.view == (0, 0, 300, 200)
-        assert rays.size == (300, 200)
-        assert (layout.labels, layout.bar, layout.time, layout.legend) == ((), None, None, None)
-
-
-def test_each_strip_takes_its_side() -> None:
-    entry = LegendEntry(text="a", colour="red")
-    bar, _ = laid_out("plain", (300, 200), Effects(colour_bar=True))
-    assert bar.view[:2] == (0, 0)
-    assert bar.view[2] < 300
-    assert bar.view[3] == 200
-    label, _ = laid_out("plain", (300, 200), Effects(time_label=True))
-    assert label.view[0::2] == (0, 300)
-    assert label.view[1] + label.view[3] == 200
-    legend, _ = laid_out("plain", (300, 200), Effects(legend=(entry,)))
-    assert legend.view[:3] == (0, 0, 300)
-    assert legend.view[3] < 200
-
-
 def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:
     layout, rays = laid_out("plain", (24, 20))
     assert rays.size == layout.view[2:]
@@ -287,13 +238,3 @@ def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:
 def test_names_of_quantities() -> None:
     assert quantity_of("speed", "m s-1") == "speed [m s-1]"
     assert quantity_of("share", "1") == quantity_of("share", "") == "share"
-
-
-def test_a_colour_bar_has_two_ticks_or_more() -> None:
-    axes = coords("plain")
-    scene = Scene(size=(256, 256), effects=Effects(colour_bar=True))
-    for low, high in ((271.0, 289.0), (0.6, 1.9), (-1.0, 1.0)):
-        colours = named_map("viridis").rescaled(low, high)
-        layout, _ = lay_out(scene, Grid.of(axes), axes, colours, "q")
-        assert layout.bar is not None
-        assert len(layout.bar.marks) >= 2

@@ -159,9 +159,7 @@ def test_surroundings_take_light_only_where_there_are_any() -> None:
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
     light = light_grid(
-        frame_of(values),
-        task_of(values.shape, table_of([0.0, 50.0])),
-        ambient_occlusion=settings,
+        frame_of(values), task_of(values.shape, table_of([0.0, 50.0])), ambient_occlusion=settings
     )
     around = light.shares[:, 10, 10, 1]
     assert np.all(light.shares[..., 0] == 1)

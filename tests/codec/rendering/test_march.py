@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from frame_field import by_stream, frame_of, streamed, table_of, waves
+from frame_field import by_stream, frame_of, table_of, waves
 from frame_field import task_of as plain_task
 
 from fhash_codec.rendering.cameras import Rays
@@ -317,28 +317,6 @@ def test_a_part_of_the_domain_is_sampled_where_the_whole_is(way: str) -> None:
     np.testing.assert_allclose(march(inner, task).rgba, full.rgba, atol=1e-4)
 
 
-@pytest.mark.parametrize("stride", [1, 2, 4])
-def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride: int) -> None:
-    n = np.arange(0, 40, stride)
-    z, y, x = np.meshgrid(n, n, n, indexing="ij")
-    values = (0.5 + 0.5 * np.sin((x + 2 * y - z) / 9)).astype(np.float32)[1:, :-2, 2:]
-    frame = Frame(values=values, first=(stride, 0, 2 * stride), stride=stride)
-    surfaces = (Surface(value=0.6, colour=WHITE, opacity=0.5),)
-    table, camera = table_of(np.linspace(0, 0.3, 100)), Camera(azimuth=10)
-    task = task_of(
-        (43, 43, 43),
-        table,
-        size=(50, 50),
-        camera=camera,
-        shaded=True,
-        surfaces=surfaces,
-        depth=True,
-    )
-    here, there = march(frame, task), streamed(frame, task)
-    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
-    np.testing.assert_allclose(there.depth, here.depth, atol=1e-3)
-
-
 def test_a_coarse_frame_covers_the_same_box(way: str) -> None:
     z, y, x = np.meshgrid(*(np.arange(22.0),) * 3, indexing="ij")
     values = ((x + y + z) / 66).astype(np.float32)
@@ -352,23 +330,6 @@ def test_a_coarse_frame_covers_the_same_box(way: str) -> None:
     )
     assert np.array_equal(fine.rgba[..., 3] > 0, covered.rgba[..., 3] > 0)
     np.testing.assert_allclose(covered.rgba, fine.rgba, atol=0.03)
-
-
-def test_shading_is_stable_where_the_gradient_vanishes(way: str) -> None:
-    values = np.full((12, 12, 12), 1000.0)
-    values += np.random.default_rng(1).uniform(-3e-5, 3e-5, values.shape)
-    table = table_of([0.3, 0.3], low=0.0, high=1000.0)
-    rgba = march(frame_of(values), task_of(values.shape, table, size=(16, 16), shaded=True)).rgba
-    np.testing.assert_allclose(rgba[..., :3], 0.2 * rgba[..., 3:] * np.ones(3), atol=0.15)
-
-
-def test_counters_show_that_nothing_is_done_unasked(way: str) -> None:
-    values = waves()
-    task = task_of(values.shape, table_of([0.1, 0.3]), size=(20, 20), depth=True)
-    counters = march(frame_of(values), task).counters
-    assert counters["gradients"] == counters["secondary_rays"] == counters["evaluations"] == 0
-    shaded = march(frame_of(values), replace(task, shaded=True)).counters
-    assert shaded["samples"] == counters["samples"] >= shaded["gradients"] > 0
 
 
 def test_threads_make_the_same_picture() -> None:
@@ -545,9 +506,7 @@ def test_a_clip_box_has_the_picture_of_its_region(way: str, shaded: bool) -> Non
     region = values[5:17, 3:13, 4:20]
     grid = Grid(counts=(16, 10, 12), origin=np.array([4.0, 3, 5]), spacing=np.ones(3))
     alone = replace(
-        grey_task(region.shape, **more),
-        rays=Rays.of(camera, grid, (40, 36)),
-        step=clipped.step,
+        grey_task(region.shape, **more), rays=Rays.of(camera, grid, (40, 36)), step=clipped.step
     )
     expected = marched(region, alone)
     assert expected.rgba[..., 3].max() > 0.5

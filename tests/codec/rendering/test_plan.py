@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from frame_field import by_stream
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Scene, Volume
-from fhash_codec.rendering.march_task import NUMPY, Units
+from fhash_codec.rendering.march_task import NUMPY
 from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_picture
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_formats.errors import FhashWarning, InputError, RegionError
@@ -60,23 +58,6 @@ def test_a_surface_beyond_the_values_is_told(volume: Volume) -> None:
             plan(volume, effects={"isosurfaces": [{"value": beyond}, {"value": high}]})
         assert len(told) == 1
     plan(volume, effects={"isosurfaces": [{"value": low}, {"value": high}]})  # and no warning
-
-
-def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
-    planned = plan(volume, effects={"shading": True, "shadows": True})
-    rays, spacing = planned.task.rays, planned.task.rays.grid.spacing
-    assert planned.lamp is not None
-    assert planned.lamp @ (rays.forward * spacing) < 0
-    assert planned.lamp @ (rays.up * spacing) > 0
-    assert planned.lamp @ (rays.right * spacing) < 0
-    assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
-
-
-def test_far_away_the_level_of_detail_is_coarse(volume: Volume) -> None:
-    assert plan(volume).lod == 0
-    assert plan(volume, size=[8, 8]).lod == 1
-    assert plan(volume, size=[4, 4]).lod == 2
-    assert plan(volume, size=[8, 8], march={"lod": 0}).lod == 0
 
 
 def test_a_network_has_no_levels_of_detail(files: dict[str, Path]) -> None:
@@ -160,35 +141,6 @@ def test_a_time_outside_is_refused(volume: Volume) -> None:
     assert plan(volume, time=1.5).step == 1.5
 
 
-@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> None:
-    field = 101325 + 1e-3 * np.random.default_rng(1).random((1, 6, 7, 8))
-    fhash_codec.encode(field, tmp_path / "wide.fhz", fhash_codec.EncodeConfig(effort=1))
-    with fhash_codec.open(tmp_path / "wide.fhz") as wide:
-        assert wide.dtype == np.float64
-        units = Units.of(wide)
-        marched = units.to(wide.read(0)).astype(np.float32)
-        assert np.abs(marched).max() <= 2
-        assert np.ptp(marched) > 0.5
-        table = plan(wide).task.table
-        assert table is not None
-        assert -2 <= table.low < table.high <= 2
-
-
-@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-def test_single_precision_with_a_large_offset_is_marched_without_it(tmp_path: Path) -> None:
-    z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
-    field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
-    fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
-    with fhash_codec.open(tmp_path / "far.fhz") as far:
-        assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
-        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("fhash_codec.rendering.march.march_native", by_stream)
-            other = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
-    np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
-
-
 def test_a_frame_that_is_too_large_is_refused_before_it_is_decoded(
     volume: Volume, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,30 +178,6 @@ def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Vo
         plan(volume, scale=[8e29, 2.4e29, 1e-30])
 
 
-def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
-    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
-    return path
-
-
-@pytest.mark.parametrize("axis", [1, 2, 3])
-def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
-    shape = [2, 9, 10, 11]
-    shape[axis] = 1
-    values = np.random.default_rng(0).random(shape).astype(np.float32)
-    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
-        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
-        assert not lit.task.shaded
-        assert not lit.lights
-        assert lit.function.opacity(0.5) == 1
-        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
-        # What the user says goes before.
-        given = plan(
-            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
-        )
-        assert given.function.opacity(0.5) == 0.25
-        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
-
-
 def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
     spec = {"range": [1, 6], "opacity": [[3, 0], [4, 1], [5, 0]]}
     for effect, low in ((None, 3.0), ("minimum_intensity", 1.0), ("average_intensity", 1.0)):
@@ -258,22 +186,6 @@ def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None
         table = plan_picture(volume, scene).task.table
         assert table is not None
         assert table.low == pytest.approx(low)
-
-
-def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
-    clip = {"z": [5, 7.5], "x": [9, 12]}
-    for effects in ({}, {"shadows": True}):
-        scene = Scene.from_dict({"effects": {"clip": clip, **effects}})
-        region = plan_picture(volume, scene).region
-        for (low, high), tile, ends in zip(
-            region, volume.chunks[1:], ((5, 8), (0, 23), (9, 12)), strict=True
-        ):
-            assert low == ends[0] // tile * tile
-            assert high >= ends[1] + 1
-            assert high - ends[1] <= tile
-        coarse = replace(scene, march=replace(scene.march, lod=2))
-        wide = plan_picture(volume, coarse).region
-        assert all(a <= c and d <= b for (a, b), (c, d) in zip(wide, region, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -387,3 +299,27 @@ def test_a_line_says_what_the_scene_asks_for(
 ) -> None:
     assert words in lines(volume, **scene)[topic]
     assert all("\n" not in line for line in lines(volume, **scene).values())
+
+
+def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
+    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
+    return path
+
+
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
+    shape = [2, 9, 10, 11]
+    shape[axis] = 1
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
+        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
+        assert not lit.task.shaded
+        assert not lit.lights
+        assert lit.function.opacity(0.5) == 1
+        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
+        # What the user says goes before.
+        given = plan(
+            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
+        )
+        assert given.function.opacity(0.5) == 0.25
+        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3

@@ -18,11 +18,11 @@ from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import render
 from fhash_codec.rendering import renderer as module
-from fhash_codec.rendering.march_task import COUNTERS, Units
+from fhash_codec.rendering.march_task import Units
 from fhash_codec.rendering.renderer import evolution
 from fhash_codec.rendering.scenes import Effects, Evolution, scene_in_png
 from fhash_codec.rendering.scenes import Scene as Scene_evolution
-from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.errors import InputError
 
 SMALL = Scene(size=(40, 32))
 
@@ -146,25 +146,6 @@ def test_a_forked_process_does_not_wait_for_what_its_parent_decodes(volume: Volu
     np.testing.assert_array_equal(renderer.render(scene(step=1)).rgba, expected)
 
 
-def test_a_failure_beside_is_that_of_its_own_picture(
-    volume: Volume, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = module.decoded_frame
-
-    def failing(volume: Volume, step: float, *others: Any) -> Any:
-        if step == 1:
-            raise DamagedFileError("step 1 is damaged")
-        return original(volume, step, *others)
-
-    monkeypatch.setattr(module, "decoded_frame", failing)
-    renderer = Renderer(volume)
-    assert renderer.render(scene(step=0), upcoming=scene(step=1)).rgba.any()
-    assert renderer.render(scene(step=2)).rgba.any()
-    renderer.render(scene(step=0), upcoming=scene(step=1))
-    with pytest.raises(DamagedFileError, match="step 1"):
-        renderer.render(scene(step=1))
-
-
 def test_what_does_not_fit_is_not_kept(volume: Volume, decoded: list[float]) -> None:
     frame = int(np.prod(volume.shape[1:])) * 4
     small = Renderer(volume, memory=frame + 10)
@@ -214,17 +195,6 @@ def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> No
         assert frame.first == tuple(low for low, _ in volume.box)
         image = fhash_codec.render(volume, scene(transfer_function={"opacity": "opaque"}))
         assert 0 < (image.rgba[..., 3] > 0.5).mean() < 0.5
-
-
-def test_counters_prove_the_plan(renderer: Renderer) -> None:
-    plain = renderer.render(scene()).counters
-    assert list(plain) == list(COUNTERS)
-    assert plain["gradients"] == plain["secondary_rays"] == plain["evaluations"] == 0
-    assert plain["samples"] > 0
-    shaded = renderer.render(scene(effects={"shading": True})).counters
-    assert {**shaded, "gradients": 0} == plain
-    assert 0 < shaded["gradients"] <= shaded["samples"]
-    assert renderer.render(scene(effects={"box": True})).counters == plain
 
 
 def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None:

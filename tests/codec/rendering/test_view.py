@@ -54,18 +54,6 @@ def test_planes_are_those_of_the_series() -> None:
     np.testing.assert_array_equal(by_point.holds(places), inside & within)
 
 
-def test_the_extent_is_that_of_the_corners_behind_planes() -> None:
-    grid = Grid(counts=(11, 11, 11), origin=np.zeros(3), spacing=np.ones(3))
-    body = body_of(grid, planes=[{"normal": [-1, -1, -1], "offset": -4}])
-    np.testing.assert_allclose(body.extent, [[0, 4]] * 3, atol=1e-12)
-    assert {tuple(corner) for corner in np.round(body.corners, 9) + 0.0} == {
-        (0, 0, 0),
-        (4, 0, 0),
-        (0, 4, 0),
-        (0, 0, 4),
-    }
-
-
 def test_an_axis_of_one_vertex_is_kept_whole() -> None:
     grid = Grid(counts=(5, 5, 1), origin=np.array([0.0, 0, 7]), spacing=np.ones(3))
     assert body_of(grid, z=[6.9, 7.1]).bounds[2].tolist() == [-0.5, 0.5]

@@ -95,18 +95,6 @@ def test_a_scene_without_a_paper_shape_says_which_have_one() -> None:
         scene_of("vortex").as_in_paper()
 
 
-def test_resizing_changes_shape_and_steps_alone_and_checks_them() -> None:
-    scene = scene_of("front")
-    assert scene.resized() == scene
-    assert scene.resized((1, 2, 3), 4).to_dict() == {
-        **scene.to_dict(),
-        "shape": [1, 2, 3],
-        "steps": 4,
-    }
-    with pytest.raises(InputError, match="shape is 0"):
-        scene.resized((0, 2, 3))
-
-
 def test_the_document_has_every_setting_of_a_scene() -> None:
     text = DOCUMENT.read_text(encoding="utf-8").partition("## Settings of a scene")[2]
     rows = re.findall(

@@ -15,7 +15,6 @@ from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
 from fhash_codec.simulation.simulate import (
     MAX_SEED,
     Simulation,
-    blocks,
     counts,
     reasons,
     simulate,
@@ -101,21 +100,6 @@ def test_an_effect_of_strength_0_changes_no_bit_and_is_not_computed(kind: str) -
     assert set(with_it.counters.evaluations) == {1, 2, 3, 4}
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if EFFECTS[kind].role != "body"])
-def test_a_weak_effect_changes_little_and_a_strong_one_much(kind: str) -> None:
-    def last(strength: float) -> np.ndarray:
-        effect = {"effect": kind, "strength": strength}
-        if kind == "rotation":  # about a middle that is not the blob's
-            effect["centre"] = (0.5, 0.3, 0.3)
-        return simulate({"effects": [BLOB, effect]}, SHAPE).read(3)
-
-    still = simulate({"effects": [BLOB]}, SHAPE).read(3)
-    weak, strong = (np.abs(last(strength) - still).max() for strength in (1e-3, 0.5))
-    # The widths of surfaces at rest and in motion are reckoned in two ways that nearly agree.
-    assert weak < 0.1
-    assert strong > max(2 * weak, 0.02)
-
-
 def test_threads_and_order_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "BLOCK_VERTICES", 64)
     frames = {}
@@ -134,16 +118,6 @@ def test_blocks_leave_no_seams(name: str, monkeypatch: pytest.MonkeyPatch) -> No
     whole = simulate(name, (3, 10, 12, 11)).read(2)
     monkeypatch.setattr(module, "BLOCK_VERTICES", 30)
     np.testing.assert_allclose(simulate(name, (3, 10, 12, 11)).read(2), whole, atol=2e-5)
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 70000, 2), (5, 7, 40000), (300, 20, 30)])
-def test_blocks_cover_every_vertex_once_and_are_small(shape: tuple[int, int, int]) -> None:
-    covered = np.zeros(shape, dtype=np.int8)
-    for block in blocks(shape):
-        part = covered[block]
-        assert 0 < part.size <= module.BLOCK_VERTICES
-        part += 1
-    assert (covered == 1).all()
 
 
 def test_flows_in_turn_come_near_the_exact_motion_with_more_splits() -> None:
@@ -216,9 +190,6 @@ def test_a_frame_that_no_memory_holds_is_refused() -> None:
     assert simulate("front", (1, 16384, 16384, 8)).shape[1] == 16384
 
 
-BLOB_TERMS = {"effect": "blob"}
-
-
 def made(monkeypatch: pytest.MonkeyPatch, *effects: dict[str, Any]) -> list[str]:
     """Kinds of the effects whose terms are made, in order."""
     kinds: list[str] = []
@@ -232,14 +203,6 @@ def made(monkeypatch: pytest.MonkeyPatch, *effects: dict[str, Any]) -> list[str]
         monkeypatch.setattr(effect, "term", term)
     terms_of(SimulatedScene(effects=effects), 0)  # type: ignore[arg-type]
     return kinds
-
-
-@pytest.mark.parametrize("kind", EFFECTS)
-def test_an_effect_that_is_not_named_or_has_no_strength_is_never_made(
-    monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
-    assert made(monkeypatch, BLOB_TERMS) == ["blob"]
-    assert made(monkeypatch, BLOB_TERMS, {"effect": kind, "strength": 0}) == ["blob"]
 
 
 EFFECTS_HERE = [

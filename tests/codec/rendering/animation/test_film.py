@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image as Pictures
 
 from fhash_codec import EncodeConfig, Renderer, Volume, encode_dataset
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering import film as film_module
-from fhash_codec.rendering.film import Animated, Target, film, numbered, rendered_by_workers
+from fhash_codec.rendering.film import Animated, Target, film, rendered_by_workers
 from fhash_codec.rendering.image import Draw, Image
 from fhash_codec.rendering.scenes import Effects, Scene, TransferFunctionSpec, scene_in_png
 from fhash_codec.rendering.timeline import Animation
@@ -98,18 +97,6 @@ def test_a_film_of_kept_pictures_is_the_same(volume: Volume, tmp_path: Path, dra
     np.testing.assert_array_equal(
         read_film(tmp_path / "a.mp4", (20, 14)), read_film(tmp_path / "b.mp4", (20, 14))
     )
-
-
-def test_a_gif_shows_the_pictures_in_order(volume: Volume, tmp_path: Path, drawing: Any) -> None:
-    animation = dataclasses.replace(Animation.parse("steps", volume), fps=10.0)
-    animate(volume, SMALL, animation, tmp_path / "a.gif", draw=drawing())
-    with Pictures.open(tmp_path / "a.gif") as picture:
-        assert (picture.n_frames, picture.info["duration"], picture.info["loop"]) == (5, 100, 0)
-        for number in range(5):
-            picture.seek(number)
-            np.testing.assert_allclose(
-                np.asarray(picture.convert("RGB"))[0, 0, 0], 25.5 * number, atol=2
-            )
 
 
 def test_an_interrupted_film_leaves_nothing(volume: Volume, tmp_path: Path, drawing: Any) -> None:
@@ -203,18 +190,6 @@ def test_a_process_that_ends_by_itself_is_an_error(volume: Volume) -> None:
     with pytest.raises(FhashError, match="ended by itself"):
         list(rendered)
     assert not multiprocessing.active_children()
-
-
-def test_pictures_are_numbered_and_hold_their_scene(
-    volume: Volume, tmp_path: Path, drawing: Any
-) -> None:
-    draw = drawing()
-    done = animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / "a.png", draw=draw)
-    assert [path.name for path in done.paths] == [f"a.000{number}.png" for number in range(5)]
-    assert (done.rendered, done.kept, done.counters) == (5, 0, {"rays": 5 * 280})
-    assert [scene_in_png(path) for path in done.paths] == draw.scenes
-    assert draw.upcoming == [*draw.scenes[1:], None]
-    assert [path.name for path in numbered(Path("b.png"), 10_001)][-1] == "b.10000.png"
 
 
 @pytest.mark.parametrize("spoil", ["cut", "scene", "another volume"])

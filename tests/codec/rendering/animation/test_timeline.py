@@ -11,7 +11,7 @@ import pytest
 
 from fhash_codec import Volume
 from fhash_codec.rendering.scenes import Camera, Effects, Isosurface, Scene, TransferFunctionSpec
-from fhash_codec.rendering.timeline import Animation, Key, Timeline, mixed
+from fhash_codec.rendering.timeline import Animation, Key, mixed
 from fhash_formats.errors import InputError, RegionError
 
 
@@ -52,38 +52,6 @@ def test_keys_are_met_and_their_settings_mixed(volume: Volume) -> None:
     np.testing.assert_allclose(scenes[2].transfer_function.opacity, [[0.25, 0.2], [2.0, 0.4]])
     assert [scene.effects.shadows is None for scene in scenes] == [True] * 8 + [False]
     assert scenes[4].transfer_function == keys[1].transfer_function
-
-
-def test_keys_outside_the_series_are_refused_even_where_other_times_are_given(
-    volume: Volume,
-) -> None:
-    with pytest.raises(RegionError):
-        Timeline([(0.0, Scene(step=9.0))], volume, scale=None, steps=(0, 1))
-
-
-def test_steps_pass_evenly_and_once(volume: Volume) -> None:
-    animation = Animation.parse("steps", volume)
-    scenes = animation.scenes(SMALL, volume)
-    assert [scene.step for scene in scenes] == [0, 1, 2, 3, 4]
-    assert {scene.camera for scene in scenes} == {SMALL.camera}
-    assert animation.rate == 8
-    between = Animation.parse("steps=4:1", volume)
-    assert [
-        scene.step for scene in dataclasses.replace(between, frames=7).scenes(SMALL, volume)
-    ] == [4, 3.5, 3, 2.5, 2, 1.5, 1]
-
-
-def test_times_pass_evenly(volume: Volume) -> None:
-    scenes = dataclasses.replace(Animation.parse("time=0:8", volume), frames=5).scenes(
-        dataclasses.replace(SMALL, step=3.0), volume
-    )
-    assert [(scene.step, scene.time) for scene in scenes] == [
-        (None, 0),
-        (None, 2),
-        (None, 4),
-        (None, 6),
-        (None, 8),
-    ]
 
 
 def test_times_may_be_dates(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:

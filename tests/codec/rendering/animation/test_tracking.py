@@ -10,9 +10,7 @@ from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Isosurface, Scene
 from fhash_codec.rendering.tracking import COLOURS, Tracked, follow, parse_tracked, tracking_scene
 from fhash_codec.rendering.transfer_function import TransferFunction
-from fhash_formats.errors import (
-    InputError,
-)
+from fhash_formats.errors import InputError
 
 SMALL = Scene(size=(20, 14))
 

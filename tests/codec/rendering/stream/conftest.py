@@ -64,11 +64,7 @@ def planned() -> Callable[[Volume, dict[str, Any], Arrays], tuple[Field, Task]]:
         frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
         if plan.lights:
             light = light_grid(
-                frame,
-                task,
-                shadows=plan.shadows,
-                lamp=plan.lamp,
-                ambient_occlusion=plan.occlusion,
+                frame, task, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion
             )
             task = replace(task, light=light)
         return FrameField(frame, grid, arrays), task

@@ -47,14 +47,6 @@ def test_a_field_of_a_network_has_the_values_and_slopes_of_its_volume(
         np.testing.assert_allclose(field.slopes(places), slopes[:, :0:-1], rtol=1e-4, atol=1e-5)
 
 
-def test_only_vertices_of_weight_need_a_value(frame_task: FrameTask) -> None:
-    values = np.arange(27.0).reshape(3, 3, 3)
-    values[:, :, 1] = np.nan
-    field, _ = frame_task(values)
-    places = np.array([[0, 1, 1], [2, 1, 1], [2, 0.5, 1.5], [0.5, 0, 0], [1.5, 1, 1]], dtype=float)
-    np.testing.assert_array_equal(field.values(places), [12, 14, 17, np.nan, np.nan])
-
-
 def test_central_differences_reach_one_vertex_to_both_sides(frame_task: FrameTask) -> None:
     z, y, x = np.meshgrid(*map(np.arange, (9.0, 7.0, 8.0)), indexing="ij")
     values = 0.3 * x**2 - 2 * y + x * z
@@ -166,14 +158,6 @@ def test_fused_kernels_are_taken_where_they_can_be_had(
     assert isinstance(inference_in(tensors, network, 0.6), HostInference)
     assert isinstance(inference_in(NUMPY, network, 0.6), HostInference)
     assert asked == 2 * [(network, 0.6, tensors.device)]
-
-
-def test_tensors_get_the_bits_of_arrays(network: Network, tensors: Arrays) -> None:
-    places = places_in(SIZE)
-    here, there = (HostInference(network, 0.6, arrays) for arrays in (NUMPY, tensors))
-    at = tensors.array(places)
-    np.testing.assert_array_equal(tensors.host(there.values(at)), here.values(places))
-    np.testing.assert_array_equal(tensors.host(there.slopes(at)), here.slopes(places))
 
 
 X = np.array([0, 1, 2, 4, 8, 16, 17, 18, 19, 20.0])

@@ -94,20 +94,6 @@ def test_events_are_joined_front_to_back_however_they_are_split(
     assert np.isinf(canvas.depth[9])
 
 
-def test_central_shading_differs_from_that_of_cells_and_keeps_the_normals(
-    volume: Volume, planned: Planned, central_scene: dict[str, Any]
-) -> None:
-    effects = {**central_scene["effects"], "shading": {"light": [1, 2, 3]}}
-    cells, central = (
-        stream(*planned(volume, scene, NUMPY), adaptive=True)
-        for scene in ({**central_scene, "effects": effects}, central_scene)
-    )
-    assert 1e-3 < np.abs(cells.rgba - central.rgba)[..., :3].max() < 0.3
-    np.testing.assert_array_equal(cells.rgba[..., 3], central.rgba[..., 3])
-    np.testing.assert_array_equal(cells.normal, central.normal)
-    assert cells.counters == central.counters
-
-
 FramePicture = Callable[[str, dict[str, Any]], Marched]
 
 
@@ -156,13 +142,6 @@ def test_adaptive_marching_takes_at_most_half_the_passes(frame_picture: FramePic
     assert adaptive.counters["passes"] <= streamed.counters["passes"] / 2
     assert large.counters["passes"] < adaptive.counters["passes"]
     np.testing.assert_array_equal(large.rgba, streamed.rgba)
-
-
-def test_a_small_budget_is_plain_streaming(frame_picture: FramePicture) -> None:
-    streamed, adaptive = (
-        frame_picture(mode, {"march": {"samples_per_pass": 1}}) for mode in ("stream", "arm")
-    )
-    assert streamed.counters == adaptive.counters
 
 
 @pytest.mark.parametrize("mode", ["stream", "arm"])
@@ -221,15 +200,6 @@ def test_both_ways_make_the_same_picture_of_a_network(files: dict[str, Path], st
     np.testing.assert_array_equal(streamed.rgba, adaptive.rgba)
 
 
-def test_a_network_is_evaluated_at_every_sample(files: dict[str, Path]) -> None:
-    with fhash_codec.open(files["paper"]) as network:
-        cache, streamed = (
-            picture(Renderer(network), mode, NETWORK).counters for mode in ("cache", "stream")
-        )
-    assert cache["evaluations"] == 0
-    assert 0 < streamed["evaluations"] <= streamed["samples"]
-
-
 @pytest.mark.parametrize("step", [0.0, 0.7])
 def test_the_picture_of_a_network_is_near_that_of_its_vertices(
     files: dict[str, Path], step: float
@@ -242,21 +212,6 @@ def test_the_picture_of_a_network_is_near_that_of_its_vertices(
     assert np.isfinite(streamed).all()
     # Between vertices the network has values of its own: they make all the difference.
     assert np.mean(np.abs(streamed - cache)) < 0.02
-
-
-@pytest.mark.parametrize("budget", [1, 10**6])
-@pytest.mark.parametrize("value", [0.381, 0.395, 0.405, 0.81, 0.795, 0.99])
-@pytest.mark.parametrize(("count", "step"), [(11, 0.5), (10, 3.9)])
-def test_a_surface_is_seen_between_places_of_which_one_is_in_a_brick_without(
-    frame_task: FrameTask, value: float, count: int, step: float, budget: int
-) -> None:
-    ramp = np.broadcast_to(np.linspace(0, 1, count)[:, None, None], (count, 7, 7))
-    field, task = frame_task(
-        ramp, step=step, surfaces=(Surface(value=value, colour=np.ones(3), opacity=0.5),)
-    )
-    for skipping in (True, False):
-        found = stream(field, replace(task, skipping=skipping), adaptive=True, budget=budget)
-        np.testing.assert_allclose(found.rgba, 0.5, atol=1e-6)
 
 
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:
@@ -274,11 +229,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
 
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
-    planned: Planned,
-    volume: Volume,
-    tensors: Arrays,
-    scene: dict[str, Any],
-    adaptive: bool,
+    planned: Planned, volume: Volume, tensors: Arrays, scene: dict[str, Any], adaptive: bool
 ) -> None:
     here, there = (
         stream(*planned(volume, scene, arrays), adaptive=adaptive, budget=3000)
@@ -334,10 +285,7 @@ def test_nothing_leaves_the_device_before_the_picture(
 
 
 def test_torch_marches_through_a_network_as_numpy_does(
-    planned: Planned,
-    files: dict[str, Path],
-    tensors: Arrays,
-    network_scene: dict[str, Any],
+    planned: Planned, files: dict[str, Path], tensors: Arrays, network_scene: dict[str, Any]
 ) -> None:
     with fhash_codec.open(files["paper"]) as network:
         here, there = (

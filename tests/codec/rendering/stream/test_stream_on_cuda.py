@@ -135,11 +135,7 @@ def test_a_pass_through_fused_kernels_waits_little(
     ],
 )
 def test_an_array_of_the_host_in_a_pass_is_seen(
-    planned: Planned,
-    files: dict[str, Path],
-    monkeypatch: pytest.MonkeyPatch,
-    cls: Any,
-    name: str,
+    planned: Planned, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch, cls: Any, name: str
 ) -> None:
     """Planted faults: one array of a march stays on the host."""
     plain = cls.__init__
