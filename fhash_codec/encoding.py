@@ -27,9 +27,9 @@ from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, recording, silent, skip, stage
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats import list_variables, open_series
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
+from fhash_formats.readers import list_variables, open_series
 from fhash_formats.readers.common.listing import Listed
 from fhash_formats.series import Series, shown_name
 from fhash_formats.support.files import check_output
@@ -55,7 +55,7 @@ def encode(
 ) -> dict[str, Any]:
     """Encode a series into the container `path`, complete or not at all.
 
-    source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or
+    source: a file (opened by `fhash_formats.readers.open_series`), a Series, or an array (t, z, y, x) or
         (z, y, x), labelled or not.
     config: the settings; the defaults if None.
     mask: booleans (t, z, y, x) or (z, y, x), one more feature. It is the only feature if the

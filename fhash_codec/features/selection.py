@@ -27,8 +27,8 @@ from fhash_codec.features.key_frames import select_key_frames, time_axis
 from fhash_codec.features.scan import Scan, scan
 from fhash_codec.measure.value_range import Ranks
 from fhash_codec.progress import Progress, stage
-from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import note_packing, packing, settled
 from fhash_formats.readers.common.file_series import Request, condense
 from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
@@ -463,7 +463,7 @@ Dataset of xarray with one variable that can be encoded."""
 def open_source(source: Source) -> Iterator[Series]:
     """The series of a source.
 
-    A file is opened by `fhash_formats.open_series`, and closed at the end of the context. A Series
+    A file is opened by `fhash_formats.readers.open_series`, and closed at the end of the context. A Series
     is taken as it is.
     """
     if isinstance(source, str | Path):

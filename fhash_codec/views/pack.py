@@ -23,7 +23,6 @@ from fhash_codec.features.scan import Scan, scan_piece
 from fhash_codec.header import PACKED, check_name, describe_source, write_missing, write_series
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces
 from fhash_codec.progress import Progress, silent
-from fhash_formats import list_variables
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import (
     SINGLE_SHARD_CHUNKS,
@@ -34,6 +33,7 @@ from fhash_formats.container.array import (
 )
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import DamagedFileError, FhashWarning, InputError, MissingInputError
+from fhash_formats.readers import list_variables
 from fhash_formats.readers.common.file_series import FileSeries, Request, selection
 from fhash_formats.readers.zarr_coded import CodedArray, coded_names, open_coded
 from fhash_formats.support.files import check_output

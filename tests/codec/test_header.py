@@ -21,8 +21,8 @@ from fhash_codec.header import (
     read_steps,
     write_steps,
 )
-from fhash_formats import open_series
 from fhash_formats.container import ContainerWriter
+from fhash_formats.readers import open_series
 
 
 @pytest.mark.parametrize("name", ["run.h5", "RUN.NC", "a.b.vti", "run.zarr"])

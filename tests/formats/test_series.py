@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import zarr
 
-from fhash_formats import open_mask, open_series
 from fhash_formats.errors import InputError, RegionError
+from fhash_formats.readers import open_mask, open_series
 from fhash_formats.series import (
     ArraySeries,
     Coordinate,

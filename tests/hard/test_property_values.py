@@ -17,9 +17,10 @@ from properties import INTEGERS, NUMBERS, Draw, arrays, chunks, looking, same
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume
-from fhash_formats import RawLayout, Region, open_series, save_region
 from fhash_formats.errors import InputError
+from fhash_formats.readers import RawLayout, open_series
 from fhash_formats.series import AXES, Coordinate
+from fhash_formats.writers import Region, save_region
 
 ORDERS = st.permutations(AXES)
 

@@ -80,7 +80,7 @@ def _shape(text: str) -> dict[str, int]:
         ):
             raise ValueError
         return dict(zip("zyx", map(int, words), strict=True))
-    from fhash_formats import parse_shape
+    from fhash_formats.readers import parse_shape
 
     shape = parse_shape(text)
     if not set("zyx") <= set(shape):
@@ -188,8 +188,8 @@ def write_series(
     Returns the paths written, and seconds. Raises InputError for an output that cannot be, and
     OutputError for a disk with too little room.
     """
-    from fhash_formats import Region, save_region
     from fhash_formats.support.files import check_space
+    from fhash_formats.writers import Region, save_region
 
     check_writable(path, force, region=True, sources=_sources(chosen))
     check_space(path, raw_bytes(simulation) + OVERHEAD_BYTES)
@@ -357,7 +357,7 @@ def _demonstrate(
     from fhash_codec.config import EncodeConfig
     from fhash_codec.features.features import parse_feature
     from fhash_codec.volume import open as open_volume
-    from fhash_formats import open_series
+    from fhash_formats.readers import open_series
     from fhash_formats.support.files import replacing
 
     data, run, picture = (folder / f"{chosen.name}.{suffix}" for suffix in ("h5", "fhz", "png"))
@@ -449,8 +449,8 @@ def make_gallery(
     Raises InputError for a folder that cannot be, and for files that exist, unless `force`.
     """
     from fhash_codec.gallery import GALLERY_SERIES, PICTURES, page
-    from fhash_formats import Region, save_region
     from fhash_formats.support.files import replacing
+    from fhash_formats.writers import Region, save_region
 
     data, text = folder / "series", folder.with_name(f"{folder.name}.md")
     try:

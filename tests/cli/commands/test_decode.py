@@ -17,8 +17,8 @@ import fhash_codec
 from fhash_cli.commands.decode import RegionOptions, Selection, Statistics, convert
 from fhash_codec import EncodeConfig
 from fhash_codec.progress import silent
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import open_series
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
 from fhash_codec.appending.parts import Part, encode_part, merge
 from fhash_codec.appending.series_plan import SeriesPlan, plan_parts
 from fhash_codec.appending.writer import append
-from fhash_formats import open_series
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.errors import OutputExistsError
+from fhash_formats.readers import open_series
 from fhash_formats.series import ArraySeries
 
 SHAPE = (7, 4, 6, 8)

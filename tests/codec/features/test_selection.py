@@ -27,8 +27,8 @@ from fhash_codec.features.selection import (
     select_features,
 )
 from fhash_codec.progress import silent
-from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers import open_series
 from fhash_formats.series import ArraySeries, Coordinate
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fhash_formats import open_series
+from fhash_formats.readers import open_series
 from fhash_formats.series import Coordinate
 from fhash_formats.writers import Region, save_region
 

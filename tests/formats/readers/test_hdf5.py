@@ -16,8 +16,8 @@ import pytest
 import xarray as xr
 from stored_series import VALUES, assert_frames, write_hdf5
 
-from fhash_formats import list_variables, open_series
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+from fhash_formats.readers import list_variables, open_series
 from fhash_formats.readers.hdf5 import openpmd_axes
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.images import (
     directions_of,
     dtype_of,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fhash_formats import RawLayout, open_series
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
+from fhash_formats.readers import RawLayout, open_series
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.joined import JoinedSeries, natural_order
 

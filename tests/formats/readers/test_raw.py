@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from stored_series import VALUES, assert_frames, frames
 
-from fhash_formats import RawLayout, list_variables, open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import RawLayout, list_variables, open_series
 from fhash_formats.readers.common.file_series import DTYPES
 
 

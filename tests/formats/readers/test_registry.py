@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import zarr
 
-import fhash_formats
-from fhash_formats import RawLayout, open_mask, open_series
 from fhash_formats.container.zip_file import ending
 from fhash_formats.errors import FhashError, InputError, MissingInputError, RegionError
-from fhash_formats.readers import REGISTRY
+from fhash_formats.readers import REGISTRY, RawLayout, list_variables, open_mask, open_series
 
 MASK = np.random.default_rng(0).random((4, 3, 5, 6)) < 0.4
 
@@ -311,13 +309,13 @@ def test_every_array_of_a_file_is_listed(tmp_path: Path) -> None:
         root.attrs["WholeExtent"] = [0, 3, 0, 2, 0, 1]
         root.attrs["Origin"], root.attrs["Spacing"] = [0.0, 0, 0], [1.0, 1, 1]
         root["PointData/u"], root["PointData/n"] = VALUES[0], VALUES[0].astype("i2")
-    found = fhash_formats.list_variables(tmp_path / "a.vtkhdf", missing=[7])
+    found = list_variables(tmp_path / "a.vtkhdf", missing=[7])
     assert [(one.name, one.dtype, one.missing) for one in found] == [
         ("n", "int16", (7,)),
         ("u", "float32", (7,)),
     ]
     assert found[0].options == (("--var", "n", "--missing", "7"),)
-    (one,) = fhash_formats.list_variables(tmp_path / "a.vtkhdf", var="u")
+    (one,) = list_variables(tmp_path / "a.vtkhdf", var="u")
     assert one.name == "u"
 
 
@@ -340,7 +338,7 @@ def test_wishes_that_a_format_has_no_use_for_are_refused(
         ({"select": {"a": 1}}, "--select a=1"),
     ]
     for wish, message in wishes:
-        for use in (open_series, fhash_formats.list_variables):
+        for use in (open_series, list_variables):
             if use is open_series or suffix != "npy" or "select" not in wish:
                 with pytest.raises(InputError, match=message):
                     use(path_registry, **wish)

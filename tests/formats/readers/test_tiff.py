@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import open_series
 
 tifffile = pytest.importorskip("tifffile")
 

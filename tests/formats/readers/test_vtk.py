@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import vtk_files
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common.variables import SeveralVariablesError
 from fhash_formats.series import Coordinate
 from fhash_formats.writers import Region, save_region

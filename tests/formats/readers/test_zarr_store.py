@@ -16,8 +16,8 @@ import xarray as xr
 import zarr
 from stored_series import VALUES, assert_frames, create_zarr, frames, zipped
 
-from fhash_formats import list_variables, open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers import list_variables, open_series
 
 
 def dataset() -> xr.Dataset:

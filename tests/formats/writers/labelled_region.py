@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fhash_formats import Region
 from fhash_formats.series import Coordinate
+from fhash_formats.writers import Region
 
 SHAPE = (3, 4, 5, 6)
 

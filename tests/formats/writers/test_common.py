@@ -14,10 +14,10 @@ import pytest
 import xarray as xr
 from labelled_region import COORDS, DATA, labelled_region
 
-from fhash_formats import Region as Region_outline
-from fhash_formats import save_region
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
+from fhash_formats.writers import Region as Region_outline
+from fhash_formats.writers import save_region
 from fhash_formats.writers.common import (
     CHUNK_BYTES,
     HeldFile,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from labelled_region import COORDS, DATA, SHAPE, labelled_region
 
-from fhash_formats import save_region
+from fhash_formats.writers import save_region
 
 
 def test_hdf5_has_scales_and_attributes(tmp_path: Path) -> None:

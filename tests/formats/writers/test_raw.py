@@ -10,9 +10,10 @@ import pytest
 from labelled_region import DATA as DATA_NPY
 from labelled_region import labelled_region
 
-from fhash_formats import Region, open_series, save_region
 from fhash_formats.errors import InputError, OutputExistsError
+from fhash_formats.readers import open_series
 from fhash_formats.series import Coordinate
+from fhash_formats.writers import Region, save_region
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "i2"])

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from read_back import READ
 
-from fhash_formats import Region, save_check, save_region
 from fhash_formats.errors import (
     FhashError,
     InputError,
@@ -25,6 +24,7 @@ from fhash_formats.errors import (
     OutputExistsError,
 )
 from fhash_formats.series import Coordinate
+from fhash_formats.writers import Region, save_check, save_region
 from fhash_formats.writers.registry import WRITERS
 
 SUFFIXES = [suffix for writer in WRITERS for suffix in writer.suffixes]
@@ -249,7 +249,7 @@ def test_a_full_disk_leaves_what_was_there(
 FULL = """
 import json, resource, sys
 import numpy as np
-from fhash_formats import Region, save_region
+from fhash_formats.writers import Region, save_region
 from fhash_formats.errors import FhashError
 from fhash_formats.series import Coordinate
 

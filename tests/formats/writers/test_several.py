@@ -12,9 +12,9 @@ import pytest
 import xarray
 from labelled_region import COORDS, SHAPE, labelled_region
 
-from fhash_formats import Region, save_check, save_region, save_regions
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
+from fhash_formats.writers import Region, save_check, save_region, save_regions
 
 RNG = np.random.default_rng(5)
 VALUES = {

@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
-from fhash_formats import Region, save_check, save_region
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
 from fhash_formats.series import Coordinate
+from fhash_formats.writers import Region, save_check, save_region
 from fhash_formats.writers.vtk import Mesh, check_mesh_output, save_mesh
 
 MESH = Mesh(

@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 from stored_series import VALUES, create_zarr, frames, save_netcdf, write_hdf5
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import join_times, packing
 from fhash_formats.series import Coordinate
 

@@ -15,8 +15,8 @@ import xarray as xr
 import zarr
 from stored_series import VALUES
 
-from fhash_formats import RawLayout, open_series, parse_shape
 from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.readers import RawLayout, open_series, parse_shape
 from fhash_formats.readers.common.file_series import (
     DTYPES,
     LONGEST_MESSAGE,

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stored_series import VALUES
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common import stored_bytes
 from fhash_formats.readers.common import stored_bytes as flat
 from fhash_formats.readers.common.stored_bytes import (

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 import zarr
 
-from fhash_formats import open_series
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import Column, counts_steps, real_time
 
 VALUES = np.random.default_rng(0).normal(size=(4, 2, 3, 5)).astype("f4")

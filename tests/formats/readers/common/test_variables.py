@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from stored_series import VALUES, assert_frames, write_hdf5
 
-from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import packing
 from fhash_formats.readers.common.file_series import RawLayout, Request
 from fhash_formats.readers.common.layout import Dimension
