@@ -55,7 +55,7 @@ def encode(
 ) -> dict[str, Any]:
     """Encode a series into the container `path`, complete or not at all.
 
-    source: a file (opened by `fhash_formats.readers.open_series`), a Series, or an array (t, z, y, x) or
+    source: a file (opened by `open_series` of `readers`), a Series, or an array (t, z, y, x) or
         (z, y, x), labelled or not.
     config: the settings; the defaults if None.
     mask: booleans (t, z, y, x) or (z, y, x), one more feature. It is the only feature if the

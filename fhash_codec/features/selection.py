@@ -463,7 +463,7 @@ Dataset of xarray with one variable that can be encoded."""
 def open_source(source: Source) -> Iterator[Series]:
     """The series of a source.
 
-    A file is opened by `fhash_formats.readers.open_series`, and closed at the end of the context. A Series
+    A file is opened by `open_series`, and closed at the end of the context. A Series
     is taken as it is.
     """
     if isinstance(source, str | Path):
