@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fhash_codec.cost.panels import Axis, Panel, panels
-from fhash_codec.cost.results import CostReport, Encoded, bytes_text, told
+from fhash_codec.cost.results import CostReport, Encoded, Picture, bytes_text, told
 from fhash_codec.cost.uses import NOTHING
 from fhash_codec.rendering.march_task import COUNTERS
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
@@ -37,150 +37,100 @@ class Table:
 
 def tables(report: CostReport) -> list[Table]:
     """Every table that has rows."""
-    made = [
-        _advice(report),
-        _encodings(report),
-        _stages(report),
-        _gains(report),
-        _reads(report),
-        _pictures(report),
-        _left_out(report),
-    ]
-    return [table for table in made if table.rows]
-
-
-def _advice(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Recommendation: the best of what was measured",
-        header=("for dB", "aim", "encoding", "options", "seconds", "bytes", "reached dB"),
-        rows=tuple(
-            (
-                f"{entry.psnr:g}",
-                entry.aim,
-                entry.name,
-                entry.options,
-                f"{entry.seconds:.3g}",
-                f"{entry.bytes}",
-                _number(entry.reached, ".2f", "exact"),
-            )
-            for entry in report.advice
-        ),
-    )
-
-
-def _encodings(report: CostReport) -> Table:
     units = f" {report.units}" if report.units not in ("", "1") else ""
-    return Table(
-        section="encode",
-        title="Encodings",
-        header=(
-            "encoding", "seconds", "predicted s", "bytes", "predicted bytes", "ratio", "PSNR dB",
-            "predicted dB", "PSNR bulk dB", f"largest error{units}", "options",
+    made = (
+        (
+            "encode",
+            "Recommendation: the best of what was measured",
+            ("for dB", "aim", "encoding", "options", "seconds", "bytes", "reached dB"),
+            [
+                (f"{advice.psnr:g}", advice.aim, advice.name, advice.options,
+                 f"{advice.seconds:.3g}", f"{advice.bytes}",
+                 _number(advice.reached, ".2f", "exact"))
+                for advice in report.advice
+            ],
         ),
-        rows=tuple(
-            (
-                point.name + (" (misses its promise)" if point.missed else ""),
-                _number(point.seconds, ".3g"),
-                _number(point.predicted_seconds, ".3g"),
-                _number(point.bytes, "d"),
-                _number(point.predicted_bytes, "d"),
-                _number(point.ratio, ".4g"),
-                _psnr(point),
-                _number(point.predicted_psnr, ".2f"),
-                _number(point.psnr_bulk, ".2f"),
-                _number(point.max_abs_error, ".4g"),
-                point.options,
-            )
-            for point in report.encodings
+        (
+            "encode",
+            "Encodings",
+            ("encoding", "seconds", "predicted s", "bytes", "predicted bytes", "ratio", "PSNR dB",
+             "predicted dB", "PSNR bulk dB", f"largest error{units}", "options"),
+            [_encoding(point) for point in report.encodings],
+        ),
+        (
+            "encode",
+            "Stages of the encoding",
+            ("stage", "seconds", "times", "why"),
+            [(stage.stage, f"{stage.seconds:.3g}", f"{stage.times}", stage.why)
+             for stage in report.stages],
+        ),
+        (
+            "encode",
+            "Size of the file in the course of the search, estimated but for the last",
+            ("after", "bytes", "seconds since the search began"),
+            [(gain.what, f"{gain.bytes}", _number(gain.seconds, ".3g")) for gain in report.gains],
+        ),
+        (
+            "read",
+            "Reads",
+            ("read", "from", "milliseconds", "bytes read", "values", "PSNR dB", "largest error"),
+            [
+                (read.what, read.file, f"{read.milliseconds:.3g}", f"{read.bytes_read}",
+                 f"{read.values}", _number(read.psnr, ".2f"), _number(read.max_abs_error, ".4g"))
+                for read in report.reads
+            ],
+        ),
+        (
+            "picture",
+            "Pictures, with everything that was counted",
+            ("varied", "setting", "milliseconds", "PSNR dB", "SSIM",
+             *(name.replace("_", " ") for name in COUNTERS)),
+            [_picture(picture) for picture in report.pictures],
+        ),
+        (
+            "about",
+            "Left out",
+            ("what", "why"),
+            [(entry.what, entry.why) for entry in report.left_out],
         ),
     )  # fmt: skip
+    return [
+        Table(section=section, title=title, header=header, rows=tuple(rows))
+        for section, title, header, rows in made
+        if rows
+    ]
 
 
-def _psnr(point: Encoded) -> str:
-    return "exact" if point.exact else _number(point.psnr, ".2f")
-
-
-def _stages(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Stages of the encoding",
-        header=("stage", "seconds", "times", "why"),
-        rows=tuple(
-            (stage.stage, f"{stage.seconds:.3g}", f"{stage.times}", stage.why)
-            for stage in report.stages
-        ),
+def _encoding(point: Encoded) -> tuple[str, ...]:
+    return (
+        point.name + (" (misses its promise)" if point.missed else ""),
+        _number(point.seconds, ".3g"),
+        _number(point.predicted_seconds, ".3g"),
+        _number(point.bytes, "d"),
+        _number(point.predicted_bytes, "d"),
+        _number(point.ratio, ".4g"),
+        "exact" if point.exact else _number(point.psnr, ".2f"),
+        _number(point.predicted_psnr, ".2f"),
+        _number(point.psnr_bulk, ".2f"),
+        _number(point.max_abs_error, ".4g"),
+        point.options,
     )
 
 
-def _gains(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Size of the file in the course of the search, estimated but for the last",
-        header=("after", "bytes", "seconds since the search began"),
-        rows=tuple(
-            (gain.what, f"{gain.bytes}", _number(gain.seconds, ".3g")) for gain in report.gains
-        ),
-    )
-
-
-def _reads(report: CostReport) -> Table:
-    return Table(
-        section="read",
-        title="Reads",
-        header=("read", "from", "milliseconds", "bytes read", "values", "PSNR dB", "largest error"),
-        rows=tuple(
-            (
-                read.what,
-                read.file,
-                f"{read.milliseconds:.3g}",
-                f"{read.bytes_read}",
-                f"{read.values}",
-                _number(read.psnr, ".2f"),
-                _number(read.max_abs_error, ".4g"),
-            )
-            for read in report.reads
-        ),
-    )
-
-
-def _pictures(report: CostReport) -> Table:
-    counters = tuple(COUNTERS)
-    return Table(
-        section="picture",
-        title="Pictures, with everything that was counted",
-        header=("varied", "setting", "milliseconds", "PSNR dB", "SSIM", *map(_spaced, counters)),
-        rows=tuple(
-            (
-                picture.group,
-                picture.setting + (" (the best)" if picture.best else ""),
-                f"{picture.milliseconds:.3g}" if picture.milliseconds else "-",
-                "equal"
-                if picture.psnr is None and picture.ssim is not None and not picture.best
-                else _number(picture.psnr, ".1f"),
-                _number(picture.ssim, ".5f"),
-                *(f"{picture.counters[name]}" for name in counters),
-            )
-            for picture in report.pictures
-        ),
-    )
-
-
-def _left_out(report: CostReport) -> Table:
-    return Table(
-        section="about",
-        title="Left out",
-        header=("what", "why"),
-        rows=tuple((entry.what, entry.why) for entry in report.left_out),
+def _picture(picture: Picture) -> tuple[str, ...]:
+    equal = picture.psnr is None and picture.ssim is not None and not picture.best
+    return (
+        picture.group,
+        picture.setting + (" (the best)" if picture.best else ""),
+        f"{picture.milliseconds:.3g}" if picture.milliseconds else "-",
+        "equal" if equal else _number(picture.psnr, ".1f"),
+        _number(picture.ssim, ".5f"),
+        *(f"{picture.counters[name]}" for name in COUNTERS),
     )
 
 
 def _number(value: float | None, form: str, none: str = "-") -> str:
     return none if value is None else format(value, form)
-
-
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
 
 
 COLUMNS = 3
@@ -264,56 +214,38 @@ def _scale(axes: Any, axis: Axis, name: str) -> None:
     if axis.log:
         getattr(axes, f"set_{name}scale")("log")
         side = getattr(axes, f"{name}axis")
-        side.set_major_formatter(_size if axis.unit else _plain)
-        side.set_minor_formatter(_nothing)
+        shown = bytes_text if axis.unit else "{:g}".format
+        side.set_major_formatter(lambda value, _: shown(value))
+        side.set_minor_formatter(lambda *_: "")
         low, high = sorted(getattr(axes, f"get_{name}lim")())
         marks = (1, 2, 5) if high < FEW_DECADES * low else (1,)
-        side.set_major_locator(_ticker().LogLocator(subs=marks, numticks=20))
+        ticker = importlib.import_module("matplotlib.ticker")
+        side.set_major_locator(ticker.LogLocator(subs=marks, numticks=20))
     if axis.reversed:
         getattr(axes, f"invert_{name}axis")()
 
 
-def _ticker() -> Any:
-    """The module of matplotlib that places the marks of an axis."""
-    return importlib.import_module("matplotlib.ticker")
-
-
-def _size(value: float, _: int) -> str:
-    return bytes_text(value)
-
-
-def _plain(value: float, _: int) -> str:
-    return f"{value:g}"
-
-
-def _nothing(*_: object) -> str:
-    return ""
-
-
 def require_matplotlib() -> Any:
     """The module that draws; raises MissingDependencyError."""
+    return _required("matplotlib.figure", "a plot needs matplotlib")
+
+
+def require_plotly() -> Any:
+    """The module that holds plotly's JavaScript; raises MissingDependencyError."""
+    return _required("plotly.offline", "a page of costs needs plotly")
+
+
+def _required(module: str, need: str) -> Any:
     try:
-        return importlib.import_module("matplotlib.figure")
+        return importlib.import_module(module)
     except ImportError as error:
-        raise MissingDependencyError(
-            "a plot needs matplotlib; pip install 'fhash[bench]'"
-        ) from error
+        raise MissingDependencyError(f"{need}; pip install 'fhash[bench]'") from error
 
 
 EFFECT_COUNTERS = ("gradients", "secondary_rays", "evaluations")
 """Counters of work that effects alone ask for, where a decoded frame is marched."""
 SECTIONS = {"encode": "Encode", "read": "Read", "picture": "Picture", "about": "About"}
 """Headings of the page by the sections of panels and tables."""
-
-
-def require_plotly() -> Any:
-    """The module that holds plotly's JavaScript; raises MissingDependencyError."""
-    try:
-        return importlib.import_module("plotly.offline")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "a page of costs needs plotly; pip install 'fhash[bench]'"
-        ) from error
 
 
 def json_text(report: CostReport) -> str:
@@ -327,19 +259,15 @@ def page(report: CostReport) -> str:
         "title": escape(f"What accuracy costs: {report.series}"),
         "summary": _summary(report),
         "sections": "".join(_section(name, report) for name in SECTIONS),
-        "data": _embedded(json_text(report)),
-        "panels": _embedded(json.dumps([panel.to_dict() for panel in panels(report)])),
+        # JSON that may stand in a script element: no tag can end it early.
+        "data": json_text(report).replace("<", "\\u003c"),
+        "panels": json.dumps([panel.to_dict() for panel in panels(report)]).replace("<", "\\u003c"),
         "plotly": require_plotly().get_plotlyjs(),
     }
     template = files("fhash_codec.cost").joinpath("page.html").read_text(encoding="utf-8")
     head, *parts = template.split("{{")
     pieces = [part.split("}}", 1) for part in parts]
     return head + "".join(filled[name] + rest for name, rest in pieces)
-
-
-def _embedded(text: str) -> str:
-    """JSON that may stand in a script element: no tag can end it early."""
-    return text.replace("<", "\\u003c")
 
 
 def _summary(report: CostReport) -> str:
