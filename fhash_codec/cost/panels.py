@@ -93,14 +93,21 @@ def style_of(name: str, place: int) -> tuple[str, str]:
     return STYLES.get(name, (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)]))
 
 
+def curve(
+    name: str, style: tuple[str, str], points: Iterable[tuple[float, Any, str]], **more: bool
+) -> Trace:
+    """A curve of points (x, y, text), in a colour and with a symbol."""
+    x, y, text = tuple(zip(*points, strict=True)) or ((), (), ())
+    return Trace(name=name, colour=style[0], symbol=style[1], x=x, y=y, text=text, **more)
+
+
 def single(panel: Panel, x: Sequence[float], y: Sequence[Any]) -> Panel:
     """A panel with one curve, or with bars of one colour."""
-    text = tuple(
-        f"{b}<br>{a:.4g} {panel.x.label}" if panel.bars else f"{a:.6g}: {b:.4g}"
+    points = [
+        (a, b, f"{b}<br>{a:.4g} {panel.x.label}" if panel.bars else f"{a:.6g}: {b:.4g}")
         for a, b in zip(x, y, strict=True)
-    )
-    trace = Trace(name="", colour=CYCLE[0], symbol=SYMBOLS[0], x=tuple(x), y=tuple(y), text=text)
-    return replace(panel, traces=(trace,))
+    ]
+    return replace(panel, traces=(curve("", (CYCLE[0], SYMBOLS[0]), points),))
 
 
 Pick = Callable[[Encoded, bool], float | None]
@@ -163,7 +170,6 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
 def _frontier(points: Sequence[Encoded], x_of: Pick, y_of: Pick) -> Iterator[Trace]:
     """A curve of measured points for each group, and one of hollow points for the rest."""
     for place, group in enumerate(dict.fromkeys(point.group for point in points)):
-        colour, symbol = style_of(group, place)
         for measured in (True, False):
             mine = [
                 (x, y, _hover(point, measured))
@@ -175,18 +181,10 @@ def _frontier(points: Sequence[Encoded], x_of: Pick, y_of: Pick) -> Iterator[Tra
                 and x > 0
             ]
             if mine:
-                mine.sort(key=lambda place: (place[1], place[0]))
-                xs, ys, texts = zip(*mine, strict=True)
-                yield Trace(
-                    name=group if measured else f"{group}, predicted",
-                    colour=colour,
-                    symbol=symbol,
-                    x=xs,
-                    y=ys,
-                    text=texts,
-                    hollow=not measured,
-                    line=measured,
-                )
+                mine.sort(key=lambda point: (point[1], point[0]))
+                name = group if measured else f"{group}, predicted"
+                style = style_of(group, place)
+                yield curve(name, style, mine, hollow=not measured, line=measured)
 
 
 def _hover(point: Encoded, measured: bool) -> str:
@@ -208,22 +206,22 @@ def _hover(point: Encoded, measured: bool) -> str:
 
 def _trainings(report: CostReport) -> Iterator[Trace]:
     """A curve of accuracy on samples against seconds for each training."""
-    for place, curve in enumerate(report.curves):
+    for place, training in enumerate(report.curves):
+        name = training.name
         points = [
-            (point["seconds"], point["psnr"], point["epoch"])
-            for point in curve.points
+            (
+                float(point["seconds"]),
+                float(point["psnr"]),
+                f"{name}<br>epoch or update {point['epoch']:g}",
+            )
+            for point in training.points
             if point["seconds"] and point["psnr"] is not None
         ]
-        colour, symbol = style_of("paper" if curve.name.startswith("paper") else curve.name, place)
+        style = style_of(name, place)
+        if name.startswith("paper"):
+            style = (style_of("paper", place)[0], "cross")
         if points:
-            yield Trace(
-                name=f"{curve.name}, in training",
-                colour=colour,
-                symbol="cross" if curve.name.startswith("paper") else symbol,
-                x=tuple(float(seconds) for seconds, _, _ in points),
-                y=tuple(float(psnr) for _, psnr, _ in points),
-                text=tuple(f"{curve.name}<br>epoch or update {epoch:g}" for *_, epoch in points),
-            )
+            yield curve(f"{name}, in training", style, points)
 
 
 def _courses(report: CostReport) -> Iterator[Panel]:
@@ -269,27 +267,17 @@ def _foretold(points: Sequence[Encoded]) -> Panel:
     """Seconds that were predicted beside those measured."""
     traces = []
     for place, group in enumerate(dict.fromkeys(point.group for point in points)):
-        colour, symbol = style_of(group, place)
         mine = sorted(
             (point.predicted_seconds, point.seconds, point.name)
             for point in points
             if point.group == group and point.seconds and point.predicted_seconds
         )
         if mine:
-            traces.append(
-                Trace(
-                    name=group,
-                    colour=colour,
-                    symbol=symbol,
-                    x=tuple(predicted for predicted, _, _ in mine),
-                    y=tuple(seconds for _, seconds, _ in mine),
-                    text=tuple(
-                        f"{name}<br>predicted {a:.3g} s, took {b:.3g} s ({b / a:.2f} x)"
-                        for a, b, name in mine
-                    ),
-                    line=False,
-                )
-            )
+            told = [
+                (a, b, f"{name}<br>predicted {a:.3g} s, took {b:.3g} s ({b / a:.2f} x)")
+                for a, b, name in mine
+            ]
+            traces.append(curve(group, style_of(group, place), told, line=False))
     return Panel(
         key="predicted",
         section="encode",
@@ -329,17 +317,8 @@ def read_panels(report: CostReport) -> Iterator[Panel]:
                 for read in report.reads
                 if read.what == kind and read.psnr is not None
             )
-            traces.append(
-                Trace(
-                    name=kind,
-                    colour=CYCLE[place % len(CYCLE)],
-                    symbol=SYMBOLS[place % len(SYMBOLS)],
-                    x=tuple(x for x, _, _ in points),
-                    y=tuple(y for _, y, _ in points),
-                    text=tuple(text for *_, text in points),
-                    line=False,
-                )
-            )
+            style = (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)])
+            traces.append(curve(kind, style, points, line=False))
         yield Panel(
             key=key,
             section="read",
@@ -393,14 +372,7 @@ def _knobs(pictures: Iterable[Picture], pick: int) -> Iterator[Trace]:
             and (value := (each.psnr, each.ssim)[pick]) is not None
         ]
         if points:
-            yield Trace(
-                name=group,
-                colour=CYCLE[place],
-                symbol=SYMBOLS[place],
-                x=tuple(x for x, _, _ in points),
-                y=tuple(y for _, y, _ in points),
-                text=tuple(text for *_, text in points),
-            )
+            yield curve(group, (CYCLE[place], SYMBOLS[place]), points)
 
 
 def _pictures_by_size(report: CostReport) -> Panel:
@@ -413,7 +385,6 @@ def _pictures_by_size(report: CostReport) -> Panel:
     ]
     traces = []
     for place, group in enumerate(dict.fromkeys(point.group for point, _ in shown)):
-        colour, symbol = style_of(group, place)
         mine = sorted(
             (
                 float(point.bytes or 0),
@@ -424,16 +395,7 @@ def _pictures_by_size(report: CostReport) -> Panel:
             for point, each in shown
             if point.group == group
         )
-        traces.append(
-            Trace(
-                name=group,
-                colour=colour,
-                symbol=symbol,
-                x=tuple(x for x, _, _ in mine),
-                y=tuple(y for _, y, _ in mine),
-                text=tuple(text for *_, text in mine),
-            )
-        )
+        traces.append(curve(group, style_of(group, place), mine))
     return Panel(
         key="picture-bytes",
         section="picture",
