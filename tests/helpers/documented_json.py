@@ -1,4 +1,4 @@
-"""What docs/json.md says of the JSON of each command, and the comparison with what it prints."""
+"""Keys of docs/json.md with their types, and the comparison with what a command prints."""
 
 from __future__ import annotations
 
