@@ -232,3 +232,11 @@ def test_smooth_values_are_tried_further(tmp_path) -> None:
     size, _, decoded = encoded(tmp_path, smooth)
     np.testing.assert_array_equal(decoded, smooth)
     assert 3 * size < smooth.size
+
+
+def test_labels_whose_sum_overflows_are_labels_all_the_same(tmp_path) -> None:
+    values = (moving_regions() % 5 + 1).astype(np.float32) * np.float32(4e37)
+    values[1, 2:5, 3:9, 2:7] = np.nan
+    _, used, decoded = encoded(tmp_path, values)
+    assert "labels" in used
+    np.testing.assert_array_equal(decoded, values)
