@@ -39,13 +39,14 @@ hard: .venv/.stamp
 every: .venv/.stamp
 	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
 
-# A source archive and a wheel for every Python 3 of each platform in dist/, by the compiler of ziglang: ten minutes on
-# 2 processors.
+# A source archive and a wheel for every Python 3 of each platform in dist/, by the compiler of ziglang, and that of the
+# benchmarks: ten minutes on 2 processors.
 PLATFORMS := x86_64-linux-gnu.2.17/manylinux_2_17_x86_64 aarch64-linux-gnu.2.17/manylinux_2_17_aarch64 \
 	x86_64-linux-musl/musllinux_1_2_x86_64 aarch64-linux-musl/musllinux_1_2_aarch64 x86_64-macos.11.0/macosx_11_0_x86_64 \
 	aarch64-macos.11.0/macosx_11_0_arm64 x86_64-windows-gnu/win_amd64 aarch64-windows-gnu/win_arm64
 wheels: .venv/.stamp $(PLATFORMS:%=wheel/%)
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
+	$(BIN)/python -m build --no-isolation --wheel --outdir dist benchmarks
 	ls -l dist
 
 wheel/%: .venv/.stamp

@@ -1,24 +1,430 @@
-"""Files of a cost report: a page, a PNG and JSON in a folder, all of them or none."""
+"""Files of a cost report: a page, a PNG and JSON in a folder, all of them or none.
+
+The plots are described once, for the page and for the PNG.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
 import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.cost.panels import Axis, Panel, panels
-from fhash_codec.cost.results import CostReport, Encoded, bytes_text, told
+from fhash_codec.cost.results import CostReport, Encoded, Picture, bytes_text, seconds_text, told
 from fhash_codec.cost.uses import NOTHING
 from fhash_codec.rendering.march_task import COUNTERS
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
 from fhash_formats.support.files import check_output, explained, replacing_all
 from fhash_formats.support.values import plain_json
+
+STYLES: dict[str, tuple[str, str]] = {
+    "compact, effort 1": ("#56B4E9", "circle"),
+    "compact, effort 2": ("#56B4E9", "diamond"),
+    "compact, effort 3": ("#2583C4", "circle"),
+    "compact, effort 5": ("#D55E00", "circle"),
+    "compact, effort 7": ("#D55E00", "diamond"),
+    "compact, effort 9": ("#D55E00", "star"),
+    "paper": ("#CC79A7", "star"),
+    "SZ3": ("#009E73", "square"),
+    "SPERR": ("#E69F00", "triangle-up"),
+    "ZFP": ("#8A8F98", "x"),
+}
+"""Colour, after Okabe and Ito (told apart by colour-blind people), and symbol of each curve."""
+CYCLE = ("#2583C4", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A8F98")
+"""Colours of curves that have none of their own."""
+SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "cross")
+"""Symbols of curves that have none of their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """An axis.
+
+    Attributes:
+        label: what it shows, with its unit.
+        log: whether it is logarithmic. reversed: whether small values lie above.
+        unit: "B" for bytes, which are shown as kB and MB; empty for plain numbers.
+    """
+
+    label: str
+    unit: str = ""
+    log: bool = False
+    reversed: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """A curve, or bars where its panel has bars.
+
+    Attributes:
+        x, y: numbers; x of bars are lengths, y their names.
+        text: what the mouse shows at each point.
+        hollow: whether the points are predictions.
+        line: whether the points are joined.
+    """
+
+    name: str
+    colour: str
+    symbol: str
+    x: tuple[float, ...]
+    y: tuple[float | str, ...]
+    text: tuple[str, ...]
+    hollow: bool = False
+    line: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """A plot.
+
+    Attributes:
+        section: "encode", "read" or "picture".
+        bars: whether the traces are horizontal bars.
+        diagonal: whether a line shows where x equals y.
+    """
+
+    key: str
+    section: str
+    title: str
+    x: Axis
+    y: Axis
+    traces: tuple[Trace, ...]
+    bars: bool = False
+    diagonal: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by field name."""
+        return asdict(self)
+
+
+def style_of(name: str, place: int) -> tuple[str, str]:
+    """Colour and symbol of a curve, by its name or its place."""
+    return STYLES.get(name, (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)]))
+
+
+def curve(
+    name: str, style: tuple[str, str], points: Iterable[tuple[float, Any, str]], **more: bool
+) -> Trace:
+    """A curve of points (x, y, text), in a colour and with a symbol."""
+    x, y, text = tuple(zip(*points, strict=True)) or ((), (), ())
+    return Trace(name=name, colour=style[0], symbol=style[1], x=x, y=y, text=text, **more)
+
+
+def single(panel: Panel, x: Sequence[float], y: Sequence[Any]) -> Panel:
+    """A panel with one curve, or with bars of one colour."""
+    points = [
+        (a, b, f"{b}<br>{a:.4g} {panel.x.label}" if panel.bars else f"{a:.6g}: {b:.4g}")
+        for a, b in zip(x, y, strict=True)
+    ]
+    return replace(panel, traces=(curve("", (CYCLE[0], SYMBOLS[0]), points),))
+
+
+Pick = Callable[[Encoded, bool], float | None]
+"""Figure of an encoding, as measured or as predicted."""
+
+
+def encode_panels(report: CostReport) -> Iterator[Panel]:
+    """Plots of the encodings, empty ones included."""
+
+    def seconds(point: Encoded, measured: bool) -> float | None:
+        return point.seconds if measured else point.predicted_seconds
+
+    def size(point: Encoded, measured: bool) -> float | None:
+        return point.bytes if measured else point.predicted_bytes
+
+    def psnr(point: Encoded, measured: bool) -> float | None:
+        return point.psnr if measured else point.predicted_psnr
+
+    def bulk(point: Encoded, measured: bool) -> float | None:
+        return point.psnr_bulk if measured else None
+
+    def largest(point: Encoded, measured: bool) -> float | None:
+        return point.max_abs_error if measured else None
+
+    units = f", {report.units}" if report.units not in ("", "1") else ", in the units of the data"
+    second, byte = (
+        Axis(label="seconds of encoding", log=True),
+        Axis(label="size of the file, bytes", unit="B", log=True),
+    )
+    decibel = Axis(label="PSNR of all values, dB")
+    for key, title, x, y, x_of, y_of in (
+        ("encode-seconds", "Accuracy against time", second, decibel, seconds, psnr),
+        ("encode-bytes", "Accuracy against size", byte, decibel, size, psnr),
+        (
+            "encode-bulk",
+            "Accuracy of the bulk against size",
+            byte,
+            Axis(label="PSNR of the middle 98 %, dB"),
+            size,
+            bulk,
+        ),
+        (
+            "encode-error",
+            "Largest error against size",
+            byte,
+            Axis(label=f"largest error{units}", log=True, reversed=True),
+            size,
+            largest,
+        ),
+    ):
+        traces = tuple(_frontier(report.encodings, x_of, y_of))
+        if key == "encode-seconds":
+            traces += tuple(trace for trace in _trainings(report) if trace.name.startswith("paper"))
+        if len(report.encodings) > 1:
+            yield Panel(key=key, section="encode", title=title, x=x, y=y, traces=traces)
+    yield from _courses(report)
+    yield _foretold(report.encodings)
+
+
+def _frontier(points: Sequence[Encoded], x_of: Pick, y_of: Pick) -> Iterator[Trace]:
+    """A curve of measured points for each group, and one of hollow points for the rest."""
+    for place, group in enumerate(dict.fromkeys(point.group for point in points)):
+        for measured in (True, False):
+            mine = [
+                (x, y, _hover(point, measured))
+                for point in points
+                if point.group == group
+                and (point.measured if measured else point.predicted_seconds is not None)
+                and (x := x_of(point, measured)) is not None
+                and (y := y_of(point, measured)) is not None
+                and x > 0
+            ]
+            if mine:
+                mine.sort(key=lambda point: (point[1], point[0]))
+                name = group if measured else f"{group}, predicted"
+                style = style_of(group, place)
+                yield curve(name, style, mine, hollow=not measured, line=measured)
+
+
+def _hover(point: Encoded, measured: bool) -> str:
+    """Text that the mouse shows at an encoding."""
+    seconds, count, psnr = (
+        (point.seconds, point.bytes, point.psnr)
+        if measured
+        else (point.predicted_seconds, point.predicted_bytes, point.predicted_psnr)
+    )
+    parts = [
+        point.name if measured else f"{point.name}, predicted",
+        "" if seconds is None else seconds_text(seconds),
+        "" if count is None else bytes_text(count),
+        "" if psnr is None else f"{psnr:.2f} dB",
+        "misses its promise" if measured and point.missed else "",
+    ]
+    return "<br>".join(part for part in parts if part)
+
+
+def _trainings(report: CostReport) -> Iterator[Trace]:
+    """A curve of accuracy on samples against seconds for each training."""
+    for place, training in enumerate(report.curves):
+        name = training.name
+        points = [
+            (
+                float(point["seconds"]),
+                float(point["psnr"]),
+                f"{name}<br>epoch or update {point['epoch']:g}",
+            )
+            for point in training.points
+            if point["seconds"] and point["psnr"] is not None
+        ]
+        style = style_of(name, place)
+        if name.startswith("paper"):
+            style = (style_of("paper", place)[0], "cross")
+        if points:
+            yield curve(f"{name}, in training", style, points)
+
+
+def _courses(report: CostReport) -> Iterator[Panel]:
+    """The trainings, and what the stages and steps of one encoding have."""
+    yield Panel(
+        key="training",
+        section="encode",
+        title="Course of the trainings",
+        x=Axis(label="seconds of training", log=True),
+        y=Axis(label="PSNR on samples, dB"),
+        traces=tuple(_trainings(report)),
+    )
+    stages = [stage for stage in reversed(report.stages) if stage.times]
+    yield single(
+        Panel(
+            key="stages",
+            section="encode",
+            title="Seconds of each stage",
+            x=Axis(label="seconds"),
+            y=Axis(label=""),
+            traces=(),
+            bars=True,
+        ),
+        [stage.seconds for stage in stages],
+        [stage.stage for stage in stages],
+    )
+    steps = [step for step in report.per_step if step["psnr"] is not None]
+    yield single(
+        Panel(
+            key="per-step",
+            section="encode",
+            title="Accuracy of each step",
+            x=Axis(label="step"),
+            y=Axis(label="PSNR, dB"),
+            traces=(),
+        ),
+        [float(step["step"]) for step in steps],
+        [step["psnr"] for step in steps],
+    )
+
+
+def _foretold(points: Sequence[Encoded]) -> Panel:
+    """Seconds that were predicted beside those measured."""
+    traces = []
+    for place, group in enumerate(dict.fromkeys(point.group for point in points)):
+        mine = sorted(
+            (point.predicted_seconds, point.seconds, point.name)
+            for point in points
+            if point.group == group and point.seconds and point.predicted_seconds
+        )
+        if mine:
+            told = [
+                (a, b, f"{name}<br>predicted {a:.3g} s, took {b:.3g} s ({b / a:.2f} x)")
+                for a, b, name in mine
+            ]
+            traces.append(curve(group, style_of(group, place), told, line=False))
+    return Panel(
+        key="predicted",
+        section="encode",
+        title="Predicted and measured time",
+        x=Axis(label="seconds predicted", log=True),
+        y=Axis(label="seconds measured", log=True),
+        traces=tuple(traces),
+        diagonal=True,
+    )
+
+
+KNOBS = ("step length", "level of detail", "level of detail, first picture", "threshold")
+"""Groups of pictures that trade time for likeness."""
+
+
+def read_panels(report: CostReport) -> Iterator[Panel]:
+    """Plots of the reads, empty ones included."""
+    kinds = dict.fromkeys(read.what for read in report.reads)
+    for key, title, x, pick in (
+        ("read-ms", "Accuracy of reads against time", Axis(label="milliseconds", log=True), 0),
+        (
+            "read-bytes",
+            "Accuracy of reads against bytes",
+            Axis(label="bytes read", unit="B", log=True),
+            1,
+        ),
+    ):
+        traces = []
+        for place, kind in enumerate(kinds):
+            points = sorted(
+                (
+                    (read.milliseconds, float(read.bytes_read))[pick],
+                    read.psnr,
+                    f"{read.what}<br>{read.file}<br>{read.milliseconds:.3g} ms,"
+                    f" {bytes_text(read.bytes_read)}<br>{read.psnr:.2f} dB",
+                )
+                for read in report.reads
+                if read.what == kind and read.psnr is not None
+            )
+            style = (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)])
+            traces.append(curve(kind, style, points, line=False))
+        yield Panel(
+            key=key,
+            section="read",
+            title=title,
+            x=x,
+            y=Axis(label="PSNR of what was read, dB"),
+            traces=tuple(trace for trace in traces if trace.x),
+        )
+
+
+def picture_panels(report: CostReport) -> Iterator[Panel]:
+    """Plots of the pictures, empty ones included."""
+    for key, title, y, pick in (
+        ("picture-psnr", "Pictures: likeness against time", "PSNR to the finest picture, dB", 0),
+        ("picture-ssim", "Pictures: SSIM against time", "SSIM to the finest picture", 1),
+    ):
+        yield Panel(
+            key=key,
+            section="picture",
+            title=title,
+            x=Axis(label="milliseconds", log=True),
+            y=Axis(label=y),
+            traces=tuple(_knobs(report.pictures, pick)),
+        )
+    effects = [picture for picture in report.pictures if picture.group == "effect"]
+    yield single(
+        Panel(
+            key="effects",
+            section="picture",
+            title="Effects, each alone",
+            x=Axis(label="milliseconds"),
+            y=Axis(label=""),
+            traces=(),
+            bars=True,
+        ),
+        [picture.milliseconds for picture in reversed(effects)],
+        [picture.setting for picture in reversed(effects)],
+    )
+    yield _pictures_by_size(report)
+
+
+def _knobs(pictures: Iterable[Picture], pick: int) -> Iterator[Trace]:
+    """A curve of time and likeness for each knob."""
+    groups = dict.fromkeys(each.group for each in pictures if each.group in KNOBS)
+    for place, group in enumerate(groups):
+        points = [  # in the order of the settings: times alone may go up and down
+            (each.milliseconds, value, f"{group} {each.setting}<br>{each.milliseconds:.3g} ms")
+            for each in pictures
+            if each.group == group
+            and not each.best
+            and (value := (each.psnr, each.ssim)[pick]) is not None
+        ]
+        if points:
+            yield curve(group, (CYCLE[place], SYMBOLS[place]), points)
+
+
+def _pictures_by_size(report: CostReport) -> Panel:
+    """Likeness of the pictures of files to that of the source, against the size of the files."""
+    sizes = {point.name: point for point in report.encodings if point.bytes}
+    shown = [
+        (sizes[each.setting], each)
+        for each in report.pictures
+        if each.group == "encoding" and each.setting in sizes and each.psnr is not None
+    ]
+    traces = []
+    for place, group in enumerate(dict.fromkeys(point.group for point, _ in shown)):
+        mine = sorted(
+            (
+                float(point.bytes or 0),
+                float(each.psnr or 0.0),
+                f"{each.setting}<br>{bytes_text(point.bytes or 0)}"
+                f"<br>picture {each.psnr:.1f} dB, SSIM {each.ssim:.4f}",
+            )
+            for point, each in shown
+            if point.group == group
+        )
+        traces.append(curve(group, style_of(group, place), mine))
+    return Panel(
+        key="picture-bytes",
+        section="picture",
+        title="Likeness to the source's picture against size",
+        x=Axis(label="size of the file, bytes", unit="B", log=True),
+        y=Axis(label="PSNR of the picture, dB"),
+        traces=tuple(traces),
+    )
+
+
+def panels(report: CostReport) -> list[Panel]:
+    """Every plot for which there are points; those that compare encodings need two."""
+    made = [*encode_panels(report), *read_panels(report), *picture_panels(report)]
+    return [panel for panel in made if any(trace.x for trace in panel.traces)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,150 +443,100 @@ class Table:
 
 def tables(report: CostReport) -> list[Table]:
     """Every table that has rows."""
-    made = [
-        _advice(report),
-        _encodings(report),
-        _stages(report),
-        _gains(report),
-        _reads(report),
-        _pictures(report),
-        _left_out(report),
-    ]
-    return [table for table in made if table.rows]
-
-
-def _advice(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Recommendation: the best of what was measured",
-        header=("for dB", "aim", "encoding", "options", "seconds", "bytes", "reached dB"),
-        rows=tuple(
-            (
-                f"{entry.psnr:g}",
-                entry.aim,
-                entry.name,
-                entry.options,
-                f"{entry.seconds:.3g}",
-                f"{entry.bytes}",
-                _number(entry.reached, ".2f", "exact"),
-            )
-            for entry in report.advice
-        ),
-    )
-
-
-def _encodings(report: CostReport) -> Table:
     units = f" {report.units}" if report.units not in ("", "1") else ""
-    return Table(
-        section="encode",
-        title="Encodings",
-        header=(
-            "encoding", "seconds", "predicted s", "bytes", "predicted bytes", "ratio", "PSNR dB",
-            "predicted dB", "PSNR bulk dB", f"largest error{units}", "options",
+    made = (
+        (
+            "encode",
+            "Recommendation: the best of what was measured",
+            ("for dB", "aim", "encoding", "options", "seconds", "bytes", "reached dB"),
+            [
+                (f"{advice.psnr:g}", advice.aim, advice.name, advice.options,
+                 f"{advice.seconds:.3g}", f"{advice.bytes}",
+                 _number(advice.reached, ".2f", "exact"))
+                for advice in report.advice
+            ],
         ),
-        rows=tuple(
-            (
-                point.name + (" (misses its promise)" if point.missed else ""),
-                _number(point.seconds, ".3g"),
-                _number(point.predicted_seconds, ".3g"),
-                _number(point.bytes, "d"),
-                _number(point.predicted_bytes, "d"),
-                _number(point.ratio, ".4g"),
-                _psnr(point),
-                _number(point.predicted_psnr, ".2f"),
-                _number(point.psnr_bulk, ".2f"),
-                _number(point.max_abs_error, ".4g"),
-                point.options,
-            )
-            for point in report.encodings
+        (
+            "encode",
+            "Encodings",
+            ("encoding", "seconds", "predicted s", "bytes", "predicted bytes", "ratio", "PSNR dB",
+             "predicted dB", "PSNR bulk dB", f"largest error{units}", "options"),
+            [_encoding(point) for point in report.encodings],
+        ),
+        (
+            "encode",
+            "Stages of the encoding",
+            ("stage", "seconds", "times", "why"),
+            [(stage.stage, f"{stage.seconds:.3g}", f"{stage.times}", stage.why)
+             for stage in report.stages],
+        ),
+        (
+            "encode",
+            "Size of the file in the course of the search, estimated but for the last",
+            ("after", "bytes", "seconds since the search began"),
+            [(gain.what, f"{gain.bytes}", _number(gain.seconds, ".3g")) for gain in report.gains],
+        ),
+        (
+            "read",
+            "Reads",
+            ("read", "from", "milliseconds", "bytes read", "values", "PSNR dB", "largest error"),
+            [
+                (read.what, read.file, f"{read.milliseconds:.3g}", f"{read.bytes_read}",
+                 f"{read.values}", _number(read.psnr, ".2f"), _number(read.max_abs_error, ".4g"))
+                for read in report.reads
+            ],
+        ),
+        (
+            "picture",
+            "Pictures, with everything that was counted",
+            ("varied", "setting", "milliseconds", "PSNR dB", "SSIM",
+             *(name.replace("_", " ") for name in COUNTERS)),
+            [_picture(picture) for picture in report.pictures],
+        ),
+        (
+            "about",
+            "Left out",
+            ("what", "why"),
+            [(entry.what, entry.why) for entry in report.left_out],
         ),
     )  # fmt: skip
+    return [
+        Table(section=section, title=title, header=header, rows=tuple(rows))
+        for section, title, header, rows in made
+        if rows
+    ]
 
 
-def _psnr(point: Encoded) -> str:
-    return "exact" if point.exact else _number(point.psnr, ".2f")
-
-
-def _stages(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Stages of the encoding",
-        header=("stage", "seconds", "times", "why"),
-        rows=tuple(
-            (stage.stage, f"{stage.seconds:.3g}", f"{stage.times}", stage.why)
-            for stage in report.stages
-        ),
+def _encoding(point: Encoded) -> tuple[str, ...]:
+    return (
+        point.name + (" (misses its promise)" if point.missed else ""),
+        _number(point.seconds, ".3g"),
+        _number(point.predicted_seconds, ".3g"),
+        _number(point.bytes, "d"),
+        _number(point.predicted_bytes, "d"),
+        _number(point.ratio, ".4g"),
+        "exact" if point.exact else _number(point.psnr, ".2f"),
+        _number(point.predicted_psnr, ".2f"),
+        _number(point.psnr_bulk, ".2f"),
+        _number(point.max_abs_error, ".4g"),
+        point.options,
     )
 
 
-def _gains(report: CostReport) -> Table:
-    return Table(
-        section="encode",
-        title="Size of the file in the course of the search, estimated but for the last",
-        header=("after", "bytes", "seconds since the search began"),
-        rows=tuple(
-            (gain.what, f"{gain.bytes}", _number(gain.seconds, ".3g")) for gain in report.gains
-        ),
-    )
-
-
-def _reads(report: CostReport) -> Table:
-    return Table(
-        section="read",
-        title="Reads",
-        header=("read", "from", "milliseconds", "bytes read", "values", "PSNR dB", "largest error"),
-        rows=tuple(
-            (
-                read.what,
-                read.file,
-                f"{read.milliseconds:.3g}",
-                f"{read.bytes_read}",
-                f"{read.values}",
-                _number(read.psnr, ".2f"),
-                _number(read.max_abs_error, ".4g"),
-            )
-            for read in report.reads
-        ),
-    )
-
-
-def _pictures(report: CostReport) -> Table:
-    counters = tuple(COUNTERS)
-    return Table(
-        section="picture",
-        title="Pictures, with everything that was counted",
-        header=("varied", "setting", "milliseconds", "PSNR dB", "SSIM", *map(_spaced, counters)),
-        rows=tuple(
-            (
-                picture.group,
-                picture.setting + (" (the best)" if picture.best else ""),
-                f"{picture.milliseconds:.3g}" if picture.milliseconds else "-",
-                "equal"
-                if picture.psnr is None and picture.ssim is not None and not picture.best
-                else _number(picture.psnr, ".1f"),
-                _number(picture.ssim, ".5f"),
-                *(f"{picture.counters[name]}" for name in counters),
-            )
-            for picture in report.pictures
-        ),
-    )
-
-
-def _left_out(report: CostReport) -> Table:
-    return Table(
-        section="about",
-        title="Left out",
-        header=("what", "why"),
-        rows=tuple((entry.what, entry.why) for entry in report.left_out),
+def _picture(picture: Picture) -> tuple[str, ...]:
+    equal = picture.psnr is None and picture.ssim is not None and not picture.best
+    return (
+        picture.group,
+        picture.setting + (" (the best)" if picture.best else ""),
+        f"{picture.milliseconds:.3g}" if picture.milliseconds else "-",
+        "equal" if equal else _number(picture.psnr, ".1f"),
+        _number(picture.ssim, ".5f"),
+        *(f"{picture.counters[name]}" for name in COUNTERS),
     )
 
 
 def _number(value: float | None, form: str, none: str = "-") -> str:
     return none if value is None else format(value, form)
-
-
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
 
 
 COLUMNS = 3
@@ -264,56 +620,38 @@ def _scale(axes: Any, axis: Axis, name: str) -> None:
     if axis.log:
         getattr(axes, f"set_{name}scale")("log")
         side = getattr(axes, f"{name}axis")
-        side.set_major_formatter(_size if axis.unit else _plain)
-        side.set_minor_formatter(_nothing)
+        shown = bytes_text if axis.unit else "{:g}".format
+        side.set_major_formatter(lambda value, _: shown(value))
+        side.set_minor_formatter(lambda *_: "")
         low, high = sorted(getattr(axes, f"get_{name}lim")())
         marks = (1, 2, 5) if high < FEW_DECADES * low else (1,)
-        side.set_major_locator(_ticker().LogLocator(subs=marks, numticks=20))
+        ticker = importlib.import_module("matplotlib.ticker")
+        side.set_major_locator(ticker.LogLocator(subs=marks, numticks=20))
     if axis.reversed:
         getattr(axes, f"invert_{name}axis")()
 
 
-def _ticker() -> Any:
-    """The module of matplotlib that places the marks of an axis."""
-    return importlib.import_module("matplotlib.ticker")
-
-
-def _size(value: float, _: int) -> str:
-    return bytes_text(value)
-
-
-def _plain(value: float, _: int) -> str:
-    return f"{value:g}"
-
-
-def _nothing(*_: object) -> str:
-    return ""
-
-
 def require_matplotlib() -> Any:
     """The module that draws; raises MissingDependencyError."""
+    return _required("matplotlib.figure", "a plot needs matplotlib")
+
+
+def require_plotly() -> Any:
+    """The module that holds plotly's JavaScript; raises MissingDependencyError."""
+    return _required("plotly.offline", "a page of costs needs plotly")
+
+
+def _required(module: str, need: str) -> Any:
     try:
-        return importlib.import_module("matplotlib.figure")
+        return importlib.import_module(module)
     except ImportError as error:
-        raise MissingDependencyError(
-            "a plot needs matplotlib; pip install 'fhash[bench]'"
-        ) from error
+        raise MissingDependencyError(f"{need}; pip install 'fhash[bench]'") from error
 
 
 EFFECT_COUNTERS = ("gradients", "secondary_rays", "evaluations")
 """Counters of work that effects alone ask for, where a decoded frame is marched."""
 SECTIONS = {"encode": "Encode", "read": "Read", "picture": "Picture", "about": "About"}
 """Headings of the page by the sections of panels and tables."""
-
-
-def require_plotly() -> Any:
-    """The module that holds plotly's JavaScript; raises MissingDependencyError."""
-    try:
-        return importlib.import_module("plotly.offline")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "a page of costs needs plotly; pip install 'fhash[bench]'"
-        ) from error
 
 
 def json_text(report: CostReport) -> str:
@@ -327,19 +665,15 @@ def page(report: CostReport) -> str:
         "title": escape(f"What accuracy costs: {report.series}"),
         "summary": _summary(report),
         "sections": "".join(_section(name, report) for name in SECTIONS),
-        "data": _embedded(json_text(report)),
-        "panels": _embedded(json.dumps([panel.to_dict() for panel in panels(report)])),
+        # JSON that may stand in a script element: no tag can end it early.
+        "data": json_text(report).replace("<", "\\u003c"),
+        "panels": json.dumps([panel.to_dict() for panel in panels(report)]).replace("<", "\\u003c"),
         "plotly": require_plotly().get_plotlyjs(),
     }
     template = files("fhash_codec.cost").joinpath("page.html").read_text(encoding="utf-8")
     head, *parts = template.split("{{")
     pieces = [part.split("}}", 1) for part in parts]
     return head + "".join(filled[name] + rest for name, rest in pieces)
-
-
-def _embedded(text: str) -> str:
-    """JSON that may stand in a script element: no tag can end it early."""
-    return text.replace("<", "\\u003c")
 
 
 def _summary(report: CostReport) -> str:

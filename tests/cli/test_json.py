@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import Result
+from documented_json import DOCUMENT, KEYS, check, fits, parsed
 
 import fhash_codec
-from fhash_bench import engines as clock
-from fhash_bench import train as bench
-from fhash_bench.pictures.results import RenderBench
-from fhash_bench.rate.measuring import Access, Point, RateBench, Speed, TilePrice
 from fhash_cli.main import COMMANDS
 from fhash_codec.cost.results import (
     Advice,
@@ -38,73 +32,8 @@ from fhash_codec.selftest.run import CaseResult, Summary
 from fhash_codec.views.server import Server
 
 Fhash = Callable[..., Result]
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "json.md"
-TYPES = {"text": str, "number": (int, float), "integer": int, "boolean": bool, "object": dict}
 WITHOUT_JSON = {"completion"}
 """Commands whose output is no result."""
-
-
-def documented() -> dict[str, dict[str, str]]:
-    """Types by key of each command, as the document has them."""
-    commands: dict[str, dict[str, str]] = {}
-    for section in DOCUMENT.read_text().split("\n## ")[1:]:
-        title = section.partition("\n")[0].replace("`", "").removeprefix("fhash ")
-        inherited = re.search(r"All keys of `fhash (\w+)`", section)
-        rows = re.findall(r"^\| `([^`]+)` \| ([a-z ]+) \|", section, re.MULTILINE)
-        commands[title] = {**(commands[inherited[1]] if inherited else {}), **dict(rows)}
-    return commands
-
-
-KEYS = documented()
-
-
-def fits(value: Any, kind: str) -> bool:
-    """Whether a value is of a documented type, such as `list of numbers or null`."""
-    if " or " in kind:
-        return any(fits(value, part) for part in kind.split(" or "))
-    if kind.startswith(("list of ", "lists of ")):
-        inner = kind.partition(" of ")[2]
-        return isinstance(value, list) and all(fits(entry, inner) for entry in value)
-    if kind == "null":
-        return value is None
-    name = kind.removeprefix("free ")
-    allowed = TYPES[name if name in TYPES else name.removesuffix("s")]
-    return isinstance(value, allowed) and (allowed is bool or not isinstance(value, bool))
-
-
-def entries(values: Any, kinds: dict[str, str], place: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of an object with its value, as the document writes keys; free objects closed."""
-    for name, value in values.items():
-        key = place + name
-        if key not in kinds and any(kind.startswith(f"{place}*") for kind in kinds):
-            key = f"{place}*"
-        if key in kinds or not key.endswith("*"):
-            yield key, value
-        free = "free object" in kinds.get(key, "")
-        if isinstance(value, dict) and not free:
-            yield from entries(value, kinds, f"{key}.")
-        elif isinstance(value, list) and not free:
-            for entry in value:
-                if isinstance(entry, dict):
-                    yield from entries(entry, kinds, f"{key}[].")
-
-
-def check(command: str, *results: Any) -> None:
-    """Compare the objects that a command printed with its section of the document."""
-    kinds, seen = KEYS[command], set()
-    for result in results:
-        for key, value in entries(result, kinds):
-            assert key in kinds, f"docs/json.md lacks the key `{key}` of fhash {command}"
-            assert fits(value, kinds[key]), f"{command}: {key} is {value!r}, not {kinds[key]}"
-            seen.add(key)
-    unseen = {key for key in kinds.keys() - seen if not key.endswith("*")}
-    assert not unseen, f"docs/json.md has keys that fhash {command} did not print: {unseen}"
-
-
-def parsed(result: Result, code: int = 0) -> Any:
-    assert result.exit_code == code, result.output
-    (line,) = result.stdout.splitlines()
-    return json.loads(line, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
 
 
 def test_the_document_names_every_command() -> None:
@@ -282,69 +211,6 @@ def test_cost() -> None:
         left_out=(LeftOut(what="a", why="b"),), machine={}, notes=("a",),
     )  # fmt: skip
     check("cost", json.loads(json.dumps({"paths": ["a"], **result.to_dict()})))
-
-
-def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ticks = count()
-    read = lambda: next(ticks) / 100  # noqa: E731
-    monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=read, process_time=read))
-    monkeypatch.setattr(bench, "INFER_SECONDS", 0.01)
-    words = ["bench", "train", data, "--seconds", "0.1", "--width", "4", "--engines", "slab"]
-    check("bench train", parsed(fhash(*words, "--json", "-q")))
-
-
-def test_bench_rate() -> None:
-    point = Point(
-        codec="SZ3", goal="psnr", asked=40.0, reached=True, bytes=9, psnr=None, max_error=0.0,
-        setting="", as_asked=None,
-    )  # fmt: skip
-    speed = Speed(
-        codec="SZ3", setting="", psnr=40.0, encode_mb_s=1.0, decode_mb_s=2.0,
-        encode_core_mb_s=1.0, decode_core_mb_s=2.0, encode_runs=3,
-    )  # fmt: skip
-    tiles = TilePrice(goal="psnr", asked=40.0, bytes=9, one_tile_bytes=8, price=1.125, steps=1)
-    access = Access(
-        codec="SZ3", setting="", region=(1, 2, 3), bytes=9, psnr=None, milliseconds=0.5,
-        bytes_read=9,
-    )  # fmt: skip
-    result = RateBench(
-        series="a", shape=(1, 2, 3, 4), dtype="float32", raw_bytes=96, value_range=(0.0, 1.0),
-        missing=0, points=(point, replace(point, codec="fhash compact")), speeds=(speed,),
-        access=(access,), tiles=(tiles,), refused={"ZFP": "no"}, machine={}, notes=("a",),
-    )  # fmt: skip
-    check("bench rate", json.loads(json.dumps(result.to_dict())))
-
-
-def test_bench_table(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    words = ["bench", "table", data, "--target", "40", "--peer", "SZ3", "--effort", "1"]
-    check("bench table", parsed(fhash(*words, "-o", tmp_path, "--json", "-q")))
-
-
-def test_bench_ablate(fhash: Fhash, data: Path) -> None:
-    words = ["bench", "ablate", data, "--axis", "fringe", "--epochs", "1"]
-    check("bench ablate", parsed(fhash(*words, "--json", "-q")))
-
-
-def test_bench_labels(fhash: Fhash) -> None:
-    words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
-    check("bench labels", parsed(fhash(*words, "--json", "-q")))
-
-
-def test_bench_paper(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    words = ["bench", "paper", data, "--quick", "--epochs", "1", "--protocol", "equal", "--feature"]
-    words += ["interval:6:99", "--encoding", "fhash", "-o", tmp_path, "--no-latency"]
-    results = [parsed(fhash(*words, "--json", "-q"))]
-    results.append(parsed(fhash("bench", "paper", "--parameters", "--json")))
-    check("bench paper", *results)
-
-
-def test_bench_render() -> None:
-    result = RenderBench(
-        series="a", shape=(1, 2, 3, 4), step=0.0, size=16, turns=1, effects=(), accelerations=(),
-        streams=(), against=(), exactness=(), playback=(), curves=(), refused={"vtk": "no"},
-        machine={}, notes=(),
-    )  # fmt: skip
-    check("bench render", json.loads(json.dumps(result.to_dict())))
 
 
 ERRORS = (

@@ -8,326 +8,25 @@ reaches the code behind them. A sealed file may even be sound.
 from __future__ import annotations
 
 import contextlib
-import json
 import random
-import struct
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from math import prod
 from pathlib import Path
 from typing import Any
 
-import mutated_arrays
-import mutated_documents
-import mutated_series
-import mutated_tiles
-from mutated_documents import Parts, directory_of, pack, pack_members, resealed, unpack, with_crc
-from numcodecs.zstd import compress
-
-from fhash_formats.container.zip_file import ENTRY, comment, deflated
-
-NUMBERS = (
-    0,
-    1,
-    7,
-    8,
-    20,
-    63,
-    255,
-    256,
-    0x7FFF,
-    0x8000,
-    0xFFFF,
-    0x10000,
-    0x7FFFFFFF,
-    0x80000000,
-    0xFFFFFFFE,
-    0xFFFFFFFF,
-)
-NAMES = (
-    *(
-        "../x",
-        "a/../../x",
-        "/etc/passwd",
-        "..",
-        ".",
-        "",
-        "a\\x",
-        "C:x",
-        "c:/x",
-        "x/",
-        "x//y",
-        "./x",
-        "~/x",
-        "a b",
-        "a\nb",
-        "a\x00b",
-        ".x",
-    ),
-    *(
-        "x/.y",
-        "%2e%2e/x",
-        "CON",
-        "x:y",
-        "x" * 512,
-        "x" * 513,
-        "x" * 65535,
-        "x/" * 250 + "y",
-        "zarr.json/zarr.json",
-        "c/0",
-        "tables/c/0",
-    ),
-)
-FIELDS = (
-    (0, "I"),
-    (4, "H"),
-    (6, "H"),
-    (8, "H"),
-    (10, "H"),
-    (12, "H"),
-    (14, "H"),
-    (16, "I"),
-    (20, "I"),
-    (24, "I"),
-    (28, "H"),
-    (30, "H"),
-)
-LATER_FIELDS = ((32, "H"), (34, "H"), (36, "H"), (38, "I"), (42, "I"))
-END_FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "I"), (16, "I"), (20, "H"))
-
-
-def _entries(data: bytes) -> list[int]:
-    """Return the offset of each entry of the directory."""
-    at, offsets = directory_of(data), []
-    while data[at : at + 4] == b"PK\x01\x02":
-        offsets.append(at)
-        at += ENTRY.size + struct.unpack_from("<H", data, at + 28)[0]
-    return offsets
-
-
-def _number(chance: random.Random, form: str, old: int) -> int:
-    new = chance.choice((*NUMBERS, old + 1, old - 1, old * 2, old // 2))
-    return new % (1 << 16 if form == "H" else 1 << 32)
-
-
-def _field(chance: random.Random, parts: Parts) -> bytes:
-    """Change one or a few fields of entries, sometimes in the local header, too."""
-    data = bytearray(pack(parts))
-    start = directory_of(bytes(data))
-    for _ in range(chance.choice((1, 1, 2, 4))):
-        entry = chance.choice(_entries(bytes(data)) or [start])
-        at, form = chance.choice((*FIELDS, *LATER_FIELDS))
-        old = struct.unpack_from(f"<{form}", data, entry + at)[0]
-        new = _number(chance, form, old)
-        struct.pack_into(f"<{form}", data, entry + at, new)
-        local = struct.unpack_from("<I", data, entry + 42)[0]
-        if 6 <= at <= 30 and chance.random() < 0.5 and local + 30 < start:
-            struct.pack_into(f"<{form}", data, local + at - 2, new)
-    return resealed(bytes(data), start)
-
-
-def _end(chance: random.Random, parts: Parts) -> bytes:
-    """Change a field of the end record, or put records before it."""
-    data = bytearray(pack(parts))
-    start, end = directory_of(bytes(data)), len(data) - len(comment(b"")) - 22
-    if chance.random() < 0.3:
-        record = struct.pack(
-            "<4sQ2H2I4Q",
-            b"PK\x06\x06",
-            44,
-            45,
-            45,
-            0,
-            0,
-            *(chance.choice((*NUMBERS, 2**60, 2**63, 2**64 - 1)) for _ in range(4)),
-        )
-        locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, chance.choice((end, 0, 2**63)), 1)
-        struct.pack_into("<I", data, end + 16, 0xFFFFFFFF)
-        return resealed(bytes(data[:end]) + record + locator + bytes(data[end:]), start)
-    at, form = chance.choice(END_FIELDS)
-    struct.pack_into(
-        f"<{form}",
-        data,
-        end + at,
-        _number(chance, form, struct.unpack_from(f"<{form}", data, end + at)[0]),
-    )
-    return resealed(bytes(data), start)
-
-
-def _signature(chance: random.Random, parts: Parts) -> bytes:
-    """Put another version or another text into the comment."""
-    data = pack(parts)
-    new = chance.choice(
-        (b"fhash 0", b"fhash 1", b"fhash 3", b"fhash 9999", b"fhash -", b"FHASH 2", b"fhash 02")
-    )
-    return (
-        data.replace(b"fhash 2", new) if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
-    )
-
-
-def _named(chance: random.Random, parts: Parts) -> bytes:
-    """Give a member another name: a hostile one, or that of another member."""
-    at = chance.randrange(len(parts))
-    name = chance.choice(NAMES) if chance.random() < 0.6 else chance.choice(parts)[0]
-    if chance.random() < 0.5:
-        return pack([*parts[:at], (name, parts[at][1]), *parts[at + 1 :]])
-    return pack([*parts[:at], (name, chance.choice((b"", b"x", parts[at][1]))), *parts[at:]])
-
-
-def _dropped(chance: random.Random, parts: Parts) -> bytes:
-    """Remove some members."""
-    gone = set(chance.sample(range(len(parts)), chance.choice((1, 1, 2, len(parts) // 2))))
-    return pack([member for number, member in enumerate(parts) if number not in gone])
-
-
-def _exchanged(chance: random.Random, parts: Parts) -> bytes:
-    """Replace the data of one member by another's."""
-    first, second = chance.randrange(len(parts)), chance.randrange(len(parts))
-    changed = list(parts)
-    changed[first] = (parts[first][0], parts[second][1])
-    if chance.random() < 0.5:
-        changed[second] = (parts[second][0], parts[first][1])
-    return pack(changed)
-
-
-def _shuffled(chance: random.Random, parts: Parts) -> bytes:
-    """Shuffle the members."""
-    changed = list(parts)
-    chance.shuffle(changed)
-    return pack(changed)
-
-
-def _nested(chance: random.Random, parts: Parts) -> bytes:
-    """Put nodes into nodes: an array into an array, groups hundreds deep, a hierarchy below its own
-    array."""
-    prefix = chance.choice(
-        (
-            "coords/time",
-            "tables/level_1",
-            "tables",
-            "tables/level_1/c",
-            "a/" * chance.choice((1, 60, 200)) + "a",
-        )
-    )
-    below = [(f"{prefix}/{name}", data) for name, data in parts if len(prefix) + len(name) < 512]
-    if chance.random() < 0.5:
-        path = prefix.split("/")
-        below += [
-            ("/".join(path[:n]) + "/zarr.json", b'{"zarr_format":3,"node_type":"group"}')
-            for n in range(1, len(path) + 1)
-        ]
-    return pack([*dict([*below, *parts]).items()])
-
-
-def _many(chance: random.Random, parts: Parts) -> bytes:
-    """Add thousands of members."""
-    count = chance.choice((100, 3000))
-    document = chance.choice((b'{"zarr_format":3,"node_type":"group"}', b"{}", b""))
-    return pack([*((f"g{number}/zarr.json", document) for number in range(count)), *parts])
-
-
-def _bomb(chance: random.Random, parts: Parts) -> bytes:
-    """Replace a document or chunk by one that inflates to 2^20 to 2^31 bytes, declared truly or
-    not."""
-    at = chance.randrange(len(parts))
-    name, data = parts[at]
-    size = 1 << chance.choice((20, 24, 26, 30, 31))
-    if name.endswith("zarr.json"):
-        text = chance.choice((b" ", b"[", b'{"a":', b"0", b'"'))
-        small = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-        block = text * ((1 << 20) // len(text))
-        stored = (
-            b"".join(small.compress(block) for _ in range(min(size, 1 << 26) >> 20)) + small.flush()
-        )
-        declared = chance.choice((size, len(data), 16 << 20, (16 << 20) + 1, 2**32 - 1)) % (1 << 32)
-        bomb = (name, stored, declared, zlib.crc32(data))
-    else:
-        frame = _zeros(
-            min(size, 1 << 30), declared=chance.choice((None, size, 64, 2**63, 2**64 - 1))
-        )
-        stored = with_crc(frame)
-        bomb = (name, stored, None, zlib.crc32(stored))
-    plain = [(other, content, None, zlib.crc32(content)) for other, content in parts]
-    return pack_members([*plain[:at], bomb, *plain[at + 1 :]])
-
-
-def _zeros(size: int, declared: int | None) -> bytes:
-    """Return a zstd frame of zeros in blocks of one repeated byte: 128 KiB from 4 bytes."""
-    head = (
-        struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88"
-        if declared is None
-        else struct.pack("<IBBQ", 0xFD2FB528, 0xC0, 0x88, declared)
-    )
-    blocks = -(-size // (1 << 17))
-    body = struct.pack("<I", (1 << 17) << 3 | 2)[:3] + b"\0"
-    return head + body * (blocks - 1) + struct.pack("<I", (1 << 17) << 3 | 3)[:3] + b"\0"
-
-
-def _deflated(chance: random.Random, parts: Parts) -> bytes:
-    """Deflate members that may or may not be deflated, with sizes that are right or wrong."""
-    given = []
-    for name, data in parts:
-        packed = name.endswith("zarr.json") or chance.random() < 0.1
-        full = max(0, len(data) + chance.choice((0, 0, 0, 0, 1, -1))) if packed else None
-        given.append((name, deflated(data) if packed else data, full, zlib.crc32(data)))
-    return pack_members(given)
-
-
-def _extra(chance: random.Random, parts: Parts) -> bytes:
-    """Add another array, sound or not."""
-    shape = [chance.choice((1, 2, 2**20, 2**31, 2**60)) for _ in range(chance.choice((1, 2, 4, 8)))]
-    chunk = [chance.choice((1, n, min(n, 2**28))) for n in shape]
-    document = {
-        **{
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": shape,
-            "data_type": "uint8",
-            "fill_value": 0,
-        },
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": [
-            {"name": "bytes"},
-            {"name": "zstd", "configuration": {"level": 1, "checksum": False}},
-            {"name": "crc32c"},
-        ],
-    }
-    name = chance.choice(
-        ("extra", "missing/bits", "occupancy/bits", "occupancy/mask", "key_frames", "coords/time")
-    )
-    size = min(1 << 28, max(1, prod(chunk)))
-    data = with_crc(
-        _zeros(size, declared=size)
-        if chance.random() < 0.5
-        else compress(bytes(min(size, 1 << 20)), 1)
-    )
-    members = {
-        f"{name}/zarr.json": json.dumps(document).encode(),
-        f"{name}/c/" + "/".join("0" * len(shape)): data,
-    }
-    if "/" in name:
-        members[f"{name.split('/')[0]}/zarr.json"] = b'{"zarr_format":3,"node_type":"group"}'
-    return pack([*{**dict(parts), **members}.items()])
-
-
-ZIP_KINDS: dict[str, Callable[[random.Random, Parts], bytes]] = {
-    "entry": _field,
-    "end": _end,
-    "signature": _signature,
-    "named": _named,
-    "dropped": _dropped,
-    "exchanged": _exchanged,
-    "shuffled": _shuffled,
-    "nested": _nested,
-    "many": _many,
-    "bomb": _bomb,
-    "deflated": _deflated,
-    "extra": _extra,
-}
-
+import documents
+import mutated_json
+import mutated_labels
+import mutated_parts
+import mutated_payload
+import mutated_plain
+import mutated_settings
+import mutated_source
+import mutated_sparse
+import mutated_variables
+import mutated_zip
+from containers import Parts, pack, unpack
 
 GOLDENS = Path(__file__).parents[1] / "golden"
 NEWEST = (
@@ -384,7 +83,7 @@ def mutation(number: int) -> Mutation:
     for name in (first, *random.Random(number).sample(names, len(names))):
         try:
             return _mutation(number, name, kinds[place])
-        except mutated_arrays.NothingFitsError:
+        except mutated_payload.NothingFitsError:
             continue
     raise AssertionError(f"no golden has what {kinds[place]} changes")
 
@@ -392,8 +91,8 @@ def mutation(number: int) -> Mutation:
 def _mutation(number: int, golden: str, kind: str) -> Mutation:
     chance = random.Random(number)
     data, parts = goldens()[golden]
-    if kind in OF_ONE and mutated_series.is_several(parts):
-        raise mutated_arrays.NothingFitsError
+    if kind in OF_ONE and mutated_variables.is_several(parts):
+        raise mutated_payload.NothingFitsError
     if kind in DAMAGES:
         return Mutation(
             number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data)
@@ -475,37 +174,37 @@ def _packed(
         after = change(chance, parts)
         with contextlib.suppress(ValueError, KeyError, RecursionError):
             if chance.random() < 0.85:
-                after = mutated_series.consolidated(after)
+                after = mutated_variables.consolidated(after)
         return pack(after)
 
     return changed
 
 
-_CHANGES: dict[str, Callable[[random.Random, Parts], Parts]] = {
-    **mutated_documents.JSON_KINDS,
-    **mutated_arrays.PAYLOAD_KINDS,
-    **mutated_tiles.SETTINGS_KINDS,
-    **mutated_tiles.LABELS_KINDS,
-    **mutated_arrays.PLAIN_KINDS,
-    **mutated_arrays.SPARSE_KINDS,
-    **mutated_series.VARIABLES_KINDS,
-    **mutated_series.SOURCE_KINDS,
-    **mutated_series.PARTS_KINDS,
-}
+_MODULES = (
+    mutated_json,
+    mutated_payload,
+    mutated_settings,
+    mutated_labels,
+    mutated_plain,
+    mutated_sparse,
+    mutated_variables,
+    mutated_source,
+    mutated_parts,
+)
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
-    **ZIP_KINDS,
-    **{name: _packed(change) for name, change in _CHANGES.items()},
+    **mutated_zip.KINDS,
+    **{name: _packed(change) for module in _MODULES for name, change in module.KINDS.items()},
 }
 KINDS = (*DAMAGES, *SEALED)
-PLAIN_KINDS = frozenset(mutated_arrays.PLAIN_KINDS)
+PLAIN_KINDS = frozenset(mutated_plain.KINDS)
 """Kinds that change plain files, or arrays of occupancy, only."""
-SPARSE_KINDS = frozenset(mutated_arrays.SPARSE_KINDS)
+SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
 """Kinds that change tables of needed vertices only."""
 SEVERAL_KINDS = frozenset(("consolidated",))
 """Kinds that change files of several variables only."""
-SOURCE_KINDS = frozenset(mutated_series.SOURCE_KINDS)
+SOURCE_KINDS = frozenset(mutated_source.KINDS)
 """Kinds that change metadata of a source only."""
-PART_KINDS = frozenset(mutated_series.PARTS_KINDS)
+PART_KINDS = frozenset(mutated_parts.KINDS)
 """Kinds that change parts of a series or files that grew only."""
 OF_ONE = frozenset(("length", "giant", "clip", "integers", "occupancy", "grown")) | (
     PLAIN_KINDS | SPARSE_KINDS
@@ -515,4 +214,4 @@ OF_ONE = frozenset(("length", "giant", "clip", "integers", "occupancy", "grown")
 
 def header_of(parts: Parts) -> Any:
     """Return the header of a golden; of several variables, that of the first."""
-    return mutated_documents.header_of(parts)[2]
+    return documents.header_of(parts)[2]

@@ -29,6 +29,7 @@ from fhash_codec.appending.parts import Part, encode_part
 from fhash_codec.header import brief_history, brief_quality, history_points
 from fhash_formats.container import Container, ContainerWriter, describe_coordinates, shard_order
 from fhash_formats.container import record as strict_json
+from fhash_formats.container.header import CONFIG_DEFAULTS
 from fhash_formats.errors import InputError
 from fhash_formats.series import (
     AXES,
@@ -218,6 +219,7 @@ def test_any_header_comes_back_or_is_refused_before_it_is_written(
             return
         assert changes == given_away
         with Container.open(path) as container:
+            changes["config"] = {**CONFIG_DEFAULTS, **config}
             for key, value in changes.items():
                 assert container.header[key] == value
 
@@ -456,8 +458,8 @@ def grids(draw: Draw) -> dict[str, Coordinate]:
 
 @st.composite
 def datasets(draw: Draw) -> tuple[dict[str, ArraySeries], dict[str, EncodeConfig]]:
-    """Draw up to four variables, each with a promise of its own."""
-    names = draw(st.lists(st.sampled_from(DATASET_NAMES), min_size=1, max_size=4, unique=True))
+    """Draw two to four variables, each with a promise of its own; a file of one is a Volume."""
+    names = draw(st.lists(st.sampled_from(DATASET_NAMES), min_size=2, max_size=4, unique=True))
     known = [draw(grids()) for _ in range(2)]
     sources = {name: draw(series(known)) for name in names}
     configs = {}

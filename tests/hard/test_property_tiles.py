@@ -8,11 +8,13 @@ from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from properties import NUMBERS, Draw, arrays, looking, same
 
+from fhash_formats.errors import InputError
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk
 from fhash_formats.transform.coder import (
     MAX_INTEGER,
@@ -105,6 +107,10 @@ def test_any_tile_of_any_size_of_values_comes_back(
 @given(shape=TILES, data=st.data())
 def test_a_transform_is_what_its_json_says(shape: tuple[int, ...], data: Draw) -> None:
     spec = data.draw(specs(shape))
+    if any(axis.basis is not None for axis in spec.axes):  # stands in settings as bytes alone
+        with pytest.raises(InputError, match="is no JSON value"):
+            spec.to_dict()
+        return
     again = TransformSpec.from_dict(json.loads(json.dumps(spec.to_dict())))
     values = np.random.default_rng(0).standard_normal(shape)
     assert again.to_dict() == spec.to_dict()

@@ -1,3 +1,5 @@
-"""Encodings of the F-Hash paper's evaluation, trained side by side, and answers to its claims."""
+"""Encodings of the F-Hash paper's evaluation, trained side by side, and answers to its claims.
 
-from __future__ import annotations
+Commands import `bench`, `data`, `files` and `report`. What the product trains with is in
+fhash_codec.paper.
+"""

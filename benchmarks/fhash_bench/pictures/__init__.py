@@ -1,3 +1,5 @@
-"""Pictures: what each effect costs, and VTK and OSPRay beside."""
+"""Pictures: what each effect costs, and VTK and OSPRay beside, in turns.
 
-from __future__ import annotations
+Commands import `render` and `results`. Each peer has its file; what is measured of fhash alone is
+in `render`.
+"""

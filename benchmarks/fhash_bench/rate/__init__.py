@@ -1,3 +1,5 @@
-"""Bytes, speed and access beside other codecs. May import fhash_codec.cost.peer_codecs."""
+"""Bytes, speed and access beside other codecs, by filters of HDF5 and by programs.
 
-from __future__ import annotations
+Commands import `rate`, `table` and `generated`. Peers that `fhash cost` needs, too, are in
+fhash_codec.cost.peers.
+"""

@@ -13,18 +13,24 @@ import pytest
 from PIL import Image
 
 from fhash_codec.cost import report as files
-from fhash_codec.cost.panels import (
+from fhash_codec.cost.report import (
+    NAMES,
     STYLES,
     Axis,
     Panel,
+    check_folder,
     encode_panels,
+    json_text,
+    page,
     panels,
     picture_panels,
+    plot,
     read_panels,
     single,
     style_of,
+    tables,
+    write_report,
 )
-from fhash_codec.cost.report import NAMES, check_folder, json_text, page, plot, tables, write_report
 from fhash_codec.cost.results import CostReport
 from fhash_formats.errors import InputError, MissingDependencyError, OutputError, OutputExistsError
 

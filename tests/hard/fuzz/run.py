@@ -36,14 +36,9 @@ TARGETS = tuple(
     HERE / f"{name}.cpp"
     for name in (
         "targets",
-        "target_encode",
-        "target_figures",
-        "target_labels",
-        "target_light",
+        "target_coding",
         "target_points",
-        "target_samples",
-        "target_slopes",
-        "target_train",
+        "target_values",
     )
 )
 SOURCES = (

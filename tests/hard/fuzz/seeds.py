@@ -204,7 +204,7 @@ def label_streams() -> Iterator[tuple[tuple[int, ...], int, bytes]]:
     rng = np.random.default_rng(1)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (3, 4, 6, 40)):
         regions = np.indices(shape).sum(0) // 5
-        # More than 256 are those whose upper byte is odd (target_labels.cpp).
+        # More than 256 are those whose upper byte is odd (target_coding.cpp).
         for most in (1, 2, 5, 17, 256, 257, 300, 65536):
             for noise in (0.0, 0.05, 1.0):
                 random = rng.integers(0, most, shape)

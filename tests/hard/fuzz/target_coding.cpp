@@ -1,4 +1,5 @@
-// The output of each encoder must decode to its input; a difference ends the process.
+// Encoders: what they write must decode to their input; labels, and training of the head. A
+// difference ends the process.
 #include <algorithm>
 #include <cmath>
 
@@ -8,6 +9,7 @@
 
 using std::int64_t;
 
+// The output of each encoder must decode to its input; a difference ends the process.
 namespace {
 
 // Calls an encoder with little room and, if that is not enough, with as much as it asked for. The
@@ -238,4 +240,194 @@ void round_trip(Reader& in) {
         case 3: of_path<float>(in); break;
         default: of_path<double>(in);
     }
+}
+
+// The coder of labels: any bytes decode to labels below the count, and what it encodes comes back.
+namespace {
+
+using Bytes = std::vector<std::uint8_t>;
+
+using Labels = std::vector<std::uint16_t>;
+
+struct Tile {
+    std::vector<int64_t> shape;
+    int64_t count;  // of different labels
+};
+
+Labels decoded(const Tile& tile, const Bytes& data) {
+    Labels labels(static_cast<std::size_t>(volume(tile.shape)), 255);
+    const int64_t code = fhash_decode_labels(labels.data(), tile.count, tile.shape.data(),
+                                             data.data(), static_cast<int64_t>(data.size()));
+    require(code == 0, "bytes that are refused");
+    for (const int64_t label : labels) require(label < tile.count, "a label that does not exist");
+    return labels;
+}
+
+// The bytes of labels, by a first call with little room and a second one with as much as it asked
+// for. The coder may write to its labels.
+Bytes encoded(const Tile& tile, const Labels& labels, std::size_t room) {
+    Bytes data(room);
+    Labels work;
+    const auto encode = [&] {
+        work = labels;
+        return fhash_encode_labels(work.data(), tile.count, tile.shape.data(), data.data(),
+                                   static_cast<int64_t>(data.size()));
+    };
+    const int64_t size = encode();
+    require(size >= 0, "labels that are refused");
+    require(work == labels, "labels that the encoder changed");
+    if (static_cast<std::size_t>(size) > room) {
+        data.assign(static_cast<std::size_t>(size), 0);
+        require(encode() == size, "another size the second time");
+    }
+    data.resize(static_cast<std::size_t>(size));
+    data.shrink_to_fit();
+    return data;
+}
+
+// Labels below a count in regions, of which the input says how long they are along x, y, z and t,
+// and which vertices have a label of their own.
+Labels drawn(Reader& in, const Tile& tile) {
+    int64_t lengths[4];
+    for (int64_t& length : lengths) length = in.within(1, 40);
+    using Label = std::uint16_t;
+    const Labels palette = in.numbers<Label>(16), others = in.numbers<Label>(8);
+    const std::uint8_t noise = in.byte();
+    Labels labels;
+    std::size_t at = 0;
+    for (int64_t t = 0; t < tile.shape[0]; t++)
+        for (int64_t z = 0; z < tile.shape[1]; z++)
+            for (int64_t y = 0; y < tile.shape[2]; y++)
+                for (int64_t x = 0; x < tile.shape[3]; x++, at++) {
+                    const int64_t region = x / lengths[0] + 3 * (y / lengths[1]) +
+                                           5 * (z / lengths[2]) + 7 * (t / lengths[3]);
+                    const bool alone = (at * 167 + at / 13) % 256 < noise;
+                    const Label label =
+                        alone ? static_cast<Label>(others[at % 8] + at / 8)
+                              : palette[static_cast<std::size_t>(region) % palette.size()];
+                    labels.push_back(static_cast<Label>(label % tile.count));
+                }
+    return labels;
+}
+
+Tile tile_of(Reader& in) {
+    Tile tile;
+    // Rows of up to three segments.
+    for (const int64_t most : {4, 4, 6, 40}) tile.shape.push_back(in.within(1, most));
+    // A byte, and another one that counts where it is odd: as many tiles of few labels as of many.
+    const int64_t low = in.byte(), high = in.byte();
+    tile.count = 1 + low + (high % 2 ? 256 * high : 0);
+    return tile;
+}
+
+}  // namespace
+
+void decode_label_bytes(Reader& in) {
+    const Tile tile = tile_of(in);
+    decoded(tile, in.rest());
+}
+
+void label_round_trip(Reader& in) {
+    const Tile tile = tile_of(in);
+    const std::size_t room = in.byte();
+    const auto labels = drawn(in, tile);
+    require(decoded(tile, encoded(tile, labels, room)) == labels, "other labels");
+}
+
+// Training of the head, with voxels and learning rates at the limits that the sampling sets
+// (fhash_codec/compact/head_training.py).
+namespace {
+
+const int64_t INPUTS = 28, BLOCK = 64;
+const int MAX_INPUT = 4095;
+const std::int32_t MAX_TARGET = 1 << 30;
+
+// The state of a training: weights and biases, and Adam's means of them.
+struct Training {
+    std::vector<double> parameters, means, squares;
+    bool operator==(const Training& other) const {
+        return parameters == other.parameters && means == other.means && squares == other.squares;
+    }
+};
+
+struct Voxels {
+    int64_t sizes[6];  // batches, blocks, voxels of a block, voxels looked at, two widths
+    std::vector<std::int16_t> inputs;
+    std::vector<std::int32_t> targets, lowest, highest;
+};
+
+Voxels make_voxels(Reader& in) {
+    Voxels voxels;
+    const std::uint8_t widths = in.byte();
+    const int64_t most = widths < 4 ? 64 : 6;  // large ones take long
+    voxels.sizes[0] = in.within(1, 3);
+    voxels.sizes[1] = in.within(1, widths % 64 ? 2 : 64);
+    voxels.sizes[2] = BLOCK;
+    voxels.sizes[3] = in.byte() & 1 ? 9 : 1;
+    voxels.sizes[4] = in.within(1, most);
+    voxels.sizes[5] = in.within(1, most);
+    const int64_t blocks = voxels.sizes[0] * voxels.sizes[1];
+    voxels.inputs = repeated<std::int16_t>(in, blocks * INPUTS * voxels.sizes[3] * BLOCK);
+    for (std::int16_t& input : voxels.inputs)
+        input = static_cast<std::int16_t>(std::clamp<int>(input, -MAX_INPUT, MAX_INPUT));
+    const auto limited = [&](std::int32_t low, std::int32_t high) {
+        std::vector<std::int32_t> numbers = repeated<std::int32_t>(in, blocks * BLOCK);
+        for (std::int32_t& number : numbers) number = std::clamp(number, low, high);
+        return numbers;
+    };
+    voxels.targets = limited(-MAX_TARGET, MAX_TARGET);
+    voxels.lowest = limited(-MAX_TARGET, 0);
+    voxels.highest = limited(0, MAX_TARGET);
+    return voxels;
+}
+
+Training make_training(Reader& in, const int64_t* sizes) {
+    const int64_t count = (INPUTS + 1) * sizes[4] + (sizes[4] * sizes[3] + 1) * sizes[5] +
+                          (sizes[5] + 1);
+    Training training;
+    const int exponent = static_cast<int>(in.within(-40, 6));
+    for (const std::int8_t number : repeated<std::int8_t>(in, count))
+        training.parameters.push_back(
+            std::clamp(std::ldexp(static_cast<double>(number) / 128, exponent), -64.0, 64.0));
+    training.means.assign(training.parameters.size(), 0);
+    training.squares = training.means;
+    return training;
+}
+
+int64_t learn(const Voxels& voxels, Training& training, const double* rates, const double* roots,
+              int64_t first, int64_t count, bool as_in_file) {
+    return fhash_head_learn(voxels.inputs.data(), voxels.targets.data(), voxels.lowest.data(),
+                            voxels.highest.data(), voxels.sizes, training.parameters.data(),
+                            training.means.data(), training.squares.data(), rates, roots, first,
+                            count, as_in_file);
+}
+
+}  // namespace
+
+void train(Reader& in) {
+    const bool as_in_file = in.byte() & 1;
+    const int64_t first = in.byte(), count = in.within(0, 4), part = in.within(0, count);
+    const Voxels voxels = make_voxels(in);
+    Training training = make_training(in, voxels.sizes), again = training;
+    std::vector<double> rates, roots;
+    for (int64_t update = 0; update < count; update++) {
+        rates.push_back(static_cast<double>(in.byte()) / 16);
+        roots.push_back(1 + static_cast<double>(in.byte()) / 8);
+    }
+    require(learn(voxels, training, rates.data(), roots.data(), first, count, as_in_file) == 0,
+            "a training that is refused");
+    for (const double number : training.parameters)
+        require(std::fabs(number) <= 64, "a weight beyond its limit");
+    // In two calls the same updates give the same numbers.
+    require(learn(voxels, again, rates.data(), roots.data(), first, part, as_in_file) == 0 &&
+                learn(voxels, again, rates.data() + part, roots.data() + part, first + part,
+                      count - part, as_in_file) == 0,
+            "a training in two calls that is refused");
+    require(training == again, "a training in two calls that gives other numbers");
+    std::vector<int64_t> sums(static_cast<std::size_t>(voxels.sizes[0]), -1);
+    require(fhash_head_errors(voxels.inputs.data(), voxels.targets.data(), voxels.lowest.data(),
+                              voxels.highest.data(), voxels.sizes, training.parameters.data(),
+                              as_in_file, sums.data()) == 0,
+            "errors that are refused");
+    for (const int64_t sum : sums) require(sum >= 0, "a negative sum of squares");
 }
