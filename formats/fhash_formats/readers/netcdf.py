@@ -194,7 +194,7 @@ def _metadata(
     arranged: Arranged,
     without: Collection[str],
 ) -> SourceMetadata:
-    """What belongs to a variable.
+    """Metadata of a variable: all that belongs to it.
 
     handle: group and name of the variable. groups: its own group and those around it, the nearest
         first. without: attributes that do not hold for the values.

@@ -152,7 +152,7 @@ def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
 def _metadata(
     found: ZarrTree, path: str, arranged: Arranged, without: Collection[str]
 ) -> SourceMetadata | None:
-    """What belongs to an array at a path.
+    """Metadata of the array at a path: all that belongs to it.
 
     None where dimensions have no names, and nothing but positions lies beside the array.
 
@@ -252,7 +252,7 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
     """Open the series in a zarr hierarchy: the only suitable array, or the one named.
 
     Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing
-    is undone (cf_packing.py). Consolidated metadata is ignored: an outdated copy would hide
+    is undone (cf.py). Consolidated metadata is ignored: an outdated copy would hide
     appended steps.
     """
     store, found = open_tree(path, request)

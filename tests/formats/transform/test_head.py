@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from heads import HIGH, LOW, random_head, random_tile
+from tiles import HIGH, LOW, random_head, random_tile
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.head import (

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from labelled_region import DATA as DATA_NPY
-from labelled_region import labelled_region
+from regions import DATA as DATA_NPY
+from regions import labelled_region
 
 from fhash_formats import Region, open_series, save_region
 from fhash_formats.errors import InputError, OutputExistsError
