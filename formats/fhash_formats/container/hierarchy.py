@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
-from fhash_formats.container.array import TRANSFORM, ArrayMetadata, attributes_of, check_keys
+from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.header import POSITIONS, TABLE, check_format, complete, validate_header
 from fhash_formats.container.record import MAX_BYTES, Record, loads
 from fhash_formats.container.source_entry import AUXILIARY
@@ -87,10 +87,10 @@ def shows_values(table: ArrayMetadata) -> bool:
 
     In integers, vertices without a value have a number that looks like one.
     """
-    if table.coding != TRANSFORM:
+    if table.tiles is None:
         return False
     # Tiles with settings of their own may have masks of which the codec says nothing.
-    settings = table.coder.settings
+    settings = table.tiles.settings
     return table.dtype.kind == "f" or (settings is not None and settings.mask is None)
 
 
