@@ -77,11 +77,9 @@ READ: dict[str, Callable[[list[Path]], np.ndarray]] = {
 
 SHAPE = (3, 4, 5, 6)
 
-
 HOURS = 347921.000277 + np.array([0.0, 1.0, 3.5])
-
-
 """Times that float32 cannot hold."""
+
 COORDS = {
     "t": Coordinate(
         name="time",
@@ -105,9 +103,8 @@ COORDS = {
     ),
     "x": Coordinate(name="lon", values=np.linspace(0.1, 0.7, 6)),
 }
-
-
 """Uneven, descending and described coordinates."""
+
 ATTRIBUTES = {
     "standard_name": "air_temperature",
     "scale_factor": 0.5,
@@ -119,13 +116,11 @@ ATTRIBUTES = {
     "grid_mapping": "rotated_pole",
     "flags": [1, 2],
 }
-
-
 """Attributes of the variable; some of them would change the meaning of physical values."""
+
 DATA = np.random.default_rng(3).normal(size=SHAPE).astype("f4")
-
-
 """Frames with a missing value and a value that equals the fill value of the attributes."""
+
 DATA[0, 0, 0, :2] = np.nan, 3.0
 
 
@@ -138,5 +133,20 @@ def labelled_region(**changes: Any) -> Region:
         "shape": SHAPE,
         "coords": COORDS,
         "attributes": ATTRIBUTES,
+    }
+    return Region(**{**made, **changes})
+
+
+def region_of(positions: dict[str, list[float]], **changes: Any) -> Region:
+    """A region of the variable wind at these positions, or with other fields."""
+    coords = {
+        axis: Coordinate(name=axis, values=np.array(values, dtype="f8"))
+        for axis, values in positions.items()
+    }
+    made = {
+        "name": "wind",
+        "dtype": np.dtype("f4"),
+        "shape": tuple(len(coords[axis].values) for axis in "tzyx"),
+        "coords": coords,
     }
     return Region(**{**made, **changes})
