@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from heads import random_head
 from hypothesis import given
 from hypothesis import strategies as st
-from predictors import predictor_of
 from properties import NUMBERS, Draw, arrays, looking
 from reporting import LONG
 from specs import MIXES, spec_of
+from tiles import predictor_of, random_head
 
 from fhash_codec import EncodeConfig, FhashError, encode
 from fhash_codec.selftest.run import cases

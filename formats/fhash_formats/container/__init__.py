@@ -11,26 +11,20 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
-    source           bytes at offsets of a file, and ranges of them that are asked for together
-    remote           bytes of a file elsewhere, in few requests
-    fsspec_file      requests to any file system of fsspec
-    zip_file         bytes of the ZIP, written and checked
-    strict_json      metadata documents as JSON
-    hierarchy        members of the ZIP -> header and arrays
-    record           checked access to a JSON object
-    header           checks of the header, and what it leaves out
-    expected_arrays  arrays that a header asks for
-    coordinates      positions in the header
-    source_entry     what belongs to the variable in its source <-> header and arrays
-    array            metadata of one array
-    coding           values of a chunk <-> bytes
-    sharding         many chunks in one member
-    stored           StoredArray: one array, read region by region
-    table_parts      tiles of a table -> array
-    reader           Container: a file for reading
-    writer           ContainerWriter: a file for writing
-    growing          GrowingContainer: a file that is complete after each layer
-    variables        names and headers of the variables in a file
+    zip_file      bytes at offsets of a file; members of the ZIP, written and checked
+    remote        bytes of a file elsewhere, in few requests, by fsspec too
+    record        metadata documents as JSON, and checked access to them
+    array         metadata of one array, values of a chunk <-> bytes, many chunks in one member
+    header        checks of the header, and the positions in it
+    source_entry  what belongs to the variable in its source <-> header and arrays
+    hierarchy     members of the ZIP -> headers and arrays
+    stored        StoredArray: one array, read region by region
+    reader        Container: a file for reading
+    writer        ContainerWriter: a file for writing
+    growing       GrowingContainer: a file that is complete after each layer
+
+Only `array` and `growing` know of the codec of tiles in `transform`. No reader of other formats and
+no writer of regions is imported here.
 """
 
 from fhash_formats.container.array import shard_order, shard_shape

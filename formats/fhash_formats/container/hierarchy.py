@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
-from fhash_formats.container import record as strict_json
-from fhash_formats.container.array import TRANSFORM, ArrayMetadata, attributes_of, check_keys
+from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.header import POSITIONS, TABLE, check_format, complete, validate_header
-from fhash_formats.container.record import Record
+from fhash_formats.container.record import MAX_BYTES, Record, loads
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.zip_file import DOCUMENT, Member, Source, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
@@ -88,10 +87,10 @@ def shows_values(table: ArrayMetadata) -> bool:
 
     In integers, vertices without a value have a number that looks like one.
     """
-    if table.coding != TRANSFORM:
+    if table.tiles is None:
         return False
     # Tiles with settings of their own may have masks of which the codec says nothing.
-    settings = table.coder.settings
+    settings = table.tiles.settings
     return table.dtype.kind == "f" or (settings is not None and settings.mask is None)
 
 
@@ -258,7 +257,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
         source.prefetch(
             (member.offset, member.header_size + member.size)
             for name, member in members.items()
-            if name.rpartition("/")[2] == DOCUMENT and member.size <= strict_json.MAX_BYTES
+            if name.rpartition("/")[2] == DOCUMENT and member.size <= MAX_BYTES
         )
     groups: dict[str, Mapping[str, Any]] = {}
     group_documents: dict[str, Mapping[str, Any]] = {}
@@ -318,14 +317,13 @@ def _check_consolidated(
 def _read_document(source: Source, member: Member) -> Mapping[str, Any]:
     """The zarr.json of a group, checked, or of an array."""
     # Checked before reading: the data of a chunk may be that large, metadata may not.
-    if max(member.sizes) > strict_json.MAX_BYTES:
+    if max(member.sizes) > MAX_BYTES:
         raise DamagedFileError(
-            f"member {member.name}: {max(member.sizes)} bytes of metadata; "
-            f"the limit is {strict_json.MAX_BYTES}"
+            f"member {member.name}: {max(member.sizes)} bytes of metadata; the limit is {MAX_BYTES}"
         )
     data = read_member(source, member)
     with member_named(member.name):
-        values = strict_json.loads(data)
+        values = loads(data)
         if values.get("zarr_format") != 3 or values.get("node_type") not in ("array", "group"):
             raise UnsupportedFileError("not the metadata of a Zarr v3 array or group")
         if values["node_type"] == "group":

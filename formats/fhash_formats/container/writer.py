@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.container import record as strict_json
 from fhash_formats.container.array import (
     ArrayMetadata,
     Codec,
@@ -42,6 +41,7 @@ from fhash_formats.container.hierarchy import (
     shows_values,
 )
 from fhash_formats.container.reader import Container
+from fhash_formats.container.record import dumps, loads
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.container.zip_file import (
     DOCUMENT,
@@ -475,8 +475,8 @@ class ContainerWriter:
                 attributes=dict(shown),
             )
             # The reader's checks are the writer's, so that a reader accepts what is written.
-            document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
-            ArrayMetadata.from_dict(strict_json.loads(document))
+            document = dumps(metadata.to_dict(), f"the metadata of array {name}")
+            ArrayMetadata.from_dict(loads(document))
         except DamagedFileError as error:
             raise InputError(f"array {name} cannot be stored: {error}") from error
         path = self._path(name)
@@ -668,7 +668,7 @@ class ContainerWriter:
         root: dict[str, Any] = {**GROUP, "attributes": attributes}
         if len(entries) > 1:
             root[CONSOLIDATED] = consolidated({**dict.fromkeys(groups, GROUP), **self._arrays})
-        return strict_json.dumps(root, "the header")
+        return dumps(root, "the header")
 
     def _tail(self, header: Mapping[str, Any] | None = None) -> bytes:
         """The bytes after the arrays: groups, root and directory.
@@ -683,9 +683,7 @@ class ContainerWriter:
             for folders in (name.split("/")[:-1] for name in self._arrays)
             for depth in range(1, len(folders) + 1)
         }
-        documents = {
-            f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)
-        }
+        documents = {f"{group}/{DOCUMENT}": dumps(GROUP, "a group") for group in sorted(groups)}
         documents[DOCUMENT] = self._root(groups, entries)
         members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():

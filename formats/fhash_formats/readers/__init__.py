@@ -1,9 +1,10 @@
 """Readers of time-varying volumes: one file per format, and `registry` to find the right one.
 
-`hdf5`, `netcdf`, `zarr_store`, `npy`, `raw`, `vtk_xml`, `vtkhdf`, `nrrd`, `metaimage` and `tiff`
-are the formats. `joined` makes one series of many files, `pvd` of a list of files, `masks` opens a
-mask over a series. `common/` holds what several formats share: the user's request, the choice of a
-variable and of its axes, coordinates, packed values, stored bytes, errors.
+`hdf5`, `netcdf` (with `netcdf3`), `zarr_store` (with `zarr_coded`), `raw`, `vtk` (with
+`vtk_document`), `images` and `tiff` are the formats; `joined` makes one series of many files.
+`common/` holds what several formats share: the user's request, the choice of a variable and of its
+axes, coordinates, packed values, stored bytes, errors. NetCDF, Zarr and VTK import `hdf5`, since
+their files may be HDF5 too; no other format knows of another one, and none of the writers.
 """
 
 from fhash_formats.readers.common.file_series import RawLayout, parse_shape

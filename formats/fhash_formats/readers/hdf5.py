@@ -27,7 +27,14 @@ from fhash_formats.readers.common.cf import (
     usable,
     written_times,
 )
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, refusing
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    StoredFiles,
+    StoredValues,
+    refusing,
+)
 from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
@@ -524,13 +531,24 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
             behind.parts(member.name, member.handle) for member in variable.members or (variable,)
         ]
     series = FileSeries(
-        source=source,
+        files=StoredFiles(
+            source=source,
+            stamp=stamp,
+            close=partial(_close, file, variable),
+            beside=_beside(path, variable, behind.files),
+        ),
         name=plain_name(shown_name(variable.name, names)),
-        shape=layout.shape,
-        dtype=variable.dtype if packed is None else packed.dtype,
-        axes=layout.axes,
-        fetch=layout.fetch(found.reading(variable)),
-        stamp=stamp,
+        values=StoredValues(
+            shape=layout.shape,
+            dtype=variable.dtype if packed is None else packed.dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(found.reading(variable)),
+            chunks=layout.chunks(
+                chunks and (*((1,) if variable.members else ()), *chunks, *trailing)
+            ),
+            packing=packed,
+            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+        ),
         coords=coords,
         attributes=json_attributes(
             variable.handle.attrs,
@@ -538,11 +556,6 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
             without=PLUMBING | PACKING | ({"units"} if scaled else frozenset()),
         )
         | layout.attributes(),
-        chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
-        close=partial(_close, file, variable),
-        beside=_beside(path, variable, behind.files),
-        packing=packed,
-        not_stored=not_stored(parts, layout, joined=bool(variable.members)),
     )
     if not variable.members and not variable.field:
         series.metadata = partial(_metadata, found, variable, layout, series, packed)

@@ -14,7 +14,14 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf import assign_axes, role_of_name
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    StoredFiles,
+    StoredValues,
+    naming,
+)
 from fhash_formats.readers.common.stored_bytes import (
     MAX_FILES,
     CompressedFile,
@@ -23,13 +30,13 @@ from fhash_formats.readers.common.stored_bytes import (
     StoredArray,
     StoredBytes,
     axis_steps,
-    component_by_number,
+    choose_component,
     component_variables,
     in_files,
     lattice,
     numbered_files,
 )
-from fhash_formats.readers.common.variables import choose
+from fhash_formats.readers.common.variables import Variable
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 from fhash_formats.support.values import decoded_text
 
@@ -210,15 +217,10 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
         axes, vector = _axes(fields, pairs, sizes, kinds)
         dtype = dtype_of(fields)
         name = _content(fields, path)
-        values = component_variables(
-            name,
-            1 if vector is None else sizes[vector],
-            tuple(length for place, length in enumerate(sizes) if place != vector)[::-1],
-            dtype,
-            None,
-        )
-        var = component_by_number(request.var, values)
-        variable = choose(source, values, var, booleans=request.booleans)
+        outer = tuple(length for place, length in enumerate(sizes) if place != vector)[::-1]
+        whole = Variable(name=name, shape=outer, dtype=dtype)
+        values = component_variables(whole, 1 if vector is None else sizes[vector])
+        variable = choose_component(source, values, request)
         _, component = variable.handle
         stored, files = _nrrd_values(path, fields, end, sizes, dtype, request)
         array = StoredArray(path, tuple(reversed(sizes)), dtype, stored)
@@ -243,17 +245,11 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
 
     units = fields.get("sample units", "").strip('" ')
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp, close=stored.close, beside=files),
         name=variable.name,
-        shape=variable.shape,
-        dtype=dtype,
-        axes=slow,
-        fetch=fetch,
-        stamp=stamp,
+        values=StoredValues(shape=variable.shape, dtype=dtype, axes=slow, fetch=fetch),
         coords=coords,
         attributes={"units": units} if units else {},
-        close=stored.close,
-        beside=files,
     )
 
 
@@ -482,13 +478,15 @@ def open_metaimage(path: Path, request: Request) -> FileSeries:
         shape = tuple(reversed(sizes))
         if len(sizes) == 2:
             shape = (1, *shape)
-        values = component_variables(fields.get("Name", "") or path.stem, channels, shape, dtype, 0)
-        var = component_by_number(request.var, values)
-        variable = choose(source, values, var, booleans=request.booleans)
+        name = fields.get("Name", "") or path.stem
+        values = component_variables(Variable(name=name, shape=shape, dtype=dtype), channels)
+        variable = choose_component(source, values, request)
         _, component = variable.handle
         hints = ["t", "z", "y", "x"][-len(shape) :]
         axes = assign_axes(source, shape, hints, hints, request.axes)
-        stored, files = _metaimage_values(path, fields, lines, end, sizes, channels, dtype, request)
+        stored, files = _metaimage_values(
+            path, fields, lines, end, (*sizes, channels), dtype, request
+        )
         coords = _metaimage_coordinates(fields, sizes) if request.axes is None else {}
     array = StoredArray(path, (*shape, channels), dtype, stored)
 
@@ -496,16 +494,10 @@ def open_metaimage(path: Path, request: Request) -> FileSeries:
         return array.read((*ranges, slice(0, channels)))[..., component]
 
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp, close=stored.close, beside=files),
         name=variable.name,
-        shape=shape,
-        dtype=dtype,
-        axes=axes,
-        fetch=fetch,
-        stamp=stamp,
+        values=StoredValues(shape=shape, dtype=dtype, axes=axes, fetch=fetch),
         coords=coords,
-        close=stored.close,
-        beside=files,
     )
 
 
@@ -572,13 +564,15 @@ def _metaimage_values(
     fields: Fields,
     listed: Sequence[str],
     end: int,
-    sizes: Sequence[int],
-    channels: int,
+    lengths: Sequence[int],
     dtype: np.dtype[Any],
     request: Request,
 ) -> tuple[StoredBytes, list[Path]]:
-    """The bytes of the values, and the other files that hold them."""
-    size = prod(sizes) * channels * dtype.itemsize
+    """The bytes of the values, and the other files that hold them.
+
+    lengths: of the dimensions, with that of the channels at the end.
+    """
+    size = prod(lengths) * dtype.itemsize
     data = fields["ElementDataFile"]
     if data.upper() == "LOCAL":
         return _metaimage_file(path, fields, end, size, dtype), []
@@ -586,7 +580,7 @@ def _metaimage_values(
     if words[:1] == ["LIST"] and not listed:
         raise InputError("its list of files is empty")
     if len(words) >= 4 and "%" in words[0]:
-        files = numbered_files(path.parent, words[0], words[1:4], prod(sizes))
+        files = numbered_files(path.parent, words[0], words[1:4], prod(lengths[:-1]))
     else:
         files = [path.parent / name for name in (listed if words[:1] == ["LIST"] else [data])]
     request.require_inside(path, *files)

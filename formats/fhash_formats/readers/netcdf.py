@@ -27,7 +27,14 @@ from fhash_formats.readers.common.cf import (
     usable,
     written_times,
 )
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, refusing
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    StoredFiles,
+    StoredValues,
+    refusing,
+)
 from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
@@ -194,7 +201,7 @@ def _metadata(
     arranged: Arranged,
     without: Collection[str],
 ) -> SourceMetadata:
-    """What belongs to a variable.
+    """Metadata of a variable: all that belongs to it.
 
     handle: group and name of the variable. groups: its own group and those around it, the nearest
         first. without: attributes that do not hold for the values.
@@ -426,21 +433,20 @@ def _series(
         # without names, dimensions have those of the axes
         names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
         series = FileSeries(
-            source=source,
+            files=StoredFiles(source=source, stamp=stamp, close=close, beside=beside),
             name=plain_name(shown_name(variable.name, names)),
-            shape=layout.shape,
-            dtype=array.dtype,
-            axes=layout.axes,
-            fetch=layout.fetch(found.reading(variable)),
-            stamp=stamp,
+            values=StoredValues(
+                shape=layout.shape,
+                dtype=array.dtype,
+                axes=layout.axes,
+                fetch=layout.fetch(found.reading(variable)),
+                chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
+                packing=packed,
+                not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+                default_fill=None if request.raw_values else default_fill(array, packed),
+            ),
             coords=NetcdfFile(source, path, groups, request).coordinates(variable, layout),
             attributes=json_attributes(array.attrs, without=without) | layout.attributes(),
-            chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
-            close=close,
-            packing=packed,
-            beside=beside,
-            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
-            default_fill=None if request.raw_values else default_fill(array, packed),
         )
     except BaseException:
         close()

@@ -16,6 +16,8 @@ from fhash_formats.readers.common.file_series import (
     RawLayout,
     Request,
     Stamp,
+    StoredFiles,
+    StoredValues,
     parse_dtype,
     refusing,
 )
@@ -101,13 +103,9 @@ def open_raw(path: Path, request: Request) -> FileSeries:
             f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}"
         )
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp),
         name=name,
-        shape=shape,
-        dtype=array.dtype,
-        axes=axes,
-        fetch=array.read,
-        stamp=stamp,
+        values=StoredValues(shape=shape, dtype=array.dtype, axes=axes, fetch=array.read),
     )
 
 
@@ -181,16 +179,17 @@ def open_npy(path: Path, request: Request) -> FileSeries:
     layout = arrange(found.source, variable.name, found.dimensions(variable), request)
     stored = len(found.shape)
     return FileSeries(
-        source=found.source,
+        files=StoredFiles(source=found.source, stamp=found.stamp),
         name=variable.name,
-        shape=layout.shape,
-        dtype=variable.dtype,
-        axes=layout.axes,
-        fetch=layout.fetch(field_reading(found.read, variable, stored)),
-        stamp=found.stamp,
+        values=StoredValues(
+            shape=layout.shape,
+            dtype=variable.dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(field_reading(found.read, variable, stored)),
+            # time as the fastest dimension: all steps are read together
+            chunks=layout.chunks(variable.shape) if found.fortran else None,
+        ),
         attributes=layout.attributes(),
-        # time as the fastest dimension: all steps are read together
-        chunks=layout.chunks(variable.shape) if found.fortran else None,
     )
 
 

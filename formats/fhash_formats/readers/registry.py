@@ -11,31 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
-from fhash_formats.readers import (
-    hdf5,
-    netcdf,
-    raw,
-    tiff,
-    zarr_store,
-)
-from fhash_formats.readers import (
-    images as metaimage,
-)
-from fhash_formats.readers import (
-    images as nrrd,
-)
-from fhash_formats.readers import (
-    raw as npy,
-)
-from fhash_formats.readers import (
-    vtk as pvd,
-)
-from fhash_formats.readers import (
-    vtk as vtk_xml,
-)
-from fhash_formats.readers import (
-    vtk as vtkhdf,
-)
+from fhash_formats.readers import hdf5, images, netcdf, raw, tiff, vtk, zarr_store
 from fhash_formats.readers.common.file_series import (
     FileSeries,
     RawLayout,
@@ -111,9 +87,9 @@ REGISTRY = (
     RAW,
     Reader(
         name="VTKHDF",
-        suffixes=vtkhdf.VTKHDF_SUFFIXES,
-        matches=vtkhdf.is_vtkhdf,
-        open=vtkhdf.open_vtkhdf,
+        suffixes=vtk.VTKHDF_SUFFIXES,
+        matches=vtk.is_vtkhdf,
+        open=vtk.open_vtkhdf,
     ),
     Reader(
         name="NetCDF",
@@ -136,27 +112,27 @@ REGISTRY = (
     Reader(
         name="NumPy",
         suffixes=(".npy",),
-        matches=npy.is_npy,
-        open=npy.open_npy,
-        variables=npy.list_npy,
+        matches=raw.is_npy,
+        open=raw.open_npy,
+        variables=raw.list_npy,
         selects=True,
     ),
     ZARR,
-    Reader(
-        name="VTK", suffixes=vtk_xml.XML_SUFFIXES, matches=vtk_xml.is_vtk_xml, open=vtk_xml.open_vtk
-    ),
+    Reader(name="VTK", suffixes=vtk.XML_SUFFIXES, matches=vtk.is_vtk_xml, open=vtk.open_vtk),
     Reader(
         name="collection",
-        suffixes=pvd.COLLECTION_SUFFIXES,
-        matches=pvd.is_collection,
-        open=pvd.open_pvd,
+        suffixes=vtk.COLLECTION_SUFFIXES,
+        matches=vtk.is_collection,
+        open=vtk.open_pvd,
     ),
-    Reader(name="NRRD", suffixes=nrrd.NRRD_SUFFIXES, matches=nrrd.is_nrrd, open=nrrd.open_nrrd),
+    Reader(
+        name="NRRD", suffixes=images.NRRD_SUFFIXES, matches=images.is_nrrd, open=images.open_nrrd
+    ),
     Reader(
         name="MetaImage",
-        suffixes=metaimage.METAIMAGE_SUFFIXES,
-        matches=metaimage.is_metaimage,
-        open=metaimage.open_metaimage,
+        suffixes=images.METAIMAGE_SUFFIXES,
+        matches=images.is_metaimage,
+        open=images.open_metaimage,
     ),
     Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
 )

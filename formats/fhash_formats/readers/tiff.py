@@ -19,14 +19,22 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, condense, naming
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    StoredFiles,
+    StoredValues,
+    condense,
+    naming,
+)
 from fhash_formats.readers.common.stored_bytes import (
     PlainFile,
-    component_by_number,
+    choose_component,
     component_variables,
     lattice,
 )
-from fhash_formats.readers.common.variables import choose
+from fhash_formats.readers.common.variables import Variable
 from fhash_formats.series import Coordinate, NotStored
 
 SUFFIXES = (".tif", ".tiff")
@@ -117,11 +125,9 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     lengths = tuple(length for length, axis in zip(outer, roles, strict=True) if axis)
     if len(lengths) == 2:  # a plane
         kept, lengths = ["z", *kept], (1, *lengths)
-    variables = component_variables(
-        path.stem, 1 if channel < 0 else shape[channel], lengths, np.dtype(series.dtype), 0
-    )
-    var = component_by_number(request.var, variables)
-    variable = choose(source, variables, var, booleans=request.booleans)
+    whole = Variable(name=path.stem, shape=lengths, dtype=np.dtype(series.dtype))
+    variables = component_variables(whole, 1 if channel < 0 else shape[channel])
+    variable = choose_component(source, variables, request)
     _check_size(path, series)
     shares = _not_stored(series)
     never = None
@@ -139,16 +145,16 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         return values.reshape(read)
 
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp, close=file.close),
         name=variable.name,
-        shape=lengths,
-        dtype=np.dtype(series.dtype),
-        axes=kept,
-        fetch=fetch,
-        stamp=stamp,
+        values=StoredValues(
+            shape=lengths,
+            dtype=np.dtype(series.dtype),
+            axes=kept,
+            fetch=fetch,
+            not_stored=never,
+        ),
         coords=_coordinates(file, dict(zip(kept, lengths, strict=True))),
-        close=file.close,
-        not_stored=never,
     )
 
 
@@ -347,15 +353,15 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSer
     with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
         coords = _coordinates(file, {"y": shape[0], "x": shape[1]})
     return FileSeries(
-        source=pattern,
+        files=StoredFiles(source=pattern, stamp=stamps[0], beside=paths),
         name=paths[0].stem.rstrip("0123456789_-. ") or paths[0].stem,
-        shape=(len(paths), *shape),
-        dtype=dtype,
-        axes=request.axes,
-        fetch=fetch,
-        stamp=stamps[0],
+        values=StoredValues(
+            shape=(len(paths), *shape),
+            dtype=dtype,
+            axes=request.axes,
+            fetch=fetch,
+        ),
         coords=coords,
-        beside=paths,
     )
 
 

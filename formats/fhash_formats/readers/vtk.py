@@ -14,15 +14,22 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.cf import assign_axes
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    Request,
+    Stamp,
+    StoredFiles,
+    StoredValues,
+    naming,
+)
 from fhash_formats.readers.common.stored_bytes import (
     axis_steps,
-    component_by_number,
+    choose_component,
     component_variables,
     lattice,
 )
 from fhash_formats.readers.common.stored_parts import Hdf5Sources
-from fhash_formats.readers.common.variables import Variable, choose
+from fhash_formats.readers.common.variables import Variable
 from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
@@ -101,8 +108,7 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
     with naming(source):
         grid = _grid(path, request)
         variables = list(_variables(grid))
-        var = component_by_number(request.var, variables)
-        variable = choose(source, variables, var, booleans=request.booleans)
+        variable = choose_component(source, variables, request)
         axes = assign_axes(source, variable.shape, list(SPACE), list(SPACE), request.axes)
         array, component = variable.handle
         elements = [_element(piece.element, array) for piece in grid.pieces]
@@ -121,16 +127,11 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
             return _frame(grid, array, component)
 
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp, beside=grid.files),
         name=variable.name.rpartition("/")[2],
-        shape=variable.shape,
-        dtype=variable.dtype,
-        axes=axes,
-        fetch=fetch,
-        stamp=stamp,
+        values=StoredValues(shape=variable.shape, dtype=variable.dtype, axes=axes, fetch=fetch),
         coords=coords if axes == SPACE else {},
         attributes=_units(elements[0]),
-        beside=grid.files,
     )
 
 
@@ -225,20 +226,19 @@ def _variables(grid: _Grid) -> Iterator[Variable]:
         if not (components.isascii() and components.isdigit() and 0 < int(components) < 1000):
             raise InputError(f"the array {name} has {components!r} components")
         parts = [element.attributes.get(f"ComponentName{i}") for i in range(int(components))]
-        yield from component_variables(
-            name if names.count(name) == 1 else f"{place}/{name}",
-            int(components),
-            _shape(grid.extent, place),
-            first.arrays.dtype(element),
-            _Array(
+        array = Variable(
+            name=name if names.count(name) == 1 else f"{place}/{name}",
+            shape=_shape(grid.extent, place),
+            dtype=first.arrays.dtype(element),
+            auxiliary=name in GHOSTS,
+            handle=_Array(
                 place=place,
                 number=number,
                 name=element.attributes.get("Name", ""),
                 components=int(components),
             ),
-            given=parts,
-            auxiliary=name in GHOSTS,
         )
+        yield from component_variables(array, int(components), parts)
 
 
 def _element(piece: Element, array: _Array) -> Element:
@@ -426,8 +426,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     extent = _row(root, "WholeExtent", 6).astype(np.int64).reshape(3, 2)[::-1]
     times = _times(root)
     variables = list(_datasets(root, extent, times))
-    var = component_by_number(request.var, variables)
-    variable = choose(source, variables, var, booleans=request.booleans)
+    variable = choose_component(source, variables, request)
     array, component = variable.handle
     require_filters(source, variable.name, array.dataset)
     with Hdf5Sources(source) as behind:
@@ -455,19 +454,18 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         return np.stack([array.dataset[(int(step), *picked)] for step in steps])
 
     return FileSeries(
-        source=source,
+        files=StoredFiles(source=source, stamp=stamp, close=file.close, beside=list(behind.files)),
         name=variable.name.rpartition("/")[2],
-        shape=variable.shape,
-        dtype=variable.dtype,
-        axes=axes,
-        fetch=fetch,
-        stamp=stamp,
+        values=StoredValues(
+            shape=variable.shape,
+            dtype=variable.dtype,
+            axes=axes,
+            fetch=fetch,
+            chunks=None if chunks is None else chunks[: len(variable.shape)],
+            not_stored=never,
+        ),
         coords=_coordinates(root, extent, array, times) if axes == own else {},
         attributes=json_attributes(array.dataset.attrs, without=PLUMBING),
-        chunks=None if chunks is None else chunks[: len(variable.shape)],
-        close=file.close,
-        beside=list(behind.files),
-        not_stored=never,
     )
 
 
@@ -513,15 +511,15 @@ def _datasets(
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
         components = 1 if error or len(shape) - leading == 3 else shape[-1]
         full = space if times is None else (len(times), *space)
-        yield from component_variables(
-            name if names.count(name) == 1 else f"{place}/{name}",
-            components,
-            full,
-            dataset.dtype,
-            _Dataset(place=place, dataset=dataset, steps=times is not None),
+        array = Variable(
+            name=name if names.count(name) == 1 else f"{place}/{name}",
+            shape=full,
+            dtype=dataset.dtype,
             auxiliary=name in GHOSTS,
             error=error,
+            handle=_Dataset(place=place, dataset=dataset, steps=times is not None),
         )
+        yield from component_variables(array, components)
 
 
 def _entries(

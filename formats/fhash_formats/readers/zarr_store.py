@@ -36,6 +36,8 @@ from fhash_formats.readers.common.file_series import (
     FolderStamp,
     Request,
     Stamp,
+    StoredFiles,
+    StoredValues,
     condense,
     refusing,
 )
@@ -152,7 +154,7 @@ def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
 def _metadata(
     found: ZarrTree, path: str, arranged: Arranged, without: Collection[str]
 ) -> SourceMetadata | None:
-    """What belongs to an array at a path.
+    """Metadata of the array at a path: all that belongs to it.
 
     None where dimensions have no names, and nothing but positions lies beside the array.
 
@@ -252,7 +254,7 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
     """Open the series in a zarr hierarchy: the only suitable array, or the one named.
 
     Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing
-    is undone (cf_packing.py). Consolidated metadata is ignored: an outdated copy would hide
+    is undone (cf.py). Consolidated metadata is ignored: an outdated copy would hide
     appended steps.
     """
     store, found = open_tree(path, request)
@@ -438,26 +440,30 @@ def series_in(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     # without names, dimensions have those of the axes
     names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
     series = FileSeries(
-        source=found.source,
+        files=StoredFiles(
+            source=found.source,
+            # In a folder the array's metadata shows a change of shape at once; a changed chunk
+            # shows when all files are checked at the end.
+            stamp=Stamp.of((metadata_file(root / path) or root) if root.is_dir() else root),
+            folder=FolderStamp.of(folder) if root.is_dir() else None,
+            close=store.close,
+        ),
         name=plain_name(shown_name(variable.name, names)),
-        shape=layout.shape,
-        dtype=variable.dtype if packed is None else packed.dtype,
-        axes=layout.axes,
-        fetch=layout.fetch(found.reading(variable)),
-        # In a folder the array's metadata shows a change of shape at once; a changed chunk shows
-        # when all files are checked at the end.
-        stamp=Stamp.of((metadata_file(root / path) or root) if root.is_dir() else root),
-        folder=FolderStamp.of(folder) if root.is_dir() else None,
+        values=StoredValues(
+            shape=layout.shape,
+            dtype=variable.dtype if packed is None else packed.dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(found.reading(variable)),
+            chunks=layout.chunks((*chunks, *trailing)),
+            packing=packed,
+            not_stored=not_stored(
+                [zarr_parts(member.handle[1]) for member in variable.members or (variable,)],
+                layout,
+                joined=bool(variable.members),
+            ),
+        ),
         coords=found.coordinates(variable, layout),
         attributes=json_attributes(dict(array.attrs), without=without) | layout.attributes(),
-        chunks=layout.chunks((*chunks, *trailing)),
-        close=store.close,
-        packing=packed,
-        not_stored=not_stored(
-            [zarr_parts(member.handle[1]) for member in variable.members or (variable,)],
-            layout,
-            joined=bool(variable.members),
-        ),
     )
     if not variable.members and not variable.field:
         arranged = Arranged(layout=layout, request=request, packed=packed, coords=series.coords)

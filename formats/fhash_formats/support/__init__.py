@@ -1,1 +1,4 @@
-"""The ground of the package: atomic writes, interrupts, threads. It depends on no file format."""
+"""The ground of the package: atomic writes, interrupts, threads, dates, values of attributes.
+
+It imports `errors` alone, and knows of no file format.
+"""

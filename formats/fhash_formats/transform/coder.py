@@ -233,7 +233,7 @@ def encode_integers(
             steps, plus `weight` per bit.
         weight: squared steps that a bit is worth.
         state: state to begin from, which is adapted in place; None begins from the prior.
-        trellis: whether the integers are those of two quantisers (trellis.py). Raises InputError
+        trellis: whether the integers are those of two quantisers. Raises InputError
             for integers that are not, and does not go with `scaled`.
     """
     if trellis and scaled is not None:

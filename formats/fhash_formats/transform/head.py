@@ -360,7 +360,7 @@ class NeighbourHead:
         First u8 the number of hidden layers, or 0x82 for two and a cross between them, and u8 the
         width of each; float32 sigma, low, high; per layer float16 the scales of weights and biases,
         and u8 the spread; then the biases of all layers as int8; then the weights of all layers,
-        row by row, in one big integer (weights.py).
+        row by row, in one big integer.
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
         fields = [

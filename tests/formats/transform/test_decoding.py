@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from heads import random_head
 from specs import spec_of
-from tiles import SETTINGS, SPEC, damaged_copies, resealed, streams, wave
+from tiles import SETTINGS, SPEC, damaged_copies, random_head, resealed, streams, wave
 from tiles import SHAPE as SHAPE_DECODING
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError

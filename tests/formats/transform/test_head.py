@@ -11,68 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from heads import HIGH, LOW, random_head, random_tile
+from tiles import HIGH, LOW, random_head, random_tile
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.head import (
-    CROSS,
     INPUTS,
     MAX_WEIGHT,
-    OFFSETS,
     Layer,
     NeighbourHead,
     best_spread,
     decode_weights,
     encode_weights,
 )
-
-
-@pytest.mark.parametrize("cross", [False, True])
-def test_the_arithmetic_is_the_stated_one(cross: bool) -> None:
-    """Voxel by voxel in float64, from the definition.
-
-    The results are equal up to the rounding of inputs and activations.
-    """
-    head = random_head(seed=7, spread=8.0 if cross else 16.0, cross=cross)
-    tile = np.random.default_rng(2).uniform(-1, 2.5, (3, 4, 5, 9)).astype(np.float32)
-    hidden, expected = np.empty((*tile.shape, head.hidden[0])), np.empty(tile.shape)
-
-    def moved(at: tuple[int, ...], offset: tuple[int, ...]) -> tuple[int, ...]:
-        return tuple(
-            min(max(i + d, 0), size - 1) for i, d, size in zip(at, offset, tile.shape, strict=True)
-        )
-
-    def outputs(
-        layer: Layer, inputs: npt.NDArray[np.float64], leaky: bool = True
-    ) -> npt.NDArray[np.float64]:
-        values = (
-            layer.weight_scale * (layer.weights.astype(float) @ inputs)
-            + layer.bias_scale * layer.biases
-        )
-        return np.where(values > 0, values, values / 8) if leaky else values
-
-    def logarithm(d: float) -> float:
-        exponent = np.floor(np.log2(1 + abs(d)))
-        return np.copysign(exponent + (1 + abs(d)) / 2**exponent - 1, d)
-
-    for at in np.ndindex(tile.shape):
-        centre = float(tile[at])
-        inputs = [
-            logarithm((float(tile[moved(at, offset)]) - centre) / (2 * head.sigma))
-            for offset in OFFSETS
-        ]
-        inputs += [
-            2 * (centre - LOW) / (HIGH - LOW) - 1,
-            logarithm((centre - LOW) / (2 * head.sigma)),
-        ]
-        hidden[at] = outputs(head.layers[0], np.array(inputs))
-    for at in np.ndindex(tile.shape):
-        seen = np.array([hidden[moved(at, offset)] for offset in (CROSS if cross else CROSS[:1])])
-        second = outputs(head.layers[1], seen.T.ravel())
-        correction = outputs(head.layers[2], second, leaky=False)[0]
-        expected[at] = np.clip(tile[at] + head.sigma * correction, LOW, HIGH)
-    np.testing.assert_allclose(head.apply(tile), expected, atol=0.02 * head.sigma)
-    assert np.abs(expected - tile).max() > head.sigma  # otherwise nothing is compared
 
 
 def test_a_strided_tile_gives_the_same_as_its_copy() -> None:

@@ -110,27 +110,10 @@ def test_references_point_back_to_bands_that_lie_alike(
                     assert (sizes[number, axis] - 1) >> shifts[axis] <= sizes[to, axis]
 
 
-def test_every_kind_of_reference_is_made() -> None:
-    spec = spec_of(("haar", "5/3", "9/7", "9/7"), 3, (8, 8, 32, 32))
-    references = band_table(spec, (8, 8, 32, 32))[:, 9:].reshape(-1, 4, 5)
-    assert (references[:, :, 0] >= 0).any(axis=0).all()
-    packets = spec_of(("haar", "5/3", "9/7", "5/3"), 3, (8, 8, 32, 32))
-    seen = band_table(packets, (8, 8, 32, 32))[:, [9, 14, 19, 24]] >= 0
-    assert seen.any(axis=0).tolist() == [True, True, True, False]
-
-
 @pytest.mark.parametrize(("spec", "shape"), CASES)
 def test_kinds_have_a_place_in_the_state(spec: TransformSpec, shape: tuple[int, ...]) -> None:
     kinds = band_table(spec, shape)[:, 8]
     assert ((kinds >= 0) & (kinds < KINDS)).all()
-
-
-def test_kinds_tell_levels_and_orientations_apart() -> None:
-    shape = (4, 4, 32, 32)
-    table = band_table(spec_of(("haar", "haar", "9/7", "9/7"), 3, shape), shape)
-    assert len({int(kind) // 4 for kind in table[:, 8]}) == 1 + 3 * 3
-    for row in table:
-        assert row[8] % 4 == 2 * (row[0] > 0) + (row[1] > 0)
 
 
 def test_a_basis_of_rank_0_has_no_band() -> None:

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from heads import random_head
-from predictors import predictor_of
 from specs import spec_of
 from tiles import (
     SETTINGS,
     SHAPE,
     damaged_copies,
+    predictor_of,
+    random_head,
     resealed,
     same,
     streams,

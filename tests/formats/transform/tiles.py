@@ -1,4 +1,4 @@
-"""A smooth tile, settings for it, and its streams in every form."""
+"""A smooth tile, settings, heads and predictors for it, and its streams in every form."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import NDArray
 from specs import spec_of
 
 from fhash_formats.native import crc32c
+from fhash_formats.transform.coder import Table
 from fhash_formats.transform.encoding import Coding, encode_tile, exact_tile
+from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.predict import Predictor, passes_of
 from fhash_formats.transform.tile_format import TileSettings
 
 Values = npt.NDArray[Any]
@@ -66,3 +70,91 @@ def damaged_copies(data: bytes) -> list[bytes]:
         for bit in range(8)
     ]
     return [*(data[:n] for n in range(len(data))), data + b"\0", data + b"\x01a", *flipped]
+
+
+NEXT = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]])
+"""FORMAT.md, Two quantisers."""
+
+
+def of_two_quantisers(indices: NDArray[np.int32], table: Table) -> NDArray[np.int32]:
+    """The integers whose indices these are, in the bands of a table; 0 elsewhere."""
+    result, state = np.zeros_like(indices), 0
+    for row in table:
+        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+        band = indices[box]
+        values = np.empty(band.size, np.int32)
+        for at, k in enumerate(band.ravel().tolist()):
+            values[at] = np.sign(k) * (2 * abs(k) - (state & 1))
+            state = NEXT[state, k & 1]
+        result[box] = values.reshape(band.shape)
+    return result
+
+
+Four = tuple[int, int, int, int]
+
+
+def predictor_of(
+    levels: Four = (2, 3, 3, 3),
+    order: Four = (0, 1, 2, 3),
+    reach: int = 1,
+    seed: int = 0,
+    step: float = 1.0,
+    origin: float = 0.0,
+) -> Predictor:
+    """A predictor with random weights for the passes of these levels, order and reach."""
+    count = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))
+    weights = np.random.default_rng(seed).integers(-300, 301, count)
+    return Predictor(
+        step=step,
+        origin=origin,
+        levels=levels,
+        order=order,
+        reach=reach,
+        weights=tuple(weights.tolist()),
+    )
+
+
+Floats = npt.NDArray[np.float32]
+
+LOW = float(np.float32(-1.25))
+HIGH = float(np.float32(2.7))
+
+
+def random_head(
+    hidden: tuple[int, ...] = (12, 8),
+    *,
+    seed: int = 0,
+    sigma: float = 0.1,
+    low: float = LOW,
+    high: float = HIGH,
+    spread: float = 8.0,
+    cross: bool = False,
+) -> NeighbourHead:
+    """A head of random weights, whose standard deviation is `spread`."""
+    random = np.random.default_rng(seed)
+    layers = []
+    for inputs, outputs in zip(layer_inputs(hidden, cross), [*hidden, 1], strict=True):
+        weights = np.rint(
+            np.clip(random.normal(size=(outputs, inputs)) * spread, -MAX_WEIGHT, MAX_WEIGHT)
+        ).astype(np.int8)
+        biases = random.integers(-127, 128, outputs).astype(np.int8)
+        layers.append(
+            Layer(
+                weights=weights,
+                biases=biases,
+                weight_scale=float(np.float16(0.02)),
+                bias_scale=float(np.float16(0.003)),
+            )
+        )
+    return NeighbourHead(
+        layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high, cross=cross
+    )
+
+
+def random_tile(shape: tuple[int, ...], seed: int = 1) -> Floats:
+    """Noise with plateaus at both ends of the clip range and constant stretches inside it."""
+    tile = np.random.default_rng(seed).normal(size=shape).astype(np.float32) * 2
+    if shape[1] > 4:
+        tile[:, : shape[1] // 2] = np.float32(0.3)
+        tile[0, -2:] = 0.0
+    return tile

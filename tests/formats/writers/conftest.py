@@ -1,5 +1,4 @@
-"""Lets the tests of this folder import the helper modules beside them, `labelled_region`
-and `read_back`.
+"""Lets the tests of this folder import the helper module beside them, `regions`.
 
 pytest's importlib mode puts no folder of tests on the path.
 """

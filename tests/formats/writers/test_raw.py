@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from labelled_region import DATA as DATA_NPY
-from labelled_region import labelled_region
+from regions import DATA as DATA_NPY
+from regions import labelled_region, region_of
 
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.readers import open_series
-from fhash_formats.series import Coordinate
 from fhash_formats.writers import Region, save_region
 
 
@@ -35,18 +35,10 @@ DATA = np.arange(48, dtype="f4").reshape(2, 2, 3, 4)
 
 
 def region(positions: dict[str, list[float]] = POSITIONS, **changes: Any) -> Region:
-    coords = {
-        axis: Coordinate(name=f"{axis} name", values=np.array(values))
-        for axis, values in positions.items()
-    }
-    coords["t"] = Coordinate(name="time", values=coords["t"].values, attributes={"units": "hours"})
-    made = {
-        "name": "wind",
-        "dtype": np.dtype("f4"),
-        "shape": tuple(len(coords[axis].values) for axis in "tzyx"),
-        "coords": coords,
-    }
-    return Region(**{**made, **changes})
+    made = region_of(positions)
+    coords = {axis: replace(each, name=f"{axis} name") for axis, each in made.coords.items()}
+    coords["t"] = replace(coords["t"], name="time", attributes={"units": "hours"})
+    return replace(made, **{"coords": coords, **changes})
 
 
 def header(path: Path) -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from read_back import READ
+from regions import READ
 
 from fhash_formats.errors import (
     FhashError,

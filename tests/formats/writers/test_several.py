@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import xarray
-from labelled_region import COORDS, SHAPE, labelled_region
+from regions import COORDS, SHAPE, labelled_region
 
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate

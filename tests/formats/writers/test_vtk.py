@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 import h5py
 import numpy as np
 import pytest
+from regions import region_of
 
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
-from fhash_formats.series import Coordinate
 from fhash_formats.writers import Region, save_check, save_region
 from fhash_formats.writers.vtk import Mesh, check_mesh_output, save_mesh
 
@@ -118,17 +118,7 @@ DATA = np.arange(36, dtype="f4").reshape(3, 1, 4, 3)
 
 
 def region(positions: dict[str, list[float]] = EVEN, **changes: Any) -> Region:
-    coords = {
-        axis: Coordinate(name=axis, values=np.array(values, dtype="f8"))
-        for axis, values in positions.items()
-    }
-    made = {
-        "name": "wind",
-        "dtype": np.dtype("f4"),
-        "shape": tuple(len(coords[axis].values) for axis in "tzyx"),
-        "coords": coords,
-    }
-    return Region(**{**made, **changes})
+    return region_of(positions, **changes)
 
 
 def one(values: dict[str, list[float]] = EVEN, **changes: Any) -> Region:
@@ -297,12 +287,7 @@ DATA_VTKHDF = np.arange(72, dtype="f4").reshape(3, 2, 4, 3)
 
 
 def region_vtkhdf(dtype: str = "f4", name: str = "wind", **axes: list[float]) -> Region:
-    positions = {**EVEN_VTKHDF, **axes}
-    coords = {
-        axis: Coordinate(name=axis, values=np.array(values)) for axis, values in positions.items()
-    }
-    t, z, y, x = (len(positions[axis]) for axis in "tzyx")
-    return Region(name=name, units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords)
+    return region_of({**EVEN_VTKHDF, **axes}, units="m/s", dtype=np.dtype(dtype), name=name)
 
 
 def test_the_structure_of_the_specification(tmp_path: Path) -> None:

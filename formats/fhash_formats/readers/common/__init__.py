@@ -1,1 +1,4 @@
-"""Parts that several readers share."""
+"""Parts that several readers share: requests, choice of variables and axes, CF, stored bytes.
+
+No reader of a format is imported here.
+"""

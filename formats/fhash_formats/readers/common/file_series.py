@@ -325,24 +325,55 @@ def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(np.uint8) if dtype.kind == "b" else dtype.newbyteorder("=")
 
 
-class FileSeries(Series):
-    """A series whose frames are fetched from a file as slices in the file's own order of
-    dimensions.
+@dataclass(frozen=True, kw_only=True)
+class StoredFiles:
+    """The files of a series.
 
-    Args:
+    Attributes:
+        source: name for messages, that of the first file.
+        stamp: checked before and after every fetch.
+        beside: further files that hold values, checked likewise.
+        folder: stamp of all files, which `FileSeries.check` alone looks at.
+        close: lets go of all that is open.
+    """
+
+    source: str
+    stamp: Stamp
+    beside: Sequence[Path] = ()
+    folder: FolderStamp | None = None
+    close: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredValues:
+    """The values of a series as they lie in its files.
+
+    Attributes:
         shape, axes: lengths and axes of the dimensions, in the file's order.
         dtype: type of the physical values, in any byte order.
         fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
         chunks: shape of a stored chunk, None without chunks. As many steps of one chunk as fit
             SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame
             at a time.
-        stamp: checked before and after every fetch.
-        beside: further files that hold values, checked likewise.
-        folder: stamp of all files, which `check` alone looks at.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
         not_stored: what nobody wrote, with the number that stands there as it is stored.
         default_fill: value as it is read that stands for one that nobody wrote, see
             `Series.defaults`.
+    """
+
+    shape: Sequence[int]
+    axes: Sequence[str]
+    dtype: np.dtype[Any]
+    fetch: Fetch
+    chunks: Sequence[int] | None = None
+    packing: Packing | None = None
+    not_stored: NotStored | None = None
+    default_fill: float | None = None
+
+
+class FileSeries(Series):
+    """A series whose frames are fetched from a file as slices in the file's own order of
+    dimensions.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -354,27 +385,16 @@ class FileSeries(Series):
     def __init__(
         self,
         *,
-        source: str,
+        files: StoredFiles,
         name: str,
-        shape: Sequence[int],
-        dtype: np.dtype[Any],
-        axes: Sequence[str],
-        fetch: Fetch,
-        stamp: Stamp,
+        values: StoredValues,
         coords: Mapping[str, Coordinate] | None = None,
         attributes: Mapping[str, Any] | None = None,
-        chunks: Sequence[int] | None = None,
-        close: Callable[[], None] = lambda: None,
-        beside: Sequence[Path] = (),
-        folder: FolderStamp | None = None,
-        packing: Packing | None = None,
-        not_stored: NotStored | None = None,
-        default_fill: float | None = None,
     ) -> None:
-        lengths = dict(zip(axes, shape, strict=True))
-        self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
-        self.files = (Path(source), *beside)
-        self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
+        lengths = dict(zip(values.axes, values.shape, strict=True))
+        self.source, self.name, self.dtype = files.source, plain_text(name), native(values.dtype)
+        self.files = (Path(files.source), *files.beside)
+        self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
         coords = dict(coords or {})
@@ -385,26 +405,25 @@ class FileSeries(Series):
             axis: index_coordinate(axis, length)
             for axis, length in zip(AXES, self.shape, strict=True)
         } | {axis: replace(each, name=plain_form(each.name)) for axis, each in coords.items()}
-        self._axes, self._fetch, self._close = tuple(axes), fetch, close
-        self._quick = (stamp, *map(Stamp.of, beside))
+        self._axes, self._fetch, self._close = tuple(values.axes), values.fetch, files.close
+        self._quick = (files.stamp, *map(Stamp.of, files.beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (
-            self._quick if folder is None else (*self._quick, folder)
+            self._quick if files.folder is None else (*self._quick, files.folder)
         )
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
-        self._together = max(
-            1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes)
-        )
+        together = _steps_of_a_chunk(self._axes, values.shape, values.chunks)
+        self._together = max(1, min(together, SLAB_BYTES // frame_bytes))
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
         self._sought: dict[float, Any] = {}
         self._met: set[float] = set()
         self.occurring = self._met
-        self.not_stored = not_stored
-        self._default, self._defaults = default_fill, set[float]()
+        self.not_stored = values.not_stored
+        self._default, self._defaults = values.default_fill, set[float]()
         self.defaults = self._defaults
-        if packing is not None:
-            note_packing(self, packing)
-        self._unpack_fill(packing)
+        if values.packing is not None:
+            note_packing(self, values.packing)
+        self._unpack_fill(values.packing)
 
     def hide(self, missing: Sequence[float]) -> None:
         """Make some values missing: they become NaN, and integers become floats.

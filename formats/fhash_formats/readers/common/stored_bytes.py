@@ -6,6 +6,7 @@ import bz2
 import re
 import zlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -14,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.variables import Variable
+from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.series import AXIS_NAMES, Coordinate
 
 BLOCK_BYTES = 8 * 2**20
@@ -493,32 +495,23 @@ def component_names(count: int, given: Sequence[str | None] = ()) -> list[str]:
 
 
 def component_variables(
-    name: str,
-    count: int,
-    shape: tuple[int, ...],
-    dtype: np.dtype[Any],
-    handle: Any,
-    *,
-    given: Sequence[str | None] = (),
-    auxiliary: bool = False,
-    error: str = "",
+    array: Variable, count: int, given: Sequence[str | None] = ()
 ) -> list[Variable]:
     """The variables of an array: itself, or one for each component, such as `velocity.x`.
 
-    The handle of each is (handle, number of the component).
+    The handle of each is (handle of the array, number of the component).
     """
     names = [""] if count == 1 else [f".{part}" for part in component_names(count, given)]
     return [
-        Variable(
-            name=f"{name}{part}",
-            shape=shape,
-            dtype=dtype,
-            auxiliary=auxiliary,
-            error=error,
-            handle=(handle, number),
-        )
+        replace(array, name=f"{array.name}{part}", handle=(array.handle, number))
         for number, part in enumerate(names)
     ]
+
+
+def choose_component(source: str, variables: Sequence[Variable], request: Request) -> Variable:
+    """The variable that the user wants; a component may be given by its number."""
+    var = component_by_number(request.var, variables)
+    return choose(source, variables, var, booleans=request.booleans)
 
 
 def component_by_number(var: str | None, variables: Sequence[Variable]) -> str | None:

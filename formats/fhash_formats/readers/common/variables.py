@@ -486,7 +486,7 @@ class FileOfArrays(ABC):
 
     @abstractmethod
     def _columns(self, group: str) -> Mapping[str, Column]:
-        """What may be a coordinate in a group, by lower-case name."""
+        """Candidates for coordinates in a group, by lower-case name."""
 
     def choose(self, var: str | None) -> Variable:
         """The variable that is wanted; see `choose`."""

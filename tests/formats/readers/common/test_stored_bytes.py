@@ -33,6 +33,7 @@ from fhash_formats.readers.common.stored_bytes import (
     lattice,
     numbers_of_words,
 )
+from fhash_formats.readers.common.variables import Variable
 
 
 @given(
@@ -171,10 +172,14 @@ def test_names_of_components() -> None:
 
 
 def test_components_are_found_by_number() -> None:
+    arrays = [
+        Variable(name=name, shape=(2, 3, 4), dtype=FLOAT, handle=handle)
+        for name, handle in (("u", "a"), ("v", "b"), ("CellData/w", "c"))
+    ]
     found = [
-        *component_variables("u", 1, (2, 3, 4), FLOAT, "a"),
-        *component_variables("v", 3, (2, 3, 4), FLOAT, "b"),
-        *component_variables("CellData/w", 2, (2, 3, 4), FLOAT, "c"),
+        *component_variables(arrays[0], 1),
+        *component_variables(arrays[1], 3),
+        *component_variables(arrays[2], 2),
     ]
     assert [each.name for each in found[:4]] == ["u", "v.x", "v.y", "v.z"]
     assert found[2].handle == ("b", 1)
