@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from html import escape
@@ -125,28 +125,15 @@ def single(panel: Panel, x: Sequence[float], y: Sequence[Any]) -> Panel:
     return replace(panel, traces=(curve("", (CYCLE[0], SYMBOLS[0]), points),))
 
 
-Pick = Callable[[Encoded, bool], float | None]
-"""Figure of an encoding, as measured or as predicted."""
+Names = tuple[str, str]
+"""Fields of an encoding: a figure as measured and as predicted, empty where none is predicted."""
 
 
 def encode_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the encodings, empty ones included."""
 
-    def seconds(point: Encoded, measured: bool) -> float | None:
-        return point.seconds if measured else point.predicted_seconds
-
-    def size(point: Encoded, measured: bool) -> float | None:
-        return point.bytes if measured else point.predicted_bytes
-
-    def psnr(point: Encoded, measured: bool) -> float | None:
-        return point.psnr if measured else point.predicted_psnr
-
-    def bulk(point: Encoded, measured: bool) -> float | None:
-        return point.psnr_bulk if measured else None
-
-    def largest(point: Encoded, measured: bool) -> float | None:
-        return point.max_abs_error if measured else None
-
+    seconds, size = ("seconds", "predicted_seconds"), ("bytes", "predicted_bytes")
+    psnr, bulk, largest = ("psnr", "predicted_psnr"), ("psnr_bulk", ""), ("max_abs_error", "")
     units = f", {report.units}" if report.units not in ("", "1") else ", in the units of the data"
     second, byte = (
         Axis(label="seconds of encoding", log=True),
@@ -182,7 +169,7 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     yield _foretold(report.encodings)
 
 
-def _frontier(points: Sequence[Encoded], x_of: Pick, y_of: Pick) -> Iterator[Trace]:
+def _frontier(points: Sequence[Encoded], x_of: Names, y_of: Names) -> Iterator[Trace]:
     """A curve of measured points for each group, and one of hollow points for the rest."""
     for place, group in enumerate(dict.fromkeys(point.group for point in points)):
         for measured in (True, False):
@@ -191,8 +178,8 @@ def _frontier(points: Sequence[Encoded], x_of: Pick, y_of: Pick) -> Iterator[Tra
                 for point in points
                 if point.group == group
                 and (point.measured if measured else point.predicted_seconds is not None)
-                and (x := x_of(point, measured)) is not None
-                and (y := y_of(point, measured)) is not None
+                and (x := getattr(point, x_of[not measured], None)) is not None
+                and (y := getattr(point, y_of[not measured], None)) is not None
                 and x > 0
             ]
             if mine:
