@@ -107,6 +107,11 @@ def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     return values
 
 
+def _mean(values: npt.NDArray[Any]) -> Any:
+    """Return the mean of some values in their number type, however large they are."""
+    return np.sum(values.astype(np.float64) / values.size).astype(values.dtype)
+
+
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     """Whether any tile of a sample has few enough different values, or regions of equal ones."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
@@ -144,7 +149,7 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
     )
     rank = rank_share(
         [
-            values if counted is None else np.where(counted, values, values[counted].mean())
+            values if counted is None else np.where(counted, values, _mean(values[counted]))
             for values, counted in sample.tiles
             if counted is None or counted.any()
         ]

@@ -74,16 +74,9 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
 
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
-    masked = MASK_ARRAY in arrays and header["model"]["profile"] == PAPER
-    if SPARSE in header["model"] and MASK_ARRAY in arrays:
-        raise DamagedFileError(
-            f"array {MASK_ARRAY} is there in a file of sparse tables, which needs {BITS_ARRAY}"
-        )
-    if masked and len(header["features"]) > MASK_FEATURES:
-        raise DamagedFileError(
-            f"array {MASK_ARRAY} is there in a file of {len(header['features'])} features; "
-            f"more than {MASK_FEATURES} need {BITS_ARRAY}"
-        )
+    masked = MASK_ARRAY in arrays
+    if masked:
+        _check_mask(header, arrays)
     for name, shape, dtypes in _required_arrays(header, arrays):
         if name == BITS_ARRAY and masked:
             continue
@@ -106,6 +99,22 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         if name in arrays and "name" in arrays[name].attributes:
             Record(arrays[name].attributes, f"array {name} attribute ").text("name")
     check_source(header, arrays)
+
+
+def _check_mask(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
+    """Check that a file may have its occupancy as a mask."""
+    reasons = (
+        (header["model"]["profile"] != PAPER, "of the profile compact, which has no such array"),
+        (SPARSE in header["model"], f"of sparse tables, which needs {BITS_ARRAY}"),
+        (
+            len(header["features"]) > MASK_FEATURES,
+            f"of {len(header['features'])} features; more than {MASK_FEATURES} need {BITS_ARRAY}",
+        ),
+        (BITS_ARRAY in arrays, f"that has {BITS_ARRAY}; only one of both may be there"),
+    )
+    for is_wrong, why in reasons:
+        if is_wrong:
+            raise DamagedFileError(f"array {MASK_ARRAY} is there in a file {why}")
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:

@@ -75,9 +75,16 @@ def test_a_mask_may_stand_in_place_of_the_bits(tmp_path, samples) -> None:
     for other in (mask[1:], mask.astype(np.int16)):
         with pytest.raises(InputError, match=r"array occupancy/mask is .* the header asks for"):
             samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": other})
+    with pytest.raises(InputError, match="only one of both may be there"):
+        samples.write(tmp_path / "b.fhz", header, samples.arrays(header) | {"occupancy/mask": mask})
     header["features"] = [f"isosurface:{n}" for n in range(9)]
     with pytest.raises(InputError, match="of 9 features; more than 8 need occupancy/bits"):
         samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": mask})
+    compact = samples.compact_header()
+    with pytest.raises(InputError, match="of the profile compact, which has no such array"):
+        samples.write(
+            tmp_path / "b.fhz", compact, samples.arrays(compact) | {"occupancy/mask": mask}
+        )
 
 
 def test_the_bits_have_a_grid_of_each_feature(tmp_path, samples) -> None:
