@@ -139,10 +139,6 @@ class StepGraphs:
         return graph, result
 
 
-SCALARS = 3
-"""Single numbers of a step."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Sent:
     """A batch of bricks and the numbers of its step, on the device.

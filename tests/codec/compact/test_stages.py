@@ -164,6 +164,14 @@ def test_labels_under_a_promise_with_tiles_that_have_none(tmp_path) -> None:
     assert size < encoded(tmp_path, values, tile="6x12x16x16")[0]
 
 
+def test_labels_whose_sum_overflows_are_labels_all_the_same(tmp_path) -> None:
+    values = (moving_regions() % 5 + 1).astype(np.float32) * np.float32(4e37)
+    values[1, 2:5, 3:9, 2:7] = np.nan
+    _, used, decoded = encoded(tmp_path, values)
+    assert "labels" in used
+    np.testing.assert_array_equal(decoded, values)
+
+
 def test_labels_on_a_plateau_are_not_believed_of_another_sample() -> None:
     """The first tile is of two values, the one with the highest cost is smooth beside them."""
     values = np.zeros((2, 8, 16, 64), "f4")
