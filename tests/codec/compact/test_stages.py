@@ -424,11 +424,3 @@ def test_a_stage_that_is_switched_off_is_never_entered(field: Field, tmp_path: P
     assert {with_all[name]["times"] for name in ("transform", "filling", "predictor", "ssim")} == {
         1
     }
-
-
-def test_labels_whose_sum_overflows_are_labels_all_the_same(tmp_path) -> None:
-    values = (moving_regions() % 5 + 1).astype(np.float32) * np.float32(4e37)
-    values[1, 2:5, 3:9, 2:7] = np.nan
-    _, used, decoded = encoded(tmp_path, values)
-    assert "labels" in used
-    np.testing.assert_array_equal(decoded, values)

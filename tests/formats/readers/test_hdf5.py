@@ -75,7 +75,7 @@ def test_filters_of_hdf5plugin_are_loaded_when_needed(tmp_path: Path) -> None:
         "'v', data=numpy.ones((2, 2, 2)), **hdf5plugin.Zstd())"
     )
     read_it = (
-        "import sys; from fhash_formats import open_series;"
+        "import sys; from fhash_formats.readers import open_series;"
         " assert open_series(sys.argv[1]).read(0).sum() == 8"
     )
     for script in (write_it, read_it):
