@@ -178,10 +178,9 @@ def eager_checkpoints() -> None:
     """Let a training save its checkpoint as often as it can."""
     import functools
 
-    import fhash_codec.paper.fit
-    from fhash_codec.paper.train import Breaks
+    from fhash_codec.paper import train
 
-    fhash_codec.paper.fit.Breaks = functools.partial(Breaks, save_seconds=0.0)  # type: ignore
+    train.Breaks = functools.partial(train.Breaks, save_seconds=0.0)  # type: ignore
 
 
 def change_at(stage: str, done: int, path: str, how: str) -> None:

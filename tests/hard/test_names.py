@@ -18,8 +18,8 @@ from fuzz import run
 from test_faults_running import PLACES
 
 import fhash_cli.main
-import fhash_codec.paper.fit
 from fhash_cli.output import Progress
+from fhash_codec.paper.train import Breaks
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -66,7 +66,7 @@ def test_functions_without_memory_exist() -> None:
 def test_what_injections_replace_exists() -> None:
     assert callable(Progress.__call__)
     assert callable(fhash_cli.main.warn)
-    assert "save_seconds" in inspect.signature(fhash_codec.paper.fit.Breaks).parameters
+    assert "save_seconds" in inspect.signature(Breaks).parameters
 
 
 def test_sources_of_the_fuzzer_exist() -> None:
