@@ -29,8 +29,8 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
-from fhash_formats.readers import list_variables, open_series
 from fhash_formats.readers.common.listing import Listed
+from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.series import Series, shown_name
 from fhash_formats.support.files import check_output
 from fhash_formats.support.values import json_attributes

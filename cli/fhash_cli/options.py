@@ -365,7 +365,7 @@ def check_writable(
     Raises InputError in every case (exit code 2): only the command line is wrong so far.
     """
     from fhash_formats.support.files import check_output
-    from fhash_formats.writers import save_check
+    from fhash_formats.writers.registry import save_check
 
     try:
         (save_check if region else check_output)(Path(path), force, sources=sources)
@@ -469,14 +469,14 @@ class SourceOptions:
 
         progress: is told that the source is being opened: many files take their time.
         """
-        from fhash_formats.readers import open_series
+        from fhash_formats.readers.registry import open_series
 
         progress("opening", 0, 1, path)
         return open_series(path, steps=self.t, keep_extremes=self.keep_extremes, **self._wishes())
 
     def list(self, path: str) -> Any:
-        """The variables at a path, as `fhash_formats.readers.list_variables` gives them."""
-        from fhash_formats.readers import list_variables
+        """The variables at a path, as `fhash_formats.readers.registry.list_variables` gives them."""
+        from fhash_formats.readers.registry import list_variables
 
         return list_variables(path, steps=self.t, **self._wishes())
 
@@ -500,7 +500,7 @@ class SourceOptions:
             raise InputError(f"--{given[0].replace('_', '-')} is for DATA that are read; name them")
 
     def _wishes(self) -> dict[str, Any]:
-        from fhash_formats.readers import RawLayout, parse_shape
+        from fhash_formats.readers.common.file_series import RawLayout, parse_shape
 
         names = [name for name, _ in self.select]
         twice = next((name for name in names if names.count(name) > 1), None)

@@ -293,7 +293,7 @@ def resolve_features(
         for feature in features
     ]
     if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
-        from fhash_formats.readers import open_mask as open_mask_file
+        from fhash_formats.readers.registry import open_mask as open_mask_file
 
         open_mask = open_mask_file
     return tuple(

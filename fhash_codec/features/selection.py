@@ -28,7 +28,6 @@ from fhash_codec.features.scan import Scan, scan
 from fhash_codec.measure.value_range import Ranks
 from fhash_codec.progress import Progress, stage
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import note_packing, packing, settled
 from fhash_formats.readers.common.file_series import Request, condense
 from fhash_formats.readers.common.layout import Dimension, Layout, arrange, must_select, single
@@ -42,6 +41,7 @@ from fhash_formats.readers.common.surroundings import (
 )
 from fhash_formats.readers.common.variables import MAX_LISTED, MIN_DIMENSIONS
 from fhash_formats.readers.netcdf import NetcdfFile, declared, stored_variable
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import (
     AXES,
     COORDINATES,

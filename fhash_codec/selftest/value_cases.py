@@ -159,7 +159,7 @@ def _from_file() -> Series:
     range."""
     import zarr
 
-    from fhash_formats.readers import open_series
+    from fhash_formats.readers.registry import open_series
 
     with tempfile.TemporaryDirectory(prefix="fhash-selftest-") as folder:
         path = Path(folder) / "declared.zarr"

@@ -24,7 +24,7 @@ Fhash = Callable[..., Result]
 @pytest.fixture(scope="module")
 def dated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A container of four steps of six hours, made of four files that count from their own day."""
-    from fhash_formats.readers import open_series
+    from fhash_formats.readers.registry import open_series
 
     folder = tmp_path_factory.mktemp("dated")
     for step in range(4):

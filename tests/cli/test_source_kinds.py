@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 from source_kinds import KINDS
 
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 
 Fhash = Callable[..., Result]
 RELATIVE = 1e-3

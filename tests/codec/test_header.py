@@ -22,7 +22,7 @@ from fhash_codec.header import (
     write_steps,
 )
 from fhash_formats.container import ContainerWriter
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 
 
 @pytest.mark.parametrize("name", ["run.h5", "RUN.NC", "a.b.vti", "run.zarr"])

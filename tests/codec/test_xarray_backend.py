@@ -27,7 +27,7 @@ from fhash_codec.config import EncodeConfig as EncodeConfig_odd_names
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate
 
 SHAPE = (5, 4, 12, 10)

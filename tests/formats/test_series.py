@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from fhash_formats.errors import InputError, RegionError
-from fhash_formats.readers import open_mask, open_series
+from fhash_formats.readers.registry import open_mask, open_series
 from fhash_formats.series import (
     ArraySeries,
     Coordinate,

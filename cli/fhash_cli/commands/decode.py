@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from fhash_codec import Volume
     from fhash_codec.progress import Progress as Callback
-    from fhash_formats.writers import Region
+    from fhash_formats.writers.common import Region
 
 
 def check_fill(kind: np.dtype[Any], fill: float | None) -> None:
@@ -504,7 +504,7 @@ def _save_surface(output: str, isosurface: float, part: Part, force: bool, run: 
 
 def _save_regions(output: str, parts: Sequence[Part], force: bool, run: str) -> list[str]:
     """Write the frames in the format of the output's suffix; the paths written."""
-    from fhash_formats.writers import save_regions
+    from fhash_formats.writers.registry import save_regions
 
     regions = [(_region(part), part.frames) for part in parts]
     return [str(path) for path in save_regions(output, regions, force=force, sources=[run])]
@@ -512,7 +512,7 @@ def _save_regions(output: str, parts: Sequence[Part], force: bool, run: str) -> 
 
 def _region(part: Part) -> Region:
     """The description of the frames for a writer."""
-    from fhash_formats.writers import Region
+    from fhash_formats.writers.common import Region
 
     volume, chosen = part.volume, part.selection
     return Region(

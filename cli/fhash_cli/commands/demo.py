@@ -80,7 +80,7 @@ def _shape(text: str) -> dict[str, int]:
         ):
             raise ValueError
         return dict(zip("zyx", map(int, words), strict=True))
-    from fhash_formats.readers import parse_shape
+    from fhash_formats.readers.common.file_series import parse_shape
 
     shape = parse_shape(text)
     if not set("zyx") <= set(shape):
@@ -189,7 +189,8 @@ def write_series(
     OutputError for a disk with too little room.
     """
     from fhash_formats.support.files import check_space
-    from fhash_formats.writers import Region, save_region
+    from fhash_formats.writers.common import Region
+    from fhash_formats.writers.registry import save_region
 
     check_writable(path, force, region=True, sources=_sources(chosen))
     check_space(path, raw_bytes(simulation) + OVERHEAD_BYTES)
@@ -357,7 +358,7 @@ def _demonstrate(
     from fhash_codec.config import EncodeConfig
     from fhash_codec.features.features import parse_feature
     from fhash_codec.volume import open as open_volume
-    from fhash_formats.readers import open_series
+    from fhash_formats.readers.registry import open_series
     from fhash_formats.support.files import replacing
 
     data, run, picture = (folder / f"{chosen.name}.{suffix}" for suffix in ("h5", "fhz", "png"))
@@ -450,7 +451,8 @@ def make_gallery(
     """
     from fhash_codec.gallery import GALLERY_SERIES, PICTURES, page
     from fhash_formats.support.files import replacing
-    from fhash_formats.writers import Region, save_region
+    from fhash_formats.writers.common import Region
+    from fhash_formats.writers.registry import save_region
 
     data, text = folder / "series", folder.with_name(f"{folder.name}.md")
     try:

@@ -1,10 +1,5 @@
-"""Writers of decoded regions: `labelled`, `raw` and `vtk`, and `registry` to find the right one.
+"""Writers of decoded regions, one file a family of formats.
 
-`common` holds the region and what writers share. Of the readers only the layout in the name of a
-raw file enters here.
+`registry` finds the writer of a path (`save_region`, `save_check`), `common` has the
+`Region` that each of them takes. No writer knows a model.
 """
-
-from fhash_formats.writers.common import Region
-from fhash_formats.writers.registry import save_check, save_region, save_regions
-
-__all__ = ["Region", "save_check", "save_region", "save_regions"]

@@ -18,7 +18,7 @@ from fhash_cli.commands.decode import RegionOptions, Selection, Statistics, conv
 from fhash_codec import EncodeConfig
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from fhash_codec.appending.writer import append
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.growing import TableParts
 from fhash_formats.errors import OutputExistsError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries
 
 SHAPE = (7, 4, 6, 8)

@@ -28,7 +28,7 @@ from fhash_codec.features.selection import (
 )
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate
 
 

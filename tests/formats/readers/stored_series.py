@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import zarr
 
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 
 VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
 """The series, (t, z, y, x)."""

@@ -17,8 +17,8 @@ import xarray as xr
 from stored_series import VALUES, assert_frames, write_hdf5
 
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
-from fhash_formats.readers import list_variables, open_series
 from fhash_formats.readers.hdf5 import openpmd_axes
+from fhash_formats.readers.registry import list_variables, open_series
 
 
 def test_links_and_cycles(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_filters_of_hdf5plugin_are_loaded_when_needed(tmp_path: Path) -> None:
         "'v', data=numpy.ones((2, 2, 2)), **hdf5plugin.Zstd())"
     )
     read_it = (
-        "import sys; from fhash_formats.readers import open_series;"
+        "import sys; from fhash_formats.readers.registry import open_series;"
         " assert open_series(sys.argv[1]).read(0).sum() == 8"
     )
     for script in (write_it, read_it):

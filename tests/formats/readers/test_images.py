@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers import open_series
 from fhash_formats.readers.images import (
     directions_of,
     dtype_of,
@@ -25,6 +24,7 @@ from fhash_formats.readers.images import (
     whole,
     words_of,
 )
+from fhash_formats.readers.registry import open_series
 
 
 def header(folder: Path, *lines: str) -> tuple[dict[str, str], dict[str, str], int]:

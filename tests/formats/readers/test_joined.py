@@ -13,9 +13,9 @@ import pytest
 import xarray as xr
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers import RawLayout, open_series
-from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.file_series import FileSeries, RawLayout
 from fhash_formats.readers.joined import JoinedSeries, natural_order
+from fhash_formats.readers.registry import open_series
 
 
 def part(number: int, *, units: str = "days since 2000-01-01", **more: object) -> xr.Dataset:

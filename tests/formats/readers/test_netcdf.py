@@ -15,8 +15,8 @@ import xarray as xr
 from stored_series import VALUES, assert_frames, frames, save_netcdf
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers import list_variables, open_series
 from fhash_formats.readers.netcdf3 import ClassicStore, read_header
+from fhash_formats.readers.registry import list_variables, open_series
 
 DIMS = ("time", "lev", "lat", "lon")
 

@@ -13,7 +13,7 @@ import pytest
 import zarr
 
 from fhash_formats.errors import FhashError, InputError
-from fhash_formats.readers import list_variables, open_series
+from fhash_formats.readers.registry import list_variables, open_series
 
 VALUES = np.arange(2 * 3 * 4 * 5, dtype="<f4").reshape(2, 3, 4, 5) + 1
 GRID = (

@@ -12,8 +12,8 @@ import pytest
 from stored_series import VALUES, assert_frames, frames
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers import RawLayout, list_variables, open_series
-from fhash_formats.readers.common.file_series import DTYPES
+from fhash_formats.readers.common.file_series import DTYPES, RawLayout
+from fhash_formats.readers.registry import list_variables, open_series
 
 
 @pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", "f2", "u1", ">i2", "u8"])

@@ -15,9 +15,11 @@ import zarr
 
 from fhash_formats.container.zip_file import ending
 from fhash_formats.errors import FhashError, InputError, MissingInputError, RegionError
-from fhash_formats.readers import REGISTRY, RawLayout, list_variables, open_mask, open_series
+from fhash_formats.readers.common.file_series import RawLayout
+from fhash_formats.readers.registry import REGISTRY, list_variables, open_mask, open_series
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import Region, save_region
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_region
 
 MASK = np.random.default_rng(0).random((4, 3, 5, 6)) < 0.4
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 
 tifffile = pytest.importorskip("tifffile")
 

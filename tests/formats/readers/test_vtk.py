@@ -17,11 +17,13 @@ import pytest
 import vtk_files
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers import open_series, vtk_document
+from fhash_formats.readers import vtk_document
 from fhash_formats.readers.common.variables import SeveralVariablesError
+from fhash_formats.readers.registry import open_series
 from fhash_formats.readers.vtk_document import Document, VtkArrays, parse
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import Region, save_region
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_region
 
 VALUES = np.random.default_rng(0).normal(size=(3, 2, 3, 4)).astype("f4")
 ROW = '<DataSet timestep="{}" part="{}" file="{}"/>'

@@ -11,7 +11,7 @@ import numpy as np
 import xarray
 
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import Region
+from fhash_formats.writers.common import Region
 
 
 def vtk_frames(paths: list[Path]) -> np.ndarray:

@@ -16,8 +16,6 @@ from regions import COORDS, DATA, SHAPE, labelled_region
 
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
-from fhash_formats.writers import Region as Region_outline
-from fhash_formats.writers import save_region
 from fhash_formats.writers.common import (
     CHUNK_BYTES,
     HeldFile,
@@ -31,6 +29,8 @@ from fhash_formats.writers.common import (
     safe_names,
     variable_attributes,
 )
+from fhash_formats.writers.common import Region as Region_outline
+from fhash_formats.writers.registry import save_region
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".nc"])

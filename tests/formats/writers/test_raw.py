@@ -12,8 +12,9 @@ from regions import DATA as DATA_NPY
 from regions import labelled_region, region_of
 
 from fhash_formats.errors import InputError, OutputExistsError
-from fhash_formats.readers import open_series
-from fhash_formats.writers import Region, save_region
+from fhash_formats.readers.registry import open_series
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_region
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "i2"])

@@ -24,8 +24,8 @@ from fhash_formats.errors import (
     OutputExistsError,
 )
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import Region, save_check, save_region
-from fhash_formats.writers.registry import WRITERS
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import WRITERS, save_check, save_region
 
 SUFFIXES = [suffix for writer in WRITERS for suffix in writer.suffixes]
 SHAPE = (3, 4, 5, 6)
@@ -249,7 +249,8 @@ def test_a_full_disk_leaves_what_was_there(
 FULL = """
 import json, resource, sys
 import numpy as np
-from fhash_formats.writers import Region, save_region
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_region
 from fhash_formats.errors import FhashError
 from fhash_formats.series import Coordinate
 

@@ -14,7 +14,8 @@ from regions import COORDS, SHAPE, labelled_region
 
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
-from fhash_formats.writers import Region, save_check, save_region, save_regions
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_check, save_region, save_regions
 
 RNG = np.random.default_rng(5)
 VALUES = {

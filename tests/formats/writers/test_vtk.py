@@ -12,7 +12,8 @@ import pytest
 from regions import region_of
 
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
-from fhash_formats.writers import Region, save_check, save_region
+from fhash_formats.writers.common import Region
+from fhash_formats.writers.registry import save_check, save_region
 from fhash_formats.writers.vtk import Mesh, check_mesh_output, save_mesh
 
 MESH = Mesh(

@@ -14,8 +14,8 @@ import zarr
 from stored_series import VALUES, create_zarr, frames, save_netcdf, write_hdf5
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import Column, counts_steps, join_times, packing, real_time
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import Coordinate
 
 

@@ -16,19 +16,21 @@ import zarr
 from stored_series import VALUES
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers import RawLayout, open_series, parse_shape
 from fhash_formats.readers.common.file_series import (
     DTYPES,
     LONGEST_MESSAGE,
     FileSeries,
     FolderStamp,
+    RawLayout,
     Request,
     Stamp,
     condense,
     parse_axes,
     parse_dtype,
+    parse_shape,
     refusing,
 )
+from fhash_formats.readers.registry import open_series
 
 
 def test_a_message_is_one_line_of_bounded_length() -> None:

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from stored_series import VALUES
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers import open_series
 from fhash_formats.readers.common import stored_bytes
 from fhash_formats.readers.common import stored_bytes as flat
 from fhash_formats.readers.common.stored_bytes import (
@@ -34,6 +33,7 @@ from fhash_formats.readers.common.stored_bytes import (
     numbers_of_words,
 )
 from fhash_formats.readers.common.variables import Variable
+from fhash_formats.readers.registry import open_series
 
 
 @given(

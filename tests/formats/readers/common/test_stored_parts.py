@@ -14,7 +14,7 @@ import pytest
 import zarr
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers import open_series
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import NotStored, Series, spans_text
 
 VALUES = np.arange(6 * 4 * 3 * 5, dtype=np.float32).reshape(6, 4, 3, 5) + 7

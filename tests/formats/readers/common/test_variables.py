@@ -12,7 +12,6 @@ import pytest
 from stored_series import VALUES, assert_frames, write_hdf5
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers import open_series
 from fhash_formats.readers.common.cf import packing
 from fhash_formats.readers.common.file_series import RawLayout, Request
 from fhash_formats.readers.common.layout import Dimension
@@ -25,6 +24,7 @@ from fhash_formats.readers.common.variables import (
     join,
     times,
 )
+from fhash_formats.readers.registry import open_series
 
 NESTED = np.dtype(
     [("rho", "f4"), ("v", [("x", "f8"), ("y", "f8")], (2,)), ("w", "i2", (3,)), ("c", "c8")]
