@@ -475,7 +475,7 @@ class SourceOptions:
         return open_series(path, steps=self.t, keep_extremes=self.keep_extremes, **self._wishes())
 
     def list(self, path: str) -> Any:
-        """The variables at a path, as `fhash_formats.readers.registry.list_variables` gives them."""
+        """The variables at a path, as `list_variables` gives them."""
         from fhash_formats.readers.registry import list_variables
 
         return list_variables(path, steps=self.t, **self._wishes())
