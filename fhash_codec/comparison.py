@@ -16,15 +16,15 @@ import numpy.typing as npt
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.selection import Source, open_source
 from fhash_codec.measure.errors import find_bulk
+from fhash_codec.measure.metrics import BUDGET as SSIM_BUDGET
 from fhash_codec.measure.metrics import (
     Comparer,
     Comparison,
     NeighboursOf,
     measure_quality,
     neighbours_of,
+    ssim_steps,
 )
-from fhash_codec.measure.ssim import BUDGET as SSIM_BUDGET
-from fhash_codec.measure.ssim import ssim_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume

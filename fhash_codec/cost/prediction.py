@@ -28,7 +28,7 @@ from fhash_codec.compact.head import (
     likely_heads,
 )
 from fhash_codec.compact.head_training import Budget
-from fhash_codec.compact.labels import ends_trials
+from fhash_codec.compact.plan import ends_trials
 from fhash_codec.compact.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.stages import (
     LARGE,
@@ -57,7 +57,7 @@ from fhash_codec.cost.probe import (
     updates_of,
 )
 from fhash_codec.encoding import DECODED_AGAIN
-from fhash_codec.measure.ssim import ssim_steps
+from fhash_codec.measure.metrics import ssim_steps
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Series, StepsSeries

@@ -33,7 +33,7 @@ from fhash_codec.compact.head_training import (
     Budget,
     train_head,
 )
-from fhash_codec.compact.labels import LabelTrial, has_labels, look_at_labels
+from fhash_codec.compact.plan import LabelTrial, has_labels, look_at_labels
 from fhash_codec.compact.predictor import TRIAL_ROWS, IntegerTile, fit_weights
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import first_guess, first_settings
@@ -45,8 +45,7 @@ from fhash_codec.encoding import encode
 from fhash_codec.features.bricks import BRICK_BITS
 from fhash_codec.features.selection import FeatureSelection, select_features
 from fhash_codec.measure.errors import find_bulk
-from fhash_codec.measure.metrics import Comparer, measure_quality
-from fhash_codec.measure.ssim import BUDGET, ssim_steps
+from fhash_codec.measure.metrics import BUDGET, Comparer, measure_quality, ssim_steps
 from fhash_codec.progress import recording, silent
 from fhash_formats.errors import FhashWarning, QualityError
 from fhash_formats.series import Series

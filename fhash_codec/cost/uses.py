@@ -19,7 +19,7 @@ from fhash_codec.cost.encodings import KeptFile
 from fhash_codec.cost.plan import Allowance, Facts
 from fhash_codec.cost.results import Picture, Read
 from fhash_codec.measure.errors import psnr
-from fhash_codec.measure.ssim import ssim
+from fhash_codec.measure.metrics import ssim
 from fhash_codec.progress import Progress
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
@@ -232,7 +232,7 @@ def picture_psnr(
 
 def picture_ssim(picture: Pixels, other: Pixels) -> float:
     """Mean structural similarity of bytes (H, W, 3) over the channels; see
-    `fhash_codec.measure.ssim`."""
+    `fhash_codec.measure.metrics`."""
     total = count = 0.0
     for channel in range(3):
         similarity, number = ssim(picture[None, ..., channel], other[None, ..., channel], 255.0)

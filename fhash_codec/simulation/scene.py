@@ -9,9 +9,19 @@ from pathlib import Path
 from typing import Any, Self
 
 from fhash_codec.records import Record, limits
-from fhash_codec.simulation.bodies import Blob, Diffusion, Fingers, Front, Shell
-from fhash_codec.simulation.effect import Effect
-from fhash_codec.simulation.flows import Advection, Buoyancy, Rotation, Turbulence, Vortex
+from fhash_codec.simulation.effects import (
+    Advection,
+    Blob,
+    Buoyancy,
+    Diffusion,
+    Effect,
+    Fingers,
+    Front,
+    Rotation,
+    Shell,
+    Turbulence,
+    Vortex,
+)
 from fhash_formats.errors import InputError, suggestion
 
 EFFECTS: dict[str, type[Effect]] = {

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.simulation.effect import Array, Bend, Body, Effect, Flow, Place, Surface, Vector
+from fhash_codec.simulation.effects import Array, Bend, Body, Effect, Flow, Place, Surface, Vector
 from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series

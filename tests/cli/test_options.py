@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import click
+import h5py
 import numpy as np
 import pytest
+import xarray
 from click.testing import CliRunner, Result
 
 import fhash_codec
@@ -24,7 +29,11 @@ from fhash_cli.options import (
     parse_slice,
     written,
 )
+from fhash_cli.selection import region_of_box, steps_of
+from fhash_cli.variables import config_of, configs_of
 from fhash_codec.config import EncodeConfig
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import Coordinate
 
 WHOLE = (None, None)
 LATTICE = np.arange(4 * 5 * 6).reshape(4, 5, 6)
@@ -321,3 +330,258 @@ def test_a_fill_value_that_nobody_declared(
     np.testing.assert_allclose(decoded[2:], values[2:], atol=1)
     measured = fhash("diff", tmp_path / "a.npy", tmp_path / "a.fhz", "--missing", "1e20", "--json")
     assert measured.exit_code == 0
+
+
+COORDINATE = Coordinate(name="x", values=np.array([1.0, 2.0, 4.0, 8.0]))
+VOLUME = cast(
+    fhash_codec.Volume,
+    SimpleNamespace(shape=(4, 4, 4, 4), coords=dict.fromkeys("tzyx", COORDINATE)),
+)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "steps"),
+    [(None, [0, 1, 2, 3]), (slice(-1, None), [3]), (slice(1, 4, 2), [1, 3]), (slice(0, 1), [0])],
+)
+def test_steps_are_those_of_a_python_slice(chosen: slice | None, steps: list[float]) -> None:
+    assert steps_of(VOLUME, chosen) == steps
+
+
+@pytest.mark.parametrize(
+    ("positions", "box", "expected"),
+    [
+        ([0.0, 5.0, 1.0, 6.0], (0.5, 2.0), (2, 3)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 6.0), (0, 4)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 1.0), None),
+        ([0.0, 1.0, 1.0, 2.0], (1.0, 1.0), (1, 3)),
+        ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
+    ],
+)
+def test_a_box_never_gives_vertices_outside_it(
+    positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None
+) -> None:
+    coordinate = Coordinate(name="x", values=np.array(positions))
+    volume = cast(
+        fhash_codec.Volume,
+        SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}),
+    )
+    if expected is None:
+        with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
+            region_of_box(volume, [(None, None), (None, None), box])
+    else:
+        assert region_of_box(volume, [(None, None), (None, None), box])[2] == expected
+
+
+def test_a_box_outside_by_little_says_by_how_much() -> None:
+    coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
+    volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
+    with pytest.raises(
+        RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"
+    ):
+        region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])
+
+
+SHAPE = (3, 6, 7, 8)
+
+
+def values(scale: float) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
+    return (scale * np.sin(0.3 * (x + y) + t) + z).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def data_variables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two variables of four axes, one of five, and numbers along one."""
+    path = tmp_path_factory.mktemp("several") / "data.h5"
+    with h5py.File(path, "w") as file:
+        file["u"], file["v"] = values(1), values(2)
+        file["members"] = np.stack([values(1)] * 2)
+        file["numbers"] = np.arange(3.0)
+        file["u"].attrs["units"] = "m s-1"
+    return path
+
+
+@pytest.fixture(scope="module")
+def run_variables(data_variables: Path) -> Path:
+    path = data_variables.with_name("run.fhz")
+    config = fhash_codec.EncodeConfig(effort=1, max_error=0.01)
+    fhash_codec.encode_dataset(data_variables, path, config, variables=["u", "v"])
+    return path
+
+
+def test_all_takes_what_can_be_encoded_as_it_is(
+    fhash: Fhash, data_variables: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data_variables, "-o", path, "--effort", 1]
+    result = fhash(*words, "--var", "all", "--max-error", "u=0.1,v=0.2")
+    assert result.exit_code == 0
+    assert (
+        f"--var all makes no variables of members, numbers; fhash info {data_variables} says why"
+        in result.stderr
+    )
+    rows = [line.split() for line in result.stdout.splitlines() if line[:1] in ("u", "v")]
+    assert [row[0] for row in rows] == ["variable", "u", "v"]
+    info = json.loads(fhash("info", path, "--json").stdout)
+    bounds = {name: each["config"]["max_error"] for name, each in info["variables"].items()}
+    assert bounds == {"u": 0.1, "v": 0.2}
+    assert info["bytes"] == path.stat().st_size
+
+
+def test_components_become_variables(fhash: Fhash, data_variables: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run.fhz"
+    words = ["encode", data_variables, "-o", path, *SMALL, "--components", "dim0", "--json"]
+    result = fhash(*words, "--max-error", "members_1=0.5")
+    assert list(json.loads(result.stdout)["variables"]) == ["members_0", "members_1"]
+    report = json.loads(fhash("info", path, "--json").stdout)["variables"]
+    assert report["members_1"]["config"]["max_error"] == 0.5
+    assert report["members_0"]["variable"]["name"] == "members"
+    difference = ["diff", data_variables, path, "--var", "members", "--select", "dim0=1", "--json"]
+    assert json.loads(fhash(*difference).stdout)["max_abs_error"] <= 0.5
+    result = fhash(*words, "--var", "all", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == [
+        *(f"members_{n}" for n in range(2)),
+        "u",
+        "v",
+    ]
+    result = fhash(*words, "--var", "u,members", "--force")
+    assert list(json.loads(result.stdout)["variables"]) == ["u", "members_0", "members_1"]
+
+
+def test_decode_and_render_take_one(fhash: Fhash, run_variables: Path, tmp_path: Path) -> None:
+    assert fhash("decode", run_variables, "--var", "v", "-o", tmp_path / "v.npy").exit_code == 0
+    assert np.abs(np.load(tmp_path / "v.npy") - values(2)).max() <= 0.01
+    picture = tmp_path / "v.png"
+    words = ["render", run_variables, "--size", "16x16", "-o", picture]
+    assert fhash(*words, "--var", "v").exit_code == 0
+    assert picture.exists()
+
+
+def test_diff_compares_one_with_its_data(
+    fhash: Fhash, run_variables: Path, data_variables: Path
+) -> None:
+    for name in "uv":
+        words = [
+            "diff",
+            data_variables,
+            run_variables,
+            "--var",
+            name,
+            "--max-error",
+            0.01,
+            "--json",
+        ]
+        result = fhash(*words)
+        assert result.exit_code == 0
+        assert json.loads(result.stdout)["max_abs_error"] <= 0.01
+        assert json.loads(result.stdout)["differences"] == []
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+@pytest.mark.parametrize("names", [None, "v, u", "v"])
+def test_decode_writes_all_or_those_that_are_named_into_one_output(
+    fhash: Fhash, run_variables: Path, tmp_path: Path, suffix: str, names: str | None
+) -> None:
+    path = tmp_path / f"out{suffix}"
+    words = ["decode", run_variables, "-o", path, "--t", "1:", "--json"]
+    result = fhash(*words, *([] if names is None else ["--var", names]))
+    assert result.exit_code == 0
+    told, chosen = json.loads(result.stdout), ["u", "v"] if names != "v" else ["v"]
+    parts = told["variables"] if len(chosen) > 1 else {"v": told}
+    assert told["paths"] == [str(path)]
+    assert sorted(parts) == chosen
+    with fhash_codec.open(run_variables) as dataset:
+        for name in chosen:
+            expected = dataset[name][1:]
+            assert parts[name]["shape"] == list(expected.shape)
+            assert parts[name]["max"] == expected.max()
+            if suffix == ".h5":
+                with h5py.File(path) as file:
+                    found = np.asarray(file[name])
+            else:
+                engine = "zarr" if suffix == ".zarr" else "h5netcdf"
+                with xarray.open_dataset(path, engine=engine, decode_times=False) as data_variables:
+                    found = np.asarray(data_variables[name])
+            np.testing.assert_array_equal(found.reshape(expected.shape), expected)
+
+
+def test_decode_refuses_what_one_output_cannot_hold(
+    refused: Callable[..., str], run_variables: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "out.npy"
+    assert "holds one variable, and there are 2" in refused(2, "decode", run_variables, "-o", path)
+    surface = ["--isosurface", 1, "-o", tmp_path / "out.ply"]
+    assert "several variables, u, v; choose one" in refused(2, "decode", run_variables, *surface)
+    message = refused(2, "decode", run_variables, "--var", "u,w", "-o", tmp_path / "out.nc")
+    assert "has no variable 'w'; it holds u, v" in message
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["render", "diff", "export"])
+def test_a_variable_must_be_named(
+    refused: Callable[..., str],
+    run_variables: Path,
+    data_variables: Path,
+    tmp_path: Path,
+    command: str,
+) -> None:
+    words = {
+        "diff": [data_variables, run_variables],
+        "export": [run_variables, "--plain", "-o", tmp_path / "plain.fhz"],
+    }
+    message = refused(2, command, *words.get(command, [run_variables]))
+    assert "holds several variables, u, v; choose one" in message
+    if command != "export":
+        message = refused(2, command, *words.get(command, [run_variables]), "--var", "w")
+        assert "has no variable 'w'; it holds u" in message
+
+
+BAD = {
+    "a name twice": (["--var", "u,u"], "has 'u' where another name"),
+    "an empty name": (["--var", "u,"], "has '' where another name"),
+    "an unknown variable": (["--var", "u,q"], "no variable 'q'"),
+    "one that needs a choice": (["--var", "u,members"], "members"),
+    "a promise for no variable": (
+        ["--var", "u,v", "--psnr", "q=40"],
+        "--psnr names q, which is none of the variables u, v",
+    ),
+    "a promise by name for one": (["--var", "u", "--psnr", "u=40"], "give the number alone"),
+    "a promise twice": (["--var", "u,v", "--psnr", "u=40,u=41"], "for each name once"),
+    "a promise that is no number": (["--var", "u,v", "--psnr", "u=a"], "not a valid"),
+    "a promise beyond its range": (["--var", "u,v", "--psnr", "u=-1"], "not in the range"),
+    "two promises for one": (
+        ["--var", "u,v", "--psnr", "u=40", "--max-error", "u=1"],
+        "promise one of them",
+    ),
+    "components of no dimension": (["--components", "dim9"], "no variable has that dimension"),
+    "an axis as components": (["--components", "t"], "no variable has that dimension"),
+    "a budget": (["--var", "u,v", "--time-budget", "9s"], "are for one variable"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_commands(
+    refused: Callable[..., str], data_variables: Path, tmp_path: Path, case: str
+) -> None:
+    words, message = BAD[case]
+    output = tmp_path / "run.fhz"
+    assert message in refused(2, "encode", data_variables, "-o", output, *SMALL, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def settings(**given: object) -> dict[str, object]:
+    promises = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
+    return {**dict.fromkeys(promises), **given}
+
+
+def test_a_promise_by_name_stands_in_place_of_those_for_all() -> None:
+    configs = configs_of(settings(psnr=50.0, max_error={"v": 0.5}, effort=3), ["u", "v"])
+    assert [(c.psnr, c.max_error, c.effort) for c in configs.values()] == [
+        (50, None, 3),
+        (None, 0.5, 3),
+    ]
+    (config,) = configs_of(settings(psnr={"u": 40.0}, psnr_bulk={"u": 30.0}), ["u"]).values()
+    assert (config.psnr, config.psnr_bulk) == (40, 30)
+    assert config_of(settings(ratio=8.0)).ratio == 8
+    with pytest.raises(InputError, match="number for u"):
+        config_of(settings(ratio={"u": 8.0}))

@@ -23,7 +23,6 @@ from xarray.core import indexing
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.config import EncodeConfig as EncodeConfig_odd_names
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats.errors import FhashWarning, InputError
@@ -109,7 +108,7 @@ NAMES = {
     "a b": "a b",
     "\ud800": "?",
 }
-CONFIG = EncodeConfig_odd_names(max_error=0.01, effort=1)
+CONFIG = EncodeConfig(max_error=0.01, effort=1)
 
 
 def zarr_2(folder: Path, names: list[str]) -> Path:

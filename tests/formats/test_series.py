@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import zarr
 
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats import errors
+from fhash_formats.errors import InputError, RegionError, suggestion
 from fhash_formats.readers.registry import open_mask, open_series
 from fhash_formats.series import (
     ArraySeries,
@@ -212,3 +213,50 @@ def test_attributes_follow_the_new_names_of_arrays() -> None:
         "formula_terms": "a: a_2 b: b",
         "long_name": "lat",
     }
+
+
+NAMES = ("shadows", "shading", "box")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("shadow", "did you mean 'shadows'?"),
+        ("shadng", "did you mean 'shading'?"),
+        ("foo", "known: shadows, shading, box"),
+        ("", "known: shadows, shading, box"),
+        ("x" * 10_000, "known: shadows, shading, box"),
+    ],
+)
+def test_suggestion(name: str, text: str) -> None:
+    assert suggestion(name, NAMES) == text
+
+
+@pytest.mark.parametrize(
+    ("error", "base", "exit_code"),
+    [
+        (errors.InputError, ValueError, 2),
+        (errors.MissingInputError, FileNotFoundError, 2),
+        (errors.RegionError, IndexError, 2),
+        (errors.OutputExistsError, FileExistsError, 2),
+        (errors.OutputError, OSError, 1),
+        (errors.QualityError, Exception, 3),
+        (errors.DamagedFileError, ValueError, 4),
+        (errors.UnsupportedFileError, errors.DamagedFileError, 4),
+        (errors.TrainingError, ArithmeticError, 1),
+        (errors.MissingDependencyError, ImportError, 2),
+        (errors.InterruptedEncodingError, Exception, 130),
+    ],
+)
+def test_every_error_has_its_base_and_its_exit_code(
+    error: type[errors.FhashError], base: type[Exception], exit_code: int
+) -> None:
+    assert issubclass(error, errors.FhashError)
+    assert issubclass(error, base)
+    assert error.exit_code == exit_code
+    assert str(error("what is wrong")) == "what is wrong"
+
+
+def test_a_missed_quality_has_its_figures() -> None:
+    assert errors.QualityError("missed", {"psnr": 40.0}).figures == {"psnr": 40.0}
+    assert errors.QualityError("missed").figures == {}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +15,43 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import DamagedFileError, EncodeConfig, InputError, Writer
+from fhash_codec import (
+    ClusterError,
+    DamagedFileError,
+    EncodeConfig,
+    InputError,
+    UnsupportedFileError,
+    Writer,
+)
+from fhash_codec.appending import cluster as rooms
+from fhash_codec.appending import series_plan
+from fhash_codec.appending.cluster import HeldSteps
 from fhash_codec.appending.parts import Part, encode_part, merge
-from fhash_codec.appending.series_plan import SeriesPlan, plan_parts
+from fhash_codec.appending.series_plan import (
+    Filling,
+    Recipe,
+    SeriesPlan,
+    bounded,
+    code_layers,
+    plan_parts,
+)
 from fhash_codec.appending.writer import append
+from fhash_codec.boxes import Box
+from fhash_codec.compact import encode
+from fhash_codec.compact import tiles as blocks
+from fhash_codec.compact.tiles import Blocks, Coding, code
+from fhash_codec.compact.transform import usual_transform
+from fhash_codec.features.features import Extent
+from fhash_codec.progress import silent
 from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container import record as strict_json
 from fhash_formats.container.growing import TableParts
-from fhash_formats.errors import OutputExistsError
+from fhash_formats.container.record import Record
+from fhash_formats.errors import FhashError, MissingInputError, OutputExistsError
 from fhash_formats.readers.registry import open_series
-from fhash_formats.series import ArraySeries
+from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (7, 4, 6, 8)
 TILE = "2x4x6x4"
@@ -295,3 +326,375 @@ def test_a_part_refuses_a_plan_of_others(tmp_path) -> None:
             encode_part(source, tmp_path / "2.fhz", config, one, plan=plan)
     encode_part(values_parts(), tmp_path / "2.fhz", CONFIG, one, plan=plan)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+SHAPE_SERIES_PLAN = (6, 4, 6, 8)
+CONFIG_SERIES_PLAN = EncodeConfig(
+    max_error=0.02, effort=2, tile="2x4x6x4", features=("interval:0.3:9",)
+)
+
+
+def series(**labels) -> ArraySeries:
+    noise = np.random.default_rng(0).random(SHAPE_SERIES_PLAN)
+    values = np.sin(np.linspace(0, 6, SHAPE_SERIES_PLAN[3])) + 0.05 * noise
+    given = {"name": "u", "units": "m", "coords": times([0, 1, 2, 4, 5, 6]), **labels}
+    return ArraySeries(given.pop("values", values.astype(np.float32)), **given)
+
+
+def times(values: list[float]) -> dict[str, Coordinate]:
+    return {"t": Coordinate(name="time", values=np.array(values, dtype=float))}
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("plan") / "run.plan"
+    plan_parts(series(), path, CONFIG_SERIES_PLAN)
+    return path
+
+
+def test_a_plan_comes_back_from_its_file(plan) -> None:
+    made, read = SeriesPlan.make(series(), bounded(CONFIG_SERIES_PLAN)), SeriesPlan.read(plan)
+    assert read.to_bytes() == plan.read_bytes() == made.to_bytes()
+    assert (read.shape, read.layers, read.config.timings) == (SHAPE_SERIES_PLAN, 3, False)
+    assert read.steps(range(1, 3)) == range(2, 6)
+    read.require(series())
+
+
+@pytest.mark.parametrize("promise", [{"psnr": 40}, {"ratio": 9}, {}, {"profile": "paper"}])
+def test_only_a_bound_is_planned(tmp_path, promise) -> None:
+    with pytest.raises(InputError, match="give max_error or max_error_rel"):
+        plan_parts(series(), tmp_path / "a.plan", EncodeConfig(**promise))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_plan_is_refused(tmp_path) -> None:
+    path = tmp_path / "a.plan"
+    with pytest.raises(MissingInputError, match="does not exist; `fhash plan` makes a plan"):
+        SeriesPlan.read(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        SeriesPlan.read(tmp_path)
+    path.write_text("{}")
+    with pytest.raises(InputError, match=r"a\.plan is no plan"):
+        SeriesPlan.read(path)
+    for data in (b"", b"PK\x03\x04", b"\x80\x04]", b"[]", b" " * (series_plan.MAX_BYTES + 9)):
+        path.write_bytes(data)
+        with pytest.raises(DamagedFileError, match=r"a\.plan is damaged, or no plan"):
+            SeriesPlan.read(path)
+
+
+def test_every_cut_and_changed_byte_is_found(plan) -> None:
+    data = plan.read_bytes()
+    for place in range(0, len(data), 7):
+        with pytest.raises(FhashError):
+            SeriesPlan.from_bytes(data[:place])
+        changed = bytearray(data)
+        changed[place] ^= 1
+        with pytest.raises(FhashError):
+            SeriesPlan.from_bytes(bytes(changed))
+
+
+def changed(path: Path, change) -> bytes:
+    """A plan with other values, and the digest of these."""
+    values = json.loads(path.read_bytes())
+    del values["digest"]
+    change(values)
+    values["digest"] = hashlib.sha256(strict_json.dumps(values, "plan")).hexdigest()
+    return strict_json.dumps(values, "plan")
+
+
+def test_a_plan_of_another_version_is_refused(plan) -> None:
+    data = changed(plan, lambda values: values.update(version="9.9"))
+    with pytest.raises(UnsupportedFileError, match=r"made by fhash 9\.9, and this is"):
+        SeriesPlan.from_bytes(data)
+
+
+HOSTILE = {
+    "no labels": lambda values: values.pop("labels"),
+    "labels": lambda values: values.update(labels=[]),
+    "shape": lambda values: values["labels"].update(shape=[1, 2, 3]),
+    "huge shape": lambda values: values["labels"].update(shape=[1 << 50, 4, 6, 8]),
+    "box": lambda values: values.update(box=[[0, 4], [0, 6], [0, 9]]),
+    "empty box": lambda values: values.update(box=[[0, 4], [0, 6], [3, 3]]),
+    "box of text": lambda values: values.update(box=[[0, 4], [0, 6], ["0", 3]]),
+    "samples": lambda values: values.update(samples=0),
+    "more samples": lambda values: values.update(samples=1 << 40),
+    "range": lambda values: values.update(value_range=[1, 0]),
+    "missing": lambda values: values.update(has_missing=0),
+    "tile": lambda values: values["recipe"].update(tile=[7, 4, 6, 4]),
+    "step": lambda values: values["recipe"]["settings"].update(step=-1),
+    "basis": lambda values: values["recipe"]["settings"]["transform"].update(t={"klt": "AAAA"}),
+    "coding": lambda values: values["recipe"].update(coding=None),
+    "promise": lambda values: values["config"].update(max_error=None),
+    "setting": lambda values: values["config"].update(effort=99),
+    "unknown setting": lambda values: values["config"].update(os="system"),
+    "no model": lambda values: values["header"].pop("model"),
+    "gains": lambda values: values["header"]["model"].update(gains={}),
+    "parameters": lambda values: values["header"]["model"].update(parameters="a"),
+    "features": lambda values: values.update(features=[1]),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_plan_is_refused(plan, case) -> None:
+    with pytest.raises(DamagedFileError, match="the plan is damaged: "):
+        SeriesPlan.from_bytes(changed(plan, HOSTILE[case]))
+
+
+TILE_SERIES_PLAN = (2, 4, 4, 4)
+SETTINGS = TileSettings(
+    transform=usual_transform(TILE_SERIES_PLAN), step=0.1, center=0.5, low=0.0, high=1.0
+)
+RECIPE = Recipe(
+    tile=TILE_SERIES_PLAN, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=4)
+)
+FILLED = replace(RECIPE, filling=Filling(settings=replace(SETTINGS, step=0.2), density=2))
+
+
+def read(values) -> Recipe:
+    return Recipe.from_dict(Record(values, "recipe."))
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, FILLED])
+@pytest.mark.parametrize("layers", [range(0, 1), range(1, 3)])
+def test_some_layers_have_the_bytes_of_the_whole(recipe, layers) -> None:
+    values = np.random.default_rng(0).random((5, 4, 6, 8), dtype=np.float32)
+    packed = [np.packbits(frame < 0.8) for frame in values]
+    extent = Extent(
+        box=Box.of_shape(values.shape[1:]),
+        key_frames=tuple(range(5)),
+        packed=packed,
+        domain=values.shape[1:],
+        samples=int((values < 0.8).sum()),
+        background=0.0,
+    )
+    blocks = Blocks(ArraySeries(values), extent, TILE_SERIES_PLAN)
+    with thread_pool() as workers:
+        whole = code_layers(blocks, recipe, range(3), workers, silent)
+        some = code_layers(blocks.by_layers(), recipe, layers, workers, silent)
+    per_layer = len(whole.streams) // 3
+    assert some.streams == whole.streams[layers.start * per_layer : layers.stop * per_layer]
+    assert some.outcome.size == sum(map(len, some.streams))
+    assert whole.outcome.max_error <= 0.05
+    if recipe is RECIPE:
+        tile = blocks.read((0, 0, 0, 0))
+        assert code(tile, SETTINGS, RECIPE.coding)[0].data == whole.streams[0]
+
+
+SHAPE_CLUSTER = (9, 6, 8, 10)
+
+
+def values_cluster() -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE_CLUSTER), indexing="ij")
+    noise = np.random.default_rng(0).random(SHAPE_CLUSTER)
+    return (np.sin(6 * x + 2 * t) * np.cos(5 * y) + z + 0.05 * noise).astype(np.float32)
+
+
+def settings_cluster(**options) -> EncodeConfig:
+    given = {"max_error": 0.02, "effort": 1, "tile": "2x6x8x5", **options}
+    return EncodeConfig(**given, timings=False)
+
+
+class Threads:
+    """A client of the threads of this process."""
+
+    def __init__(self, pool: ThreadPoolExecutor) -> None:
+        self.pool, self.futures = pool, []
+
+    def submit(self, work, *arguments) -> Future:
+        given = [each.result() if isinstance(each, Future) else each for each in arguments]
+        self.futures.append(self.pool.submit(work, *given))
+        return self.futures[-1]
+
+    def compute(self, array) -> Future:
+        return self.pool.submit(array.compute, scheduler="synchronous")
+
+    def nthreads(self) -> dict[str, int]:
+        return {"worker": 2}
+
+
+@pytest.fixture
+def threads():
+    with ThreadPoolExecutor(2) as pool:
+        yield Threads(pool)
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A client of two worker processes."""
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+def saved(folder: Path, array: np.ndarray) -> Path:
+    np.save(folder / "data.npy", array)
+    return folder / "data.npy"
+
+
+def labelled(array: np.ndarray, chunks: dict[str, int]):
+    """A dask-backed array in another order of its axes, with coordinates."""
+    xarray, _ = pytest.importorskip("xarray"), pytest.importorskip("dask")
+    times = np.datetime64("2020-01-01", "ns") + np.arange(SHAPE_CLUSTER[0]) * np.timedelta64(6, "h")
+    coords = {
+        "time": times,
+        "lat": ("lat", np.linspace(-40, 40, SHAPE_CLUSTER[2]), {"units": "degrees_north"}),
+    }
+    made = xarray.DataArray(
+        array, dims=("time", "lev", "lat", "lon"), coords=coords, name="u", attrs={"units": "m s-1"}
+    )
+    made["lev"].attrs["axis"], made["lon"].attrs["axis"] = "Z", "X"
+    return made.transpose("lat", "time", "lon", "lev").chunk(chunks)
+
+
+def require_same(tmp_path: Path, source, client, config: EncodeConfig) -> dict:
+    """Encode a source with and without a client; the files must be the same. The figures."""
+    whole = fhash_codec.encode(source, tmp_path / "whole.fhz", config)
+    figures = fhash_codec.encode(source, tmp_path / "run.fhz", config, client=client)
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    varying = ("path", "seconds", "stages")
+    assert {key: value for key, value in figures.items() if key not in varying} == {
+        key: value for key, value in whole.items() if key not in varying
+    }
+    assert not list(tmp_path.glob(".*"))
+    return figures
+
+
+CASES_CLUSTER = {
+    "bound": {},
+    "trials and a feature": {"effort": 2, "features": ("change:0.2",)},
+    "a relative bound": {"max_error": None, "max_error_rel": 0.01},
+}
+
+
+@pytest.mark.parametrize("case", CASES_CLUSTER)
+def test_workers_code_a_file_to_the_same_bytes(tmp_path, client, case) -> None:
+    require_same(
+        tmp_path, saved(tmp_path, values_cluster()), client, settings_cluster(**CASES_CLUSTER[case])
+    )
+
+
+@pytest.mark.parametrize("case", CASES_CLUSTER)
+def test_workers_compute_the_frames_of_a_lazy_array(tmp_path, client, case) -> None:
+    source = labelled(values_cluster(), {"time": 4, "lat": 3})
+    require_same(tmp_path, source, client, settings_cluster(**CASES_CLUSTER[case]))
+
+
+def test_a_persisted_array_stays_on_the_workers(tmp_path, client) -> None:
+    source = labelled(values_cluster(), {"time": 2}).persist()
+    require_same(tmp_path, source.to_dataset(), client, settings_cluster())
+
+
+def test_a_failure_of_a_worker_is_one_line(tmp_path, client) -> None:
+    path = saved(tmp_path, values_cluster())
+    hidden = path.with_name("hidden.npy")
+
+    def hide(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "planning" and done == total and path.exists():
+            os.replace(path, hidden)
+
+    with pytest.raises(ClusterError, match=r"part 1/5 failed on the cluster: .*data\.npy") as error:
+        fhash_codec.encode(
+            path, tmp_path / "a.fhz", settings_cluster(), client=client, progress=hide
+        )
+    assert "\n" not in str(error.value)
+    assert os.listdir(tmp_path) == ["hidden.npy"]
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_an_interruption_cancels_the_rest_and_leaves_no_file(tmp_path, threads, older) -> None:
+    path, output = saved(tmp_path, values_cluster()), tmp_path / "a.fhz"
+    if older:
+        output.write_bytes(b"older")
+
+    def stop(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "coding" and note == "parts":
+            raise KeyboardInterrupt
+
+    config = settings_cluster(tile="1x6x8x5")  # 8 parts
+    with pytest.raises(KeyboardInterrupt):
+        fhash_codec.encode(path, output, config, client=threads, force=older, progress=stop)
+    assert len(threads.futures) == rooms.AHEAD * 2  # and none was begun after that
+    assert all(future.done() or future.running() for future in threads.futures)
+    assert sorted(os.listdir(tmp_path)) == (["a.fhz"] if older else []) + ["data.npy"]
+    assert not older or output.read_bytes() == b"older"
+
+
+def test_what_other_machines_cannot_read_is_refused(tmp_path, threads) -> None:
+    output = tmp_path / "a.fhz"
+    for source, options, message in (
+        (values_cluster(), {}, "leave client out"),
+        (ArraySeries(values_cluster()), {}, "leave client out"),
+        (saved(tmp_path, values_cluster()), {"mask": np.ones(SHAPE_CLUSTER)}, "feature mask:FILE"),
+    ):
+        with pytest.raises(InputError, match=message):
+            fhash_codec.encode(source, output, settings_cluster(), client=threads, **options)
+    for promise in ({"psnr": 40}, {"ratio": 10}, {}, {"profile": "paper"}):
+        with pytest.raises(InputError, match="give max_error or max_error_rel"):
+            fhash_codec.encode(
+                tmp_path / "data.npy", output, EncodeConfig(**promise), client=threads
+            )
+    output.write_bytes(b"older")
+    with pytest.raises(OutputExistsError):
+        fhash_codec.encode(tmp_path / "data.npy", output, settings_cluster(), client=threads)
+    assert not threads.futures
+
+
+def test_held_steps_have_the_labels_of_the_whole() -> None:
+    whole = ArraySeries(values_cluster(), name="u", units="m")
+    held = HeldSteps(whole, whole=True).with_steps(3, values_cluster()[3:5])
+    assert (held.shape, held.name, held.units) == (SHAPE_CLUSTER, "u", "m")
+    np.testing.assert_array_equal(held.read(4), values_cluster()[4])
+    with pytest.raises(InputError, match="step 5 was not sent"):
+        held.read(5)
+
+
+@pytest.mark.parametrize("kind", ["values", "gaps", "integers", "constant"])
+def test_a_long_series_is_scanned_on_the_cluster(tmp_path, threads, monkeypatch, kind) -> None:
+    dask = pytest.importorskip("dask.array")
+    for module in (rooms, series_plan, encode):
+        monkeypatch.setattr(module, "fits_memory", lambda series: False)
+    monkeypatch.setattr(blocks, "MAX_BYTES_IN_MEMORY", 1)
+    array = values_cluster()
+    if kind == "gaps":
+        array[4, 2] = np.nan
+    if kind == "integers":
+        array = (100 * array).astype(np.int16)
+    if kind == "constant":
+        array[:] = 3
+    monkeypatch.setattr(rooms, "PART_BYTES", 2 * array[0].nbytes)
+    counts: list[tuple[int, int]] = []
+
+    def watch(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "scanning":
+            counts.append((done, total))
+
+    require_same(
+        tmp_path, dask.from_array(array, chunks=(4, 6, 8, 10)), threads, settings_cluster()
+    )
+    source = dask.from_array(array, chunks=(4, 6, 8, 10))
+    fhash_codec.encode(
+        source, tmp_path / "again.fhz", settings_cluster(), client=threads, progress=watch
+    )
+    on_cluster = [(2, 9), (4, 9), (6, 9), (8, 9), (9, 9)]
+    alone = [(step, 9) for step in range(1, 10)]
+    assert counts == (on_cluster[:3] + alone if kind == "gaps" else on_cluster)
+
+
+def test_extremes_that_nobody_declared_are_refused_on_the_cluster_too(
+    tmp_path, threads, monkeypatch
+) -> None:
+    dask = pytest.importorskip("dask.array")
+    monkeypatch.setattr(rooms, "fits_memory", lambda series: False)
+    monkeypatch.setattr(rooms, "PART_BYTES", 1)
+    array = values_cluster()
+    array[[1, 7], 0] = 1e20
+    with pytest.raises(InputError, match="give --missing 1e\\+20"):
+        fhash_codec.encode(
+            dask.from_array(array, chunks=3), tmp_path / "a.fhz", settings_cluster(), client=threads
+        )
+    assert not list(tmp_path.iterdir())

@@ -8,21 +8,33 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from kill_writer import BOUND, SHAPE, TILE, frame
+from kill_writer import BOUND as BOUND_WRITER
+from kill_writer import SHAPE as SHAPE_WRITER
+from kill_writer import TILE, frame
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, Writer
-from fhash_codec.appending.growing import GrowingFile
-from fhash_codec.appending.writer import append, bound_of
+from fhash_codec import (
+    DamagedFileError,
+    EncodeConfig,
+    InputError,
+    Writer,
+)
+from fhash_codec.appending import growing
+from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, bound_of_file, continued
+from fhash_codec.appending.writer import append, bound_of, plan_layers
+from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.array import transform_codecs
 from fhash_formats.errors import OutputError
-from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
 
-CONFIG = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, timings=False)
+CONFIG = EncodeConfig(max_error=BOUND_WRITER, effort=1, tile=TILE, timings=False)
 
 
 def frames(first: int, end: int) -> np.ndarray:
@@ -49,12 +61,12 @@ def test_steps_follow_and_the_older_ones_keep_every_bit(run) -> None:
     report = append(series(6, 13), run)
     assert (report["steps"], report["kept"], report["appended"]) == (13, 6, 7)
     assert report["bytes"] == run.stat().st_size
-    assert report["max_abs_error"] <= BOUND
+    assert report["max_abs_error"] <= BOUND_WRITER
     with fhash_codec.open(run) as volume:
         assert volume.verify()
         after = volume[:]
         np.testing.assert_array_equal(after[:6], before)
-        assert np.abs(after - frames(0, 13)).max() <= BOUND
+        assert np.abs(after - frames(0, 13)).max() <= BOUND_WRITER
         np.testing.assert_array_equal(volume.coords["t"].values, np.arange(13))
     assert os.listdir(run.parent) == ["run.fhz"]
     found = fhash_codec.diff(frames(0, 13), run)
@@ -130,12 +142,12 @@ def test_the_bound_is_absolute_or_of_a_known_range() -> None:
             bound_of(EncodeConfig(**other), RANGE)
 
 
-CONFIG_WRITER = EncodeConfig(max_error=BOUND, effort=1, tile=TILE)
+CONFIG_WRITER = EncodeConfig(max_error=BOUND_WRITER, effort=1, tile=TILE)
 LAYER = 3
 
 
 def written(path: Path, steps: int, **options) -> Path:
-    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, **options) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER, **options) as writer:
         for step in range(steps):
             writer.append(frame(step))
     return path
@@ -147,21 +159,21 @@ def frames_writer(steps: int) -> np.ndarray:
 
 def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER) as writer:
         for step in range(10):
             writer.append(frame(step))
             assert (writer.steps, writer.steps_written) == (step + 1, (step + 1) // LAYER * LAYER)
             if writer.steps_written:
                 with fhash_codec.open(path) as volume:
-                    assert volume.shape == (writer.steps_written, *SHAPE)
+                    assert volume.shape == (writer.steps_written, *SHAPE_WRITER)
             else:
                 assert not path.exists()
     assert (writer.steps, writer.steps_written) == (10, 10)
     assert os.listdir(tmp_path) == ["run.fhz"]
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames_writer(10)).max() <= BOUND
-        assert volume.chunks == (LAYER, *SHAPE)
+        assert np.abs(volume[:] - frames_writer(10)).max() <= BOUND_WRITER
+        assert volume.chunks == (LAYER, *SHAPE_WRITER)
         np.testing.assert_array_equal(volume.coords["t"].values, np.arange(10))
 
 
@@ -181,8 +193,8 @@ def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
         assert step["rmse"] >= other["rmse"]
     values = frames_writer(7)
     assert told["value_range"] == [values.min(), values.max()]
-    assert told["config"]["max_error"] == BOUND
-    assert quality["max_abs_error"] <= BOUND
+    assert told["config"]["max_error"] == BOUND_WRITER
+    assert quality["max_abs_error"] <= BOUND_WRITER
 
 
 def test_resumed_it_goes_on_as_if_it_had_not_stopped(tmp_path) -> None:
@@ -211,25 +223,29 @@ def test_a_short_last_layer_is_not_extended_but_may_be_dropped(tmp_path) -> None
         for step in range(3, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND_WRITER
         assert len(volume.info["quality"]["per_step"]) == 9
 
 
 def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    fhash_codec.encode(frames_writer(6), path, EncodeConfig(max_error=BOUND, effort=5, tile=TILE))
+    fhash_codec.encode(
+        frames_writer(6), path, EncodeConfig(max_error=BOUND_WRITER, effort=5, tile=TILE)
+    )
     with Writer.resume(path) as writer:
         for step in range(6, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND_WRITER
     fhash_codec.encode(
         frames_writer(6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE)
     )
     with pytest.raises(InputError, match="does not promise a bound"):
         Writer.resume(tmp_path / "psnr.fhz")
-    feature = EncodeConfig(max_error=BOUND, effort=1, tile=TILE, features=("interval:0.5:1",))
+    feature = EncodeConfig(
+        max_error=BOUND_WRITER, effort=1, tile=TILE, features=("interval:0.5:1",)
+    )
     fhash_codec.encode(frames_writer(6), tmp_path / "feature.fhz", feature)
     with pytest.raises(InputError, match="keeps features"):
         Writer.resume(tmp_path / "feature.fhz")
@@ -239,7 +255,9 @@ def test_coordinates_and_labels(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
     options = {"coords": coords, "name": "u", "units": "m s-1", "time_units": "hours"}
-    with Writer(path, shape=SHAPE, config=CONFIG_WRITER, attributes={"a": 1}, **options) as writer:
+    with Writer(
+        path, shape=SHAPE_WRITER, config=CONFIG_WRITER, attributes={"a": 1}, **options
+    ) as writer:
         for step, now in enumerate((0.0, 0.1, 0.7, 2.0)):
             writer.append(frame(step), time=now)
     with fhash_codec.open(path) as volume:
@@ -250,16 +268,20 @@ def test_coordinates_and_labels(tmp_path) -> None:
         np.testing.assert_array_equal(volume.coords["z"].values, [1, 2, 4, 8])
         np.testing.assert_array_equal(volume.coords["x"].values, np.arange(12) / 3)
     with pytest.raises(InputError, match="the coordinate of x has shape"):
-        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"x": np.arange(3)})
+        Writer(
+            tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG_WRITER, coords={"x": np.arange(3)}
+        )
     with pytest.raises(InputError, match="coords names 'w'"):
-        Writer(tmp_path / "b.fhz", shape=SHAPE, config=CONFIG_WRITER, coords={"w": np.arange(3)})
+        Writer(
+            tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG_WRITER, coords={"w": np.arange(3)}
+        )
 
 
 def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> None:
     path, good = tmp_path / "run.fhz", frame(0)
     bad = good.copy()
     bad[0, 0, :2] = np.nan
-    with Writer(path, shape=SHAPE, config=CONFIG_WRITER) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER) as writer:
         writer.append(good)
         for wrong, time_of_step, message in (
             (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
@@ -278,7 +300,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
     with pytest.raises(InputError, match="the writer is closed"):
         writer.append(good)
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames_writer(4)).max() <= BOUND
+        assert np.abs(volume[:] - frames_writer(4)).max() <= BOUND_WRITER
 
 
 @pytest.mark.parametrize(
@@ -296,13 +318,13 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
 def test_settings_that_cannot_be_kept_are_refused_at_once(tmp_path, options, message) -> None:
     path = tmp_path / options.pop("path", "run.fhz")
     with pytest.raises(InputError, match=message):
-        Writer(path, **{"shape": SHAPE, **options})
+        Writer(path, **{"shape": SHAPE_WRITER, **options})
     assert os.listdir(tmp_path) == []
 
 
 def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    with Writer(path, shape=SHAPE, max_error_rel=0.001, value_range=(-2, 2)) as writer:
+    with Writer(path, shape=SHAPE_WRITER, max_error_rel=0.001, value_range=(-2, 2)) as writer:
         for step in range(4):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
@@ -314,7 +336,7 @@ def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     tmp_path, monkeypatch
 ) -> None:
     path = tmp_path / "run.fhz"
-    writer = Writer(path, shape=SHAPE, config=CONFIG_WRITER)
+    writer = Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER)
     for step in range(LAYER):
         writer.append(frame(step))
 
@@ -360,7 +382,7 @@ def test_killed_it_loses_no_layer_that_was_written(tmp_path) -> None:
         with fhash_codec.open(path) as volume:
             assert volume.verify()
             steps = volume.shape[0]
-            assert np.abs(volume[:] - frames_writer(steps)).max() <= BOUND
+            assert np.abs(volume[:] - frames_writer(steps)).max() <= BOUND_WRITER
         assert told <= steps <= told + LAYER
         before = steps
     with Writer.resume(path):
@@ -386,3 +408,161 @@ def test_integers_far_from_zero_and_from_each_other(tmp_path, bound) -> None:
         assert errors.max() <= bound
         assert volume.info["quality"]["max_abs_error"] == errors.max()
         assert volume.info["value_range"] == [values.min(), values.max()]
+
+
+WRITER = ContainerWriter("unused.fhz")
+"""A writer that gets nothing: few steps have their figures in the header."""
+
+
+def measured(count: int = 3) -> tuple[Figures, np.ndarray]:
+    errors = np.random.default_rng(0).normal(0, 0.01, (count, 2, 3, 4))
+    figures = Figures(Figures.scale_of(ValueRange(0.0, 5.0)))
+    for error in errors:
+        figures.steps.append(figures.measure(np.zeros(error.shape), error))
+    return figures, errors
+
+
+def test_what_a_header_tells_is_taken_up_again() -> None:
+    figures, _ = measured()
+    told = figures.header(WRITER, 5.0)
+    header = {
+        "domain": {"shape": [3, 2, 3, 4]},
+        "value_range": [0.0, 5.0],
+        "model": {},
+        "history": {},
+        "quality": told,
+    }
+    full = full_header(header, {})
+    again = Figures.of_header(full, figures.scale).header(WRITER, 5.0)
+    # Figures of steps are rounded to hundredths of a dB.
+    assert again["rmse"] == pytest.approx(told["rmse"], rel=2e-3)
+    assert again["rmse"] >= told["rmse"]
+    assert again["max_abs_error"] == told["max_abs_error"]
+    steps = full["quality"]["per_step"]
+    for wrong in (steps[:2], [*steps[:2], {"rmse": None, "max_abs_error": 1.0}]):
+        with pytest.raises(InputError, match="does not tell the errors of step 2"):
+            Figures.of_header({**header, "quality": {"per_step": wrong}}, 1.0)
+
+
+SHAPE = (3, 4, 5)
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A file without steps, and its frames."""
+    frames = np.random.default_rng(0).random((6, *SHAPE)).astype(np.float32)
+    frames[3:] += 2
+    config = EncodeConfig(max_error=0.05, effort=1, tile="2x3x4x5")
+    plan = plan_layers(list(frames[:2]), config, 0.05, None)
+    variable = {"name": "u", "units": "", "dtype": "float32", "attributes": {}}
+    lengths = zip(("t", "z", "y", "x"), (1, *SHAPE), strict=True)
+    coords = {axis: index_coordinate(axis, n) for axis, n in lengths}
+    header = {**plan.header, "variable": variable}
+    return GrowingFile(tmp_path / "a.fhz", plan.coder, header, coords, Figures(1.0)), frames
+
+
+def add(file: GrowingFile, frames: np.ndarray, first: int, **options) -> None:
+    with ThreadPoolExecutor(1) as workers:
+        layer = file.coder.code(list(frames[first : first + 2]), file.figures, workers)
+    file.add(layer, [float(first), first + 1.0], **options)
+
+
+def test_there_is_a_limit_of_steps(begun, monkeypatch) -> None:
+    file, frames = begun
+    monkeypatch.setattr(growing, "MAX_STEPS", 3)
+    with file:
+        add(file, frames, 0)
+        with pytest.raises(InputError, match="at most 3: begin another"):
+            add(file, frames, 2)
+    with fhash_codec.open(file.path) as volume:
+        assert volume.shape[0] == 2
+
+
+BOUND = 0.01
+
+
+@pytest.fixture(scope="module")
+def frames_layers() -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 9, 12)), indexing="ij")
+    return (np.sin(5 * x + t) * np.cos(4 * y) + z).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def coder(frames_layers) -> LayerCoder:
+    config = EncodeConfig(max_error=BOUND, effort=1, tile="4x5x6x6")
+    return plan_layers(list(frames_layers), config, BOUND, None).coder
+
+
+def coded(coder: LayerCoder, frames_layers: np.ndarray):
+    figures = Figures(1.0)
+    with ThreadPoolExecutor(2) as workers:
+        return coder.code(list(frames_layers), figures, workers)
+
+
+def test_a_tile_that_decodes_otherwise_is_told(frames_layers, coder, monkeypatch) -> None:
+    monkeypatch.setattr("fhash_codec.appending.growing.decode_tile", lambda *_: frames_layers[0])
+    with pytest.raises(RuntimeError, match="decodes to other values"):
+        coded(coder, frames_layers)
+
+
+BOUND_RESUMING = 0.02
+CONFIG_GROWING = EncodeConfig(max_error=BOUND_RESUMING, effort=1, tile="2x4x6x4")
+
+
+@pytest.fixture
+def run_growing(tmp_path, field):
+    path = tmp_path / "run.fhz"
+    fhash_codec.encode(field((4, 4, 6, 8)), path, CONFIG_GROWING)
+    return path
+
+
+def with_array(run_growing, path, name, values, dimension_names):
+    """A copy of a file with another array."""
+    with Container.open(run_growing) as container, ContainerWriter(path) as writer:
+        table = container.arrays["tables/level_1"]
+        writer.add_sharded(
+            "tables/level_1",
+            shape=table.shape,
+            dtype=table.dtype,
+            chunk_shape=table.chunk_shape,
+            shard_shape=table.shard_shape,
+            chunks=(bytes(table.coded(index)) for index in np.ndindex(*table.grid)),
+            dimension_names=table.dimension_names,
+            codecs=transform_codecs(table.settings),
+        )
+        writer.add_whole(name, values, dimension_names=dimension_names, attributes={"a": 1})
+        header = dict(container.header)
+        writer.commit({**header, "more": {"key": 1}})
+    return path
+
+
+def test_arrays_and_keys_that_do_not_depend_on_time_are_carried(run_growing, tmp_path) -> None:
+    path = with_array(run_growing, tmp_path / "a.fhz", "auxiliary/area", np.arange(6.0), ["y"])
+    with continued(path) as growing:
+        growing.publish()
+    with Container.open(path) as container:
+        area = container.arrays["auxiliary/area"]
+        np.testing.assert_array_equal(area.read(), np.arange(6.0))
+        assert (area.attributes, area.dimension_names) == ({"a": 1}, ("y",))
+        assert container.header["more"] == {"key": 1}
+    for names in (["time"], None):
+        other = tmp_path / f"{names}.fhz"
+        path = with_array(run_growing, other, "auxiliary/pressure", np.arange(4.0), names)
+        with pytest.raises(InputError, match="has a value for each step"), continued(path):
+            pass
+
+
+def test_a_damaged_tile_is_found_before_anything_is_written(run_growing) -> None:
+    data = bytearray(run_growing.read_bytes())
+    data[data.index(b"/c/0/0/0/0") + 40] ^= 1
+    run_growing.write_bytes(data)
+    with pytest.raises(DamagedFileError, match=r"run\.fhz"), continued(run_growing):
+        pass
+    assert run_growing.read_bytes() == data
+
+
+def test_the_bound_of_a_file() -> None:
+    header = {"value_range": [1.0, 3.0]}
+    assert bound_of_file({**header, "config": {"max_error": 2}}) == 2
+    assert bound_of_file({**header, "config": {"max_error_rel": 0.1}}) == pytest.approx(0.2)
+    assert bound_of_file({**header, "config": {"psnr": 40, "max_error": None}}) is None

@@ -33,7 +33,6 @@ from fhash_codec.compact.head_training import Budget, Pair, Shape, train_head
 from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.tiles import Coding, Outcome, recoded
 from fhash_codec.compact.transform import usual_transform
-from fhash_codec.config import EncodeConfig as EncodeConfig_tiles_to_promise
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
@@ -360,9 +359,7 @@ def moving_sphere() -> npt.NDArray[Any]:
 def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
     """One that was trained on the tiles saves more than it takes; one for noise does not."""
     series = ArraySeries(moving_sphere())
-    config = EncodeConfig_tiles_to_promise(
-        psnr=38.0, effort=2, tile="2x24x32x32", without=("transform",)
-    )
+    config = EncodeConfig(psnr=38.0, effort=2, tile="2x24x32x32", without=("transform",))
     aim = _Aim(psnr=38.0, data_range=2.0, quick=False)
     with ThreadPoolExecutor(2) as workers:
         selection = select_features(series, config, silent)

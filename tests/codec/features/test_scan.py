@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
+from math import prod
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_codec.features.scan import (
-    ABSURD,
-    HUGE,
-    MOST,
-    SEVERAL,
-    Extremes,
-    SpanScan,
-    scan,
+from fhash_codec.features.bricks import brick_shape, build_coreset, parse_brick
+from fhash_codec.features.features import (
+    Everything,
+    FeatureChoice,
+    Interval,
+    Isosurface,
+    Segmentation,
+    dilate,
 )
+from fhash_codec.features.key_frames import KeyTimes, select_key_frames
+from fhash_codec.features.occupancy import morton_index, pack, packed_bytes, unpack
+from fhash_codec.features.scan import ABSURD, HUGE, MOST, SEVERAL, Extremes, SpanScan, scan
 from fhash_codec.measure.value_range import Ranks, pieces
 from fhash_codec.progress import silent
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError, RegionError
 from fhash_formats.series import ArraySeries, StepsSeries
 
 Values = npt.NDArray[np.generic]
@@ -229,3 +234,367 @@ def test_missing_values_in_a_span_leave_the_scan_to_another_way() -> None:
     spans = [SpanScan(series, range(a, a + 2)) for a in (0, 2)]
     assert [span.has_missing for span in spans] == [False, True]
     assert SpanScan.joined(series, spans) is None
+
+
+SHAPES = [
+    (1, 1, 1), (1, 1, 2), (2, 1, 1), (1, 2, 1), (1, 1, 3), (1, 1, 9), (9, 1, 1), (1, 9, 1),
+    (2, 2, 2), (1, 2, 5), (3, 1, 2), (2, 3, 5), (7, 11, 13), (1, 17, 4), (17, 1, 3), (5, 64, 2),
+    (8, 8, 16), (1, 1, 100), (31, 2, 1), (4, 33, 16),
+]  # fmt: skip
+
+
+def brute_force_index(z, y, x, shape):
+    """Take bits from x, y, z in turn while the axis has any."""
+    axes = [
+        [x, (shape[2] - 1).bit_length()],
+        [y, (shape[1] - 1).bit_length()],
+        [z, (shape[0] - 1).bit_length()],
+    ]
+    index = place = 0
+    while any(left for _, left in axes):
+        for axis in axes:
+            if axis[1]:
+                index |= (axis[0] & 1) << place
+                axis[0] >>= 1
+                axis[1] -= 1
+                place += 1
+    return index
+
+
+def random_mask(shape, seed=0):
+    return np.random.default_rng(seed).random(shape) < 0.4
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_bits_lie_where_the_definition_says(shape) -> None:
+    mask, vertices = random_mask(shape), np.indices(shape)
+    index = morton_index(*vertices, shape)
+    assert index.ravel().tolist() == [
+        brute_force_index(*(int(v) for v in vertex), shape) for vertex in vertices.reshape(3, -1).T
+    ]
+    expected = np.zeros(8 * packed_bytes(shape), dtype=bool)
+    expected[index] = mask
+    np.testing.assert_array_equal(pack(mask), np.packbits(expected))
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (25, 125, 125)])
+def test_unpack_inverts_pack_and_the_index_is_injective(shape) -> None:
+    mask = random_mask(shape, 1)
+    bits = pack(mask)
+    assert (bits.dtype, bits.shape) == (np.uint8, (packed_bytes(shape),))
+    np.testing.assert_array_equal(unpack(bits, shape), mask)
+    assert np.unique(morton_index(*np.indices(shape), shape)).size == mask.size
+    assert np.unpackbits(bits).sum() == mask.sum()
+
+
+EVERYTHING = (Everything(),)
+SHAPES_BRICKS = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70, 5)]
+
+
+def unpack_frame(coreset, key):
+    """The samples of a key frame, put back into the box: float32 (z, y, x), NaN elsewhere."""
+    shape, grid = coreset.brick_shape, coreset.brick_grid
+    first, last = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
+    mask = np.unpackbits(coreset.mask_bits[first:last], axis=1, count=prod(shape)).view(np.bool_)
+    held = np.full(mask.shape, np.nan, dtype=np.float32)
+    held[mask] = coreset.values[coreset.offsets[first] : coreset.offsets[last]]
+    tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
+    _, z, y, x = coreset.bricks[first:last].T
+    tiles[z, y, x] = held.reshape(-1, *shape)
+    frame = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
+        [count * step for count, step in zip(grid, shape, strict=True)]
+    )
+    z_size, y_size, x_size = coreset.box.shape
+    return frame[:z_size, :y_size, :x_size]
+
+
+def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):
+    """Blobs that drift with the steps."""
+    axes = np.meshgrid(*((np.arange(size) + 0.5) / size * 2 - 1 for size in shape), indexing="ij")
+    frames = [
+        np.exp(-6 * sum((axis - 0.3 * np.sin(step + k)) ** 2 for k, axis in enumerate(axes)))
+        for step in range(steps)
+    ]
+    return (low + span * np.stack(frames)).astype(dtype)
+
+
+def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
+    series = ArraySeries(array)
+    seen = scan(series, silent)
+    keys = tuple(range(series.shape[0])) if keys is None else keys
+    choice = FeatureChoice(keys, features, dilation)
+    return build_coreset(series, seen, choice, silent, **kwargs), seen
+
+
+def check_against_direct_crop(array, features, keys, dilation, **kwargs) -> None:
+    coreset, seen = build(array, features, keys, dilation, **kwargs)
+    selected = [
+        np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys
+    ]
+    masks = [
+        dilate(mask, dilation) & np.isfinite(array[step])
+        for mask, step in zip(selected, keys, strict=True)
+    ]
+    everywhere = np.argwhere(np.any(masks, axis=0))
+    assert coreset.box == tuple(
+        zip(everywhere.min(axis=0), everywhere.max(axis=0) + 1, strict=True)
+    )
+    for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
+        expected = np.where(mask, seen.value_range.to_unit(array[step]), np.float32(np.nan))
+        np.testing.assert_array_equal(unpack_frame(coreset, key), expected[coreset.box.slices()])
+        np.testing.assert_array_equal(
+            unpack(coreset.occupancy[key], coreset.box.shape), mask[coreset.box.slices()]
+        )
+    assert coreset.fraction == pytest.approx(np.mean(masks))
+    left = [
+        array[step][~mask & np.isfinite(array[step])]
+        for step, mask in zip(keys, masks, strict=True)
+    ]
+    left = np.concatenate(left).astype(np.float64)
+    assert coreset.background / 2 == pytest.approx(
+        (left / 2 / left.size).sum() if left.size else seen.mean / 2, rel=1e-12
+    )
+    check_structure(coreset)
+    return coreset
+
+
+def check_structure(coreset) -> None:
+    vertices = prod(coreset.brick_shape)
+    counts = np.unpackbits(coreset.mask_bits, axis=1)[:, :vertices].sum(axis=1)
+    assert (counts > 0).all()
+    assert (np.diff(coreset.offsets) == counts).all()
+    assert (coreset.offsets[0], coreset.offsets[-1]) == (0, coreset.values.size)
+    assert coreset.mask_bits.shape == (len(coreset.bricks), -(-vertices // 8))
+    assert [
+        array.dtype
+        for array in (coreset.bricks, coreset.mask_bits, coreset.values, coreset.offsets)
+    ] == ["i4", "u1", "f4", "i8"]
+    assert ((coreset.values >= 0) & (coreset.values <= 1)).all()
+    assert (coreset.bricks.max(axis=0) < (len(coreset.key_frames), *coreset.brick_grid)).all()
+    order = np.ravel_multi_index(coreset.bricks.T, (len(coreset.key_frames), *coreset.brick_grid))
+    assert (np.diff(order) > 0).all()
+    grid = tuple(
+        -(-size // step) for size, step in zip(coreset.box.shape, coreset.brick_shape, strict=True)
+    )
+    assert coreset.brick_grid == grid
+
+
+@pytest.mark.filterwarnings("ignore:feature .* selects nothing")
+@pytest.mark.parametrize("shape", SHAPES_BRICKS)
+@pytest.mark.parametrize(
+    "features",
+    [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))],
+    ids=["all", "interval", "two"],
+)
+@pytest.mark.parametrize("dilation", [0, 1, 2])
+def test_bricks_hold_the_direct_crop(shape, features, dilation) -> None:
+    array = smooth(4, shape)
+    check_against_direct_crop(array, features, (0, 2, 3), dilation)
+
+
+def test_missing_values_are_neither_samples_nor_background() -> None:
+    array = smooth(4, (5, 9, 20))
+    array[:, :, :3], array[1, 2, 4, 10], array[2] = np.nan, np.inf, np.nan
+    coreset = check_against_direct_crop(array, (Interval(0.2, 2.0),), (0, 1, 2, 3), 1)
+    assert np.isnan(unpack_frame(coreset, 2)).all()
+    assert 2 not in coreset.bricks[:, 0]
+    assert np.isfinite(coreset.background)
+
+
+def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not() -> None:
+    array = np.zeros((3, 4, 5, 6))
+    array[1, 2, 2, 2] = 1.0
+    coreset = check_against_direct_crop(array, (Interval(0.5, 1.0),), (0, 1, 2), 1)
+    assert coreset.box == ((1, 4), (1, 4), (1, 4))
+    assert len(coreset.occupancy) == 3
+    with pytest.raises(
+        InputError,
+        match=r"feature interval:2:3, isosurface:9 selects nothing; values range from 0 to 1",
+    ):
+        build(array, (Interval(2.0, 3.0), Isosurface(9.0)))
+
+
+def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box() -> None:
+    for size in np.random.default_rng(0).integers(1, 60, size=(300, 3)).tolist():
+        brick = brick_shape(size)
+        counts = [-(-length // edge) for edge, length in zip(brick, size, strict=True)]
+        assert prod(brick) <= 1024
+        assert all(
+            count * edge - length < count
+            for edge, length, count in zip(brick, size, counts, strict=True)
+        )
+        assert prod(brick) >= 200 or prod(counts) < 40
+
+
+def test_a_feature_that_selects_nothing_beside_others_is_warned_of() -> None:
+    with pytest.warns(FhashWarning, match="feature isosurface:99 selects nothing; the others do"):
+        build(smooth(2, (5, 6, 7)), (Interval(0.2, 2.0), Isosurface(99.0)), (0, 1), 1)
+
+
+def test_the_fringe_is_sampled_and_no_part_of_the_coreset() -> None:
+    values = np.random.default_rng(1).random((3, 5, 6, 7)).astype(np.float32)
+    plain, seen = build(values, [Interval(0.8, 1.0)], dilation=0)
+    fringed, _ = build(values, [Interval(0.8, 1.0)], dilation=0, fringe=True)
+    masks = [unpack(bits, plain.box.shape) for bits in plain.occupancy]
+    for key, grown in enumerate(
+        (masks[0] | masks[1], masks[0] | masks[1] | masks[2], masks[1] | masks[2])
+    ):
+        unit = seen.value_range.to_unit(values[key])[plain.box.slices()]
+        np.testing.assert_array_equal(
+            unpack_frame(fringed, key), np.where(grown, unit, np.float32(np.nan))
+        )
+        np.testing.assert_array_equal(fringed.occupancy[key], plain.occupancy[key])
+    assert (fringed.fraction, fringed.background) == (plain.fraction, plain.background)
+
+
+def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:
+    values = np.zeros((3, 2, 3, 4), np.float32)
+    values[0, 0], values[2, 1] = 0.75, 0.5
+    values[1] = np.nan
+    values[1, 0, 0, 0] = 1.0
+    coreset, seen = build(values, [Interval(0.25, 1.0)], dilation=0, fringe=True)
+    middle = unpack_frame(coreset, 1)
+    expected = np.stack([np.full((3, 4), 0.75), np.full((3, 4), 0.5)]).astype(np.float32)
+    expected[0, 0, 0] = 1.0
+    np.testing.assert_array_equal(middle, seen.value_range.to_unit(expected))
+
+
+def test_bricks_are_named_by_their_shape():
+    assert parse_brick("auto") is None
+    assert parse_brick("4x2x16") == (4, 2, 16)
+    for text in ("4x2", "4x0x2", "axbxc", "64x64x64"):
+        with pytest.raises(InputError, match=f"brick is '{text}'; allowed"):
+            parse_brick(text)
+
+
+UNEVEN = np.array([0.0, 1.0, 1.5, 4.0, 4.25, 9.0, 9.5, 10.0])
+
+
+def series_of(steps, seed=0, shape=(2, 3, 4)):
+    rng = np.random.default_rng(seed)
+    return ArraySeries(rng.random((steps, *shape)).cumsum(axis=0))
+
+
+def pick(spec, series, times=None):
+    return select_key_frames(
+        spec, series, np.arange(series.shape[0], dtype=float) if times is None else times, silent
+    )
+
+
+def interpolation_error(array, times, keys):
+    """Summed squared error of all frames, straight from the definition."""
+    flat = array.reshape(len(array), -1)
+    sign = -1 if times[-1] < times[0] else 1
+    rebuilt = np.stack(
+        [
+            np.interp(sign * times, sign * times[list(keys)], column[list(keys)])
+            for column in flat.T
+        ],
+        axis=1,
+    )
+    return ((rebuilt - flat) ** 2).sum()
+
+
+@pytest.mark.parametrize(
+    ("spec", "steps", "expected"),
+    [
+        ("all", 4, (0, 1, 2, 3)),
+        ("every:1", 3, (0, 1, 2)),
+        ("every:3", 7, (0, 3, 6)),
+        ("every:3", 8, (0, 3, 6, 7)),
+        ("every:99", 5, (0, 4)),
+        ("every:2", 1, (0,)),
+        ("0,4,9", 10, (0, 4, 9)),
+        (" 1, 3 ", 5, (1, 3)),
+        ("2", 5, (2,)),
+        ("auto:1", 1, (0,)),
+        ("auto:9", 4, (0, 1, 2, 3)),
+        ("auto:2", 6, (0, 5)),
+    ],
+)
+def test_what_a_spec_names(spec, steps, expected) -> None:
+    assert pick(spec, series_of(steps)) == expected
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("", "allowed: all, every:K, auto:N or a list such as 0,4,9"),
+        ("some", "allowed: all"),
+        ("0,,1", "allowed: all"),
+        ("-1,2", "allowed: all"),
+        ("every:0", "write every:K with K >= 1"),
+        ("every", "write every:K"),
+        ("every:x", "write every:K"),
+        ("auto:0", "write auto:N with N >= 2"),
+        ("auto:2.5", "write auto:N"),
+        ("auto:1", "at least 2"),
+        ("0,5", r"ascend without repeats within 0\.\.4"),
+        ("2,1", "ascend without repeats"),
+        ("1,1", "ascend without repeats"),
+    ],
+)
+def test_what_a_spec_may_not_be(spec, message) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        pick(spec, series_of(5))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 7])
+@pytest.mark.parametrize(
+    "times", [np.arange(8.0), UNEVEN, -UNEVEN, UNEVEN * 1e-300, UNEVEN * 1e300, 1e9 + UNEVEN]
+)
+def test_auto_is_the_best_of_all_subsets(count, times) -> None:
+    series = series_of(8, seed=count)
+    chosen = pick(f"auto:{count}", series, times)
+    subsets = [(0, *inner, 7) for inner in itertools.combinations(range(1, 7), count - 2)]
+    best = min(interpolation_error(series.values, times, subset) for subset in subsets)
+    assert len(chosen) == count
+    assert interpolation_error(series.values, times, chosen) == pytest.approx(best, rel=1e-9)
+
+
+def test_auto_needs_times_that_go_one_way() -> None:
+    with pytest.raises(InputError, match="step numbers"):
+        pick("auto:2", series_of(4), np.array([0.0, 1, 1, 2]))
+
+
+@pytest.mark.parametrize(
+    "times",
+    [UNEVEN, -UNEVEN, UNEVEN[::-1].copy(), 1e9 + UNEVEN],
+    ids=["up", "down", "back", "late"],
+)
+@pytest.mark.parametrize("key_frames", [(0, 7), (0, 2, 3, 7), (1, 4, 5), tuple(range(8)), (3,)])
+def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_frames) -> None:
+    keys = KeyTimes(times=times, key_frames=key_frames)
+    assert [keys.key_index(step) for step in key_frames] == list(range(len(key_frames)))
+    steps = np.linspace(0, 7, 141)
+    indices = keys.key_indices(steps)
+    assert (np.diff(indices) >= 0).all()
+    assert (indices[0], indices[-1]) == (0, len(key_frames) - 1)
+    for a, b in itertools.pairwise(key_frames):
+        for step in np.linspace(a, b, 7):
+            time = np.interp(step, range(8), times)
+            inside = (time - times[a]) / (times[b] - times[a])
+            assert keys.key_index(step) - key_frames.index(a) == pytest.approx(
+                inside, abs=1e-6 if times[0] > 1e6 else 1e-12
+            )
+
+
+@pytest.mark.parametrize("times", [UNEVEN, UNEVEN[::-1].copy(), -UNEVEN])
+def test_step_of_time_inverts_the_times(times) -> None:
+    keys = KeyTimes(times=times, key_frames=(0, 7))
+    assert [keys.step_of_time(time) for time in times] == list(range(8))
+    assert keys.step_of_time((times[2] + times[3]) / 2) == pytest.approx(2.5)
+    np.testing.assert_allclose(keys.steps_of_times(times.reshape(2, 4)), np.arange(8).reshape(2, 4))
+
+
+def test_what_lies_outside_is_refused() -> None:
+    keys = KeyTimes(times=UNEVEN[::-1].copy(), key_frames=(0, 7))
+    for time in (-0.1, 10.5, np.nan, np.inf):
+        with pytest.raises(RegionError, match=r"outside 0\.\.10"):
+            keys.step_of_time(time)
+    for step in (-0.5, 7.01, np.nan):
+        with pytest.raises(RegionError, match=r"outside 0\.\.7"):
+            keys.key_index(step)
+    with pytest.raises(InputError, match="step numbers"):
+        KeyTimes(times=np.array([0.0, 0.0]), key_frames=(0,))

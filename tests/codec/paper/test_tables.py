@@ -6,18 +6,37 @@ import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import FhashWarning, QualityError
+from fhash_codec import EncodeConfig, FhashWarning, QualityError
 from fhash_codec.features import occupancy
+from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.occupancy import unpack
+from fhash_codec.features.scan import scan
 from fhash_codec.paper import tables as small_parts
 from fhash_codec.paper.encode import select
-from fhash_codec.paper.model import decode_region
-from fhash_codec.paper.storage import finest_frame, mix_components
+from fhash_codec.paper.model import PointSampler, PointTables, SparsePatch, decode_region
+from fhash_codec.paper.network import Architecture, Network, level_resolutions
+from fhash_codec.paper.storage import (
+    Needed,
+    SparseTable,
+    StoredTable,
+    finest_frame,
+    fringe_step,
+    mix_components,
+    needed_by,
+    round_fringe,
+    table_chunk,
+    write_tables,
+)
 from fhash_codec.paper.table_step import MAX_LOSS, StepSearch, Window, choose_codings
 from fhash_codec.paper.tables import (
     MIN_WEIGHTS,
@@ -30,7 +49,8 @@ from fhash_codec.paper.tables import (
     tile_shape,
 )
 from fhash_codec.progress import silent
-from fhash_formats.container import Container
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import ArraySeries
 
 
@@ -359,3 +379,351 @@ def test_nothing_below_the_smallest_step_is_tried() -> None:
     assert search.done
     assert search.step == 0.5
     assert trials < TRIALS
+
+
+def coreset_of(fringe: bool) -> Coreset:
+    """A plane that moves through the box from one key frame to the next."""
+    values = np.zeros((3, 6, 5, 7), np.float32)
+    for step in range(3):
+        values[step, 2 * step : 2 * step + 2] = 1.0
+    series = ArraySeries(values)
+    scanned = scan(series, silent)
+    return build_coreset(
+        series, scanned, FeatureChoice(range(3), [Interval(0.5, 2.0)]), silent, fringe=fringe
+    )
+
+
+@pytest.fixture
+def coreset() -> Coreset:
+    return coreset_of(fringe=True)
+
+
+def finest(scale: float = 1.0):
+    frames = np.random.default_rng(0).standard_normal((3, 6, 5, 7, 2)).astype(np.float32)
+    frames[0, 4:] = 0.0  # in no coreset beside this key frame: no samples
+    frames[2, :2] = 0.0
+    return lambda key: frames[key] * np.float32(scale)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1.7, 300.0])
+def test_only_the_fringe_is_rounded_and_by_half_a_step_at_most(coreset, scale) -> None:
+    table = finest(scale)
+    step = fringe_step(coreset, 3, table)
+    for key in range(3):
+        rounded = round_fringe(coreset, key, table(key), step)
+        inside = unpack(coreset.occupancy[key], coreset.box.shape)
+        np.testing.assert_array_equal(rounded[inside], table(key)[inside])
+        assert np.abs(rounded - table(key)).max() <= step / 2
+        assert not np.array_equal(rounded, table(key))
+        multiples = rounded[~inside] / step
+        np.testing.assert_array_equal(multiples, np.rint(multiples))
+        assert not np.signbit(rounded[~inside][rounded[~inside] == 0]).any()
+
+
+def test_without_a_fringe_nothing_is_rounded(coreset) -> None:
+    assert fringe_step(coreset, 3, lambda key: np.zeros((6, 5, 7, 2), np.float32)) is None
+    table = finest()
+    np.testing.assert_array_equal(round_fringe(coreset, 0, table(0), None), table(0))
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Coreset:
+    series = ArraySeries(np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5))
+    return build_coreset(
+        series, scan(series, silent), FeatureChoice(range(2), [Everything()]), silent
+    )
+
+
+class Stored:
+    """Stands for a writer, and for the last array that was written."""
+
+    def add_array(self, name, *, shape, dtype, chunk_shape, chunks, dimension_names, attributes):
+        self.values = np.concatenate([chunk.reshape(-1) for chunk in chunks])
+        self.shape, self.dtype, self.attributes = shape, dtype, attributes or {}
+
+    def read(self, region):
+        return self.values
+
+
+def written(tiny: Coreset, kind: str, values: list[float]) -> np.ndarray:
+    """The coarsest table as it is read back, of a model with `values` first in every level."""
+    architecture = Architecture.for_box(tiny.box.shape, 2, embedding_size=1)
+    fine = np.zeros((1, len(tiny.values)), np.float32)
+    tables = [np.zeros((prod(level), 1), np.float32) for level in architecture.levels[1:]]
+    for table in (fine, *tables):
+        table.reshape(-1)[: len(values)] = values
+    stored = Stored()
+    write_tables(stored, architecture, tiny, fine, tables, kind)
+    return StoredTable(stored).read(())
+
+
+@pytest.mark.parametrize("kind", ["float32", "float16", "uint8"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused(tiny, kind, value) -> None:
+    with pytest.raises(InputError, match="not finite"):
+        written(tiny, kind, [0.5, value])
+
+
+def test_a_range_that_eight_bits_cannot_give_back_is_refused(tiny) -> None:
+    with pytest.raises(InputError, match=r"more than uint8 holds; use --tables float32"):
+        written(tiny, "uint8", [-3e38, 3e38])
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "within"),
+    [
+        ("float32", [-3e38, 1e-45, 3e38], 0.0),
+        ("float16", [-65504.0, 65504.0, 6e-8], 1e-8),
+        ("float16", [1e-9, -1e-9], 1e-9),
+        ("uint8", [-1e38, 2e38], 3e38 / 255),
+        ("uint8", [7.5], 7.5 / 255),
+        ("uint8", [-1e-40, 1e-45], 6e-39),
+        ("uint8", [1e-45], 6e-39),
+        ("uint8", [0.0], 0.0),
+    ],
+)
+def test_what_fits_comes_back_within_the_step_of_its_type(tiny, kind, values, within) -> None:
+    back = written(tiny, kind, values).astype(np.float64)
+    assert np.all(np.isfinite(back))
+    exact = np.zeros(len(back), np.float32)
+    exact[: len(values)] = values
+    assert np.abs(back - exact.astype(np.float64)).max() <= within
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1, 1, 2), (2, 300, 200, 100, 2), (9, 1, 1, 10**7, 4)])
+def test_chunks_are_one_time_node_of_bounded_size(shape) -> None:
+    chunk = table_chunk(shape, 4)
+    assert (chunk[0], chunk[-1]) == (1, shape[-1])
+    assert prod(chunk) * 4 <= 2 << 20
+    assert all(1 <= n <= length for n, length in zip(chunk, shape, strict=True))
+
+
+def rewritten(path, target, mixing) -> None:
+    """Write the same arrays, not coded, with other attributes of a component of level 1."""
+    with Container.open(path) as container, ContainerWriter(target) as writer:
+        for name, array in container.arrays.items():
+            attributes = mixing if name == "tables/level_1/component_2" else dict(array.attributes)
+            writer.add_whole(name, array.read(), attributes=attributes)
+        writer.commit(container.header)
+
+
+@pytest.fixture(scope="module")
+def coded_small(tmp_path_factory):
+    """A small file with coded tables of two components."""
+    path = tmp_path_factory.mktemp("small") / "a.fhz"
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 4, 5, 6)), indexing="ij")
+    field = (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32)
+    config = EncodeConfig(profile="paper", epochs=2, width=16, embedding_size=2, tables="transform")
+    fhash_codec.encode(field, path, config)
+    return path
+
+
+@pytest.mark.parametrize(
+    "mixing",
+    [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}],
+    ids=str,
+)
+def test_a_mixing_of_other_numbers_is_refused(tmp_path, coded_small, mixing) -> None:
+    with pytest.raises(InputError, match="array tables/level_1/component_2 attribute mixing"):
+        rewritten(coded_small, tmp_path / "a.fhz", mixing)
+
+
+def test_a_mixing_beyond_float32_is_damage(tmp_path, coded_small) -> None:
+    rewritten(coded_small, tmp_path / "a.fhz", {"mixing": [1e308, 0.0]})
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        pytest.raises(DamagedFileError, match="not finite"),
+    ):
+        volume.read(0)
+
+
+@pytest.mark.parametrize("fringe", [False, True])
+@pytest.mark.parametrize(
+    ("box", "keys", "fold"), [((5, 6, 7), 5, 2), ((1, 9, 4), 1, 2), ((4, 3, 11), 7, 3)]
+)
+def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
+    """The law in words: every corner with a weight, of every sample, and nothing else."""
+    random = np.random.default_rng(0)
+    masks = random.random((keys, *box)) < 0.04
+    levels = level_resolutions(box, keys, fold)
+    packed = [occupancy.pack(mask) for mask in masks]
+    needed = Needed(levels, packed.__getitem__, fringe=fringe)
+    samples = masks.copy()
+    if fringe:
+        samples[1:] |= masks[:-1]
+        samples[:-1] |= masks[1:]
+    for number, level in enumerate(levels):
+        expected = np.zeros(level, np.bool_)
+        sizes = (keys, *box)
+        for sample in np.argwhere(samples):
+            around = [
+                {p * (r - 1) // max(n - 1, 1), -(-p * (r - 1) // max(n - 1, 1))}
+                for p, r, n in zip(sample.tolist(), level, sizes, strict=True)
+            ]
+            for corner in product(*around):
+                expected[corner] = True
+        found = np.stack([needed.mask(number, node) for node in range(level[0])])
+        np.testing.assert_array_equal(found, expected)
+        assert needed.counts(number) == expected.sum(axis=(1, 2, 3)).tolist()
+
+
+FEATURE = EncodeConfig(
+    profile="paper",
+    epochs=2,
+    width=8,
+    features=("interval:80:120",),
+    dilation=0,
+    key_frames="0,2,4",
+    timings=False,
+)
+
+
+def sparse(network: Network, model: Any) -> Network:
+    """The network with tables that hold the needed vertices of a random model alone."""
+    needed = needed_by(model.selection.architecture, model.selection.coreset)
+    tables = []
+    for level, table in enumerate(network.tables):
+        values = table.read(tuple(slice(0, n) for n in table.shape))
+        masks = np.stack([needed.mask(level, node) for node in range(len(values))])
+        held = values[masks]
+        tables.append(
+            SparseTable(
+                values.shape,
+                masks.sum(axis=(1, 2, 3)).tolist(),
+                lambda first, end, held=held: held[first:end],
+                lambda node, masks=masks: masks[node],
+                f"level {level + 1}",
+            )
+        )
+    return replace(network, tables=tables)
+
+
+def test_regions_of_a_table_are_those_of_a_dense_one(random_model) -> None:
+    dense = random_model.network(fill=0.0)
+    chance = np.random.default_rng(0)
+    for table, other in zip(sparse(dense, random_model).tables, dense.tables, strict=True):
+        assert tuple(table.shape) == tuple(other.shape)
+        for _ in range(20):
+            spans = [sorted(chance.choice(n + 1, 2, replace=False)) for n in table.shape]
+            region = tuple(slice(int(start), int(stop)) for start, stop in spans)
+            np.testing.assert_array_equal(table.read(region), other.read(region))
+
+
+@pytest.mark.parametrize("small", [0, 200, 10**6])
+@pytest.mark.parametrize("key", [0.0, 0.4, 2.0, 3.75, 4.0])
+def test_a_decoded_region_has_the_bits_of_a_dense_one(
+    random_model, monkeypatch, key, small
+) -> None:
+    """Whichever levels get all their vertices first."""
+    monkeypatch.setattr("fhash_codec.paper.model.SMALL_NUMBERS", small)
+    dense = random_model.network(fill=0.0)
+    network = sparse(dense, random_model)
+    whole = tuple((0, n) for n in dense.box_size)
+    for region in (whole, ((2, 7), (0, 12), (3, 17)), tuple((n - 1, n) for n in dense.box_size)):
+        np.testing.assert_array_equal(
+            decode_region(network, key, region), decode_region(dense, key, region)
+        )
+    requested = np.random.default_rng(1).random(dense.box_size) < 0.1
+    np.testing.assert_array_equal(
+        decode_region(network, key, whole, requested=requested)[requested],
+        decode_region(dense, key, whole, requested=requested)[requested],
+    )
+
+
+@pytest.mark.parametrize("key", [0.0, 1.3, 4.0])
+def test_points_of_one_time_are_found_by_ranks(random_model, key) -> None:
+    """Pictures through the network do so."""
+    dense = random_model.network(fill=0.0)
+    network = sparse(dense, random_model)
+    tables = PointTables.of_box(network, key)
+    assert all(isinstance(patch, SparsePatch) for patch in tables.patches)
+    chance = np.random.default_rng(3)
+    places = [np.zeros(1), *(chance.random(300) * (n - 1) for n in dense.box_size)]
+    for column, size in zip(places[1:], dense.box_size, strict=True):
+        column[:20] = chance.integers(0, size, 20)
+    read = []
+    for box in (tables, PointTables.of_box(dense, key)):
+        values, slopes = np.empty(300, np.float32), np.empty((300, 4), np.float32)
+        PointSampler(box, key).sample(places, values, slopes, 1)
+        read.append((values, slopes))
+    np.testing.assert_array_equal(read[0][0], read[1][0])
+    np.testing.assert_array_equal(read[0][1], read[1][1])
+
+
+def test_sparse_parts_of_two_times_are_not_read_by_rank(random_model) -> None:
+    tables = PointTables.of_box(sparse(random_model.network(fill=0.0), random_model), 1.3)
+    with pytest.raises(AssertionError, match="at several times"):
+        PointSampler(tables)
+    PointSampler(tables, 1.3)
+
+
+def test_numbers_that_are_not_finite_are_damage(random_model) -> None:
+    network = sparse(random_model.network(fill=0.0), random_model)
+    frame = network.tables[1].frame(0)
+    frame.values[0, 0] = np.nan
+    with pytest.raises(DamagedFileError, match="level 2 holds numbers that are not finite"):
+        decode_region(network, 0.0, tuple((0, n) for n in network.box_size))
+
+
+@pytest.fixture(scope="module", params=["float16", "float32", "uint8"])
+def files(request, tmp_path_factory, waves) -> tuple[Path, Path]:
+    """The files of one training: with all vertices, and with the needed ones alone."""
+    folder = tmp_path_factory.mktemp("sparse")
+    config = replace(FEATURE, tables=request.param)
+    for name, share in {"dense": 0.0, "sparse": 2.0}.items():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("fhash_codec.paper.encode.SPARSE_BELOW", share)
+            fhash_codec.encode(waves(), folder / f"{name}.fhz", config)
+    return folder / "dense.fhz", folder / "sparse.fhz"
+
+
+def test_both_files_decode_to_the_same_bits(files) -> None:
+    with fhash_codec.open(files[0]) as dense, fhash_codec.open(files[1]) as other:
+        assert "sparse" not in dense.info["model"]
+        assert other.info["model"]["sparse"] == "fringe"
+        assert other.info["required_features"] == ["sparse-tables"]
+        for t in (0, 0.7, 1, 2, 3.5, 4):
+            np.testing.assert_array_equal(dense.read(t), other.read(t))
+        points = np.random.default_rng(0).random((2000, 4)) * [4, 8, 11, 19]
+        np.testing.assert_array_equal(dense.model(points), other.model(points))
+        assert np.isfinite(other.model(points)).sum() > 20
+
+
+def copied(source: Path, target: Path, changes: dict[str, Any]) -> None:
+    """Write the same arrays, some of them replaced by (values, attributes)."""
+    with Container.open(source) as container, ContainerWriter(target) as writer:
+        for name, array in container.arrays.items():
+            values, attributes = changes.get(name, (array.read(), dict(array.attributes)))
+            writer.add_whole(name, values, attributes=attributes)
+        writer.commit(container.header)
+
+
+def test_counts_that_are_not_those_of_the_occupancy_are_damage(files, tmp_path) -> None:
+    with Container.open(files[1]) as container:
+        table = container.arrays["tables/level_1"]
+        values, attributes = table.read(), dict(table.attributes)
+        bits = container.arrays["occupancy/bits"].read()
+    first, *others = attributes["counts"]
+    moved = {**attributes, "counts": [first - 1, others[0] + 1, *others[1:]]}
+    copied(files[1], tmp_path / "a.fhz", {"tables/level_1": (values, moved)})
+    message = rf"a.fhz: array tables/level_1 has {first - 1} vertices at time node 0; .* {first}$"
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        pytest.raises(DamagedFileError, match=message),
+    ):
+        volume.read(0)
+    everywhere = np.full_like(bits, 255)
+    copied(files[1], tmp_path / "b.fhz", {"occupancy/bits": (everywhere, {})})
+    with (
+        fhash_codec.open(tmp_path / "b.fhz") as volume,
+        pytest.raises(DamagedFileError, match="the occupancy asks for"),
+    ):
+        volume.read(0)
+
+
+def test_a_table_of_other_rows_is_refused(files, tmp_path) -> None:
+    with Container.open(files[1]) as container:
+        table = container.arrays["tables/level_2"]
+        values, attributes = table.read(), dict(table.attributes)
+    with pytest.raises(InputError, match=r"array tables/level_2 is .* asks for"):
+        copied(files[1], tmp_path / "a.fhz", {"tables/level_2": (values[1:], attributes)})

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from frame_field import frame_of, table_of, task_of
+from frame_field import frame_of, table_of, waves
+from frame_field import task_of as plain_task
+from frame_field import task_of as task_of_light
+from numpy.lib.stride_tricks import sliding_window_view
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.rendering import light as light_module
-from fhash_codec.rendering.bricks import Bricks
+from fhash_codec.rendering.bricks import FARTHEST, SIDE, Bricks, cells_of, limits_of, smoothed
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.light import (
     DEVIATIONS,
@@ -25,9 +31,20 @@ from fhash_codec.rendering.light import (
     slope_scale,
     smoothing,
 )
-from fhash_codec.rendering.march_task import GRADES, Grading
+from fhash_codec.rendering.march import (
+    MAX_MAGNITUDE,
+    MAX_SURFACES,
+    POWERS,
+    TILE,
+    March,
+    MarchInput,
+    march_native,
+    numbers,
+)
+from fhash_codec.rendering.march_task import GRADES, Grading, Lighting, Surface
 from fhash_codec.rendering.plan import plan_picture
-from fhash_codec.rendering.scenes import AmbientOcclusion, Shadows
+from fhash_codec.rendering.scenes import AmbientOcclusion, Camera, Shadows
+from fhash_codec.rendering.view import Body
 from fhash_formats.errors import InputError
 
 
@@ -124,7 +141,7 @@ def test_the_shadow_within_a_slab_is_its_closed_form(resolution, spacing) -> Non
     lamp = UP * np.sign(spacing)
     light = light_grid(
         frame_of(np.ones(shape)),
-        task_of(shape, table_of([0.05, 0.05]), (1, 1, spacing)),
+        task_of_light(shape, table_of([0.05, 0.05]), (1, 1, spacing)),
         shadows=settings,
         lamp=lamp,
     )
@@ -143,7 +160,7 @@ def test_a_block_throws_its_shadow_away_from_the_lamp() -> None:
     lamp = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
     light = light_grid(
         frame_of(values),
-        task_of(values.shape, table_of([0.0, 5.0])),
+        task_of_light(values.shape, table_of([0.0, 5.0])),
         shadows=Shadows(strength=1.0, resolution=1.0),
         lamp=lamp,
     )
@@ -159,7 +176,9 @@ def test_surroundings_take_light_only_where_there_are_any() -> None:
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
     light = light_grid(
-        frame_of(values), task_of(values.shape, table_of([0.0, 50.0])), ambient_occlusion=settings
+        frame_of(values),
+        task_of_light(values.shape, table_of([0.0, 50.0])),
+        ambient_occlusion=settings,
     )
     around = light.shares[:, 10, 10, 1]
     assert np.all(light.shares[..., 0] == 1)
@@ -171,7 +190,10 @@ def test_surroundings_take_light_only_where_there_are_any() -> None:
 def test_nothing_that_takes_light_leaves_all_of_it() -> None:
     for table in (None, table_of([0.0, 0.0])):
         light = light_grid(
-            frame_of(np.ones((5, 5, 5))), task_of((5, 5, 5), table), shadows=Shadows(), lamp=UP
+            frame_of(np.ones((5, 5, 5))),
+            task_of_light((5, 5, 5), table),
+            shadows=Shadows(),
+            lamp=UP,
         )
         assert np.all(light.shares == 1)
         assert light.secondary_rays == 0
@@ -181,7 +203,7 @@ def test_shadows_need_a_lamp() -> None:
     with pytest.raises(InputError, match="lamp"):
         light_grid(
             frame_of(np.ones((5, 5, 5))),
-            task_of((5, 5, 5), table_of([1.0, 1.0])),
+            task_of_light((5, 5, 5), table_of([1.0, 1.0])),
             shadows=Shadows(),
         )
 
@@ -192,7 +214,7 @@ def test_opacity_by_gradient_takes_as_little_light_as_it_draws() -> None:
     ball = np.where(np.sqrt(x * x + y * y + z * z) < 9, 1.0, 0.0)
 
     def lit(grading):
-        task = task_of(ball.shape, table_of([0.0, 0.2]), grading=grading)
+        task = task_of_light(ball.shape, table_of([0.0, 0.2]), grading=grading)
         shadows = Shadows(strength=1.0, resolution=1.0)
         return light_grid(frame_of(ball), task, shadows=shadows, lamp=UP).shares[..., 0]
 
@@ -226,7 +248,7 @@ def test_light_is_computed_again_only_for_what_changes_it(monkeypatch) -> None:
         del sums[:], extinctions[:]
         return light_grid(
             given,
-            task_of(values.shape, table, grading=grading),
+            task_of_light(values.shape, table, grading=grading),
             shadows=Shadows(resolution=1.0),
             lamp=lamp,
             ambient_occlusion=AmbientOcclusion(radius=radius),
@@ -260,3 +282,345 @@ def test_the_errors_of_a_bounded_file_are_noise(tmp_path: Path) -> None:
             assert coding_noise(volume) == pytest.approx(factor * largest)
             assert plan_picture(volume, Scene()).task.noise == pytest.approx(factor * largest)
         path.unlink()
+
+
+def bricks_of(values):
+    return Bricks.of(frame_of(values))
+
+
+def task_of(shape, extinctions, surfaces=()):
+    return plain_task(shape, table_of(extinctions), surfaces=surfaces)
+
+
+@pytest.mark.parametrize("shape", [(20, 17, 33), (9, 8, 10), (1, 30, 2), (1, 1, 1), (70, 70, 70)])
+def test_a_brick_has_the_extremes_of_its_vertices(shape) -> None:
+    values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
+    values[values > 1.5] = np.nan
+    bricks = bricks_of(values)
+    for at in np.ndindex(bricks.low.shape):
+        part = values[tuple(slice(i * SIDE, i * SIDE + SIDE + 1) for i in at)]
+        known = part[~np.isnan(part)]
+        assert bricks.low[at] == (known.min() if known.size else np.inf)
+        assert bricks.high[at] == (known.max() if known.size else -np.inf)
+    assert all(
+        count == max(-(-(size - 1) // SIDE), 1)
+        for count, size in zip(bricks.low.shape, shape, strict=True)
+    )
+
+
+def test_bricks_matter_where_something_can_be_seen() -> None:
+    values = np.zeros((33, 33, 33))
+    values[22, 2, 10] = 1.0
+    values[2, 26, 26] = 0.4
+    bricks = bricks_of(values)
+    peak = task_of(values.shape, [0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    assert np.argwhere(bricks.matters(peak)).tolist() == [[5, 0, 2]]
+    surface = Surface(value=0.3, colour=np.ones(3), opacity=1.0)
+    assert bricks.matters(task_of(values.shape, [0.0, 0.0], (surface,))).sum() == 2
+    assert not bricks.matters(task_of(values.shape, [0.0, 0.0])).any()
+    assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
+
+
+def test_the_distance_is_that_to_the_nearest_brick_that_matters() -> None:
+    values = np.zeros((60, 50, 90))
+    for z, y, x in ((4, 4, 4), (50, 20, 60), (33, 44, 85)):
+        values[z, y, x] = 1.0
+    bricks, task = bricks_of(values), task_of(values.shape, [0.0, 0.0, 1.0])
+    matters = np.argwhere(bricks.matters(task))
+    every = np.array(list(np.ndindex(bricks.low.shape)))
+    exact = np.abs(every[:, None] - matters).max(axis=2).min(axis=1)
+    assert np.array_equal(bricks.distance(task).ravel(), exact)
+    assert np.all(bricks.distance(task_of(values.shape, [0.0, 0.0])) == FARTHEST)
+
+
+def values(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape, dtype=np.float32)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.01, 0.2])
+def test_smoothed_values_stay_within_the_error(error: float) -> None:
+    noise = values((9, 11, 20))
+    noise[3, 4, 5] = np.nan
+    free, found = smoothed(noise, 1.5), smoothed(noise, 1.5, error)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(noise))
+    assert np.nanmax(np.abs(free - noise)) > error
+    assert np.nanmax(np.abs(found - noise)) <= error + 1e-6
+    near = np.abs(free - noise) <= error
+    np.testing.assert_allclose(found[near], free[near], atol=1e-6)
+
+
+def test_errors_cancel_and_what_is_larger_than_they_are_stays() -> None:
+    """A plateau with errors becomes flat; a step beside it keeps its height between neighbours."""
+    step = np.zeros((16, 16, 16), np.float32)
+    step[..., 8:] = 1
+    bounded = step + (0.02 * values(step.shape) - 0.01).astype(np.float32)
+    free, found = smoothed(bounded, 2.5), smoothed(bounded, 2.5, 0.01)
+    plateau = (slice(4, -4), slice(4, -4), slice(0, 3))
+    assert np.ptp(found[plateau]) < 0.5 * np.ptp(bounded[plateau])
+    heights = found[4:-4, 4:-4, 8] - found[4:-4, 4:-4, 7]
+    assert heights.min() > 0.95
+    assert (free[..., 8] - free[..., 7]).max() < 0.5
+
+
+def noise(shape, share_missing=0.0):
+    rng = np.random.default_rng(sum(shape))
+    values = rng.uniform(0, 0.4, shape).astype(np.float32)
+    values[rng.random(shape) < 0.04] = 0.9
+    values[rng.random(shape) < share_missing] = np.nan
+    return values
+
+
+def test_limits_lie_around_what_is_seen() -> None:
+    values = np.linspace(0, 1, 64).reshape(4, 4, 4)
+    bricks = bricks_of(values)
+    steps = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 3.0]
+    np.testing.assert_allclose(
+        limits_of(bricks, task_of(values.shape, steps)), [[0.125, 0.375], [0.75, np.inf]]
+    )
+    # What touches is one.
+    np.testing.assert_allclose(
+        limits_of(bricks, task_of(values.shape, [1.0, 0.0, 1.0, 0.0, 0.0])), [[-np.inf, 0.75]]
+    )
+    surface = Surface(value=0.6, colour=np.ones(3), opacity=1.0)
+    found = limits_of(bricks, task_of(values.shape, [0.0, 0.0], (surface,)))
+    assert found.shape == (1, 2)
+    assert found[0, 0] < 0.6 < found[0, 1]
+    assert found[0, 1] - found[0, 0] < 1e-5
+    assert limits_of(bricks, task_of(values.shape, [0.0, 0.0])).shape == (0, 2)
+
+
+@pytest.mark.parametrize("shape", [(9, 9, 9), (17, 20, 23), (1, 22, 30), (6, 1, 40), (2, 2, 2)])
+@pytest.mark.parametrize("missing", [0.0, 0.2])
+def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing) -> None:
+    library = native.library()
+    values = noise(shape, missing)
+    values[-1, -1, -1] = 0.9
+    bricks = bricks_of(values)
+    for extinctions, surfaces in (
+        ([0.0] * 8 + [1.0] * 3, ()),
+        ([0.0] * 8 + [1.0] * 3, (Surface(value=0.97, colour=np.ones(3), opacity=1.0),)),
+        (
+            [0.0, 0.0],
+            (
+                Surface(value=0.395, colour=np.ones(3), opacity=1.0),
+                Surface(value=0.41, colour=np.ones(3), opacity=1.0),
+            ),
+        ),
+    ):
+        task = task_of(shape, extinctions, surfaces)
+        cells = cells_of(library, bricks, task, bricks.distance(task))
+        limits = limits_of(bricks, task)
+        padded = np.pad(values, [(0, int(size == 1)) for size in shape], mode="edge")
+        corners = sliding_window_view(padded, (2, 2, 2)).reshape(
+            *(max(size - 1, 1) for size in shape), 8
+        )
+        low, high = (
+            np.where(np.isnan(corners), np.inf, corners).min(-1),
+            np.where(np.isnan(corners), -np.inf, corners).max(-1),
+        )
+        exact = np.any(
+            [(high > first) & (low < stop) & (low <= high) for first, stop in limits], axis=0
+        )
+        if cells is None:
+            assert exact.mean() > 0.3
+            continue
+        z, y, x = np.indices(exact.shape)
+        bits = (
+            cells[z // 4, y // 4, x // 4, z // 2 % 2]
+            >> (z % 2 * 16 + y % 4 * 4 + x % 4).astype(np.uint32)
+            & 1
+        )
+        np.testing.assert_array_equal(bits.astype(bool), exact)
+
+
+def test_where_most_cells_are_seen_they_are_not_looked_for() -> None:
+    library = native.library()
+    values = noise((17, 17, 17))
+    bricks = bricks_of(values)
+    for extinctions in ([1.0, 1.0], [0.0, 0.0], [0.0, 1.0] * 20 + [0.0, 0.0, 1.0] * 20):
+        task = task_of(values.shape, extinctions)
+        assert cells_of(library, bricks, task, bricks.distance(task)) is None
+
+
+SOURCES = Path(native.__file__).parent
+
+
+def constant(name: str, file: str) -> int:
+    match = re.search(rf"\b{name} = (\d+)", (SOURCES / file).read_text(encoding="utf-8"))
+    assert match is not None
+    return int(match[1])
+
+
+def test_the_fields_are_those_of_the_header_in_its_order() -> None:
+    header = (SOURCES / "march.hpp").read_text(encoding="utf-8")
+    body = header.split("struct FhashMarch {")[1].split("\n};")[0]
+    declarations = re.sub(r"//.*", "", body).split(";")[:-1]
+    names = [
+        re.sub(r"\[.*|^.*[ *]", "", name.strip())
+        for declaration in declarations
+        for name in declaration.split(",")
+    ]
+    assert names == [name for name, _ in March._fields_]
+
+
+def test_both_sides_have_the_same_constants() -> None:
+    assert constant("FHASH_SURFACES", "march.hpp") == MAX_SURFACES
+    assert constant("FHASH_POWERS", "march.hpp") == POWERS
+    assert constant("FHASH_BRICK", "march.hpp") == SIDE
+    assert constant("TILE", "march_packet.hpp") == TILE
+
+
+def test_a_structure_keeps_its_arrays_and_refuses_those_of_another_type() -> None:
+    structure = March(values=np.arange(1000, dtype=np.float32), depth=None, eye=numbers([1, 2, 3]))
+    assert structure.values[999] == 999
+    assert not structure.depth
+    assert list(structure.eye) == [1.0, 2.0, 3.0]
+    with pytest.raises(AssertionError, match="values is float64"):
+        March(values=np.zeros(3))
+    with pytest.raises(AssertionError, match="depth is not contiguous"):
+        March(depth=np.zeros((4, 4), dtype=np.float32)[:, ::2])
+
+
+COUNTS = (21, 17, 13)
+
+
+def input_of(values: Any, low: float, high: float, level: float, **place: Any) -> MarchInput:
+    """The input for a frame of values, a table and a surface."""
+    frame = frame_of(values, **place)
+    surfaces = (Surface(value=level, colour=np.ones(3), opacity=1.0),)
+    table = table_of([1.0, 1.0], low, high)
+    more = {"camera": Camera(), "size": (4, 4), "surfaces": surfaces}
+    task = plain_task(COUNTS[::-1], table, (1.0, 2.0, -3.0), **more)
+    return MarchInput.of(frame, task, Bricks.of(frame))
+
+
+def test_places_of_the_domain_are_those_of_the_frame() -> None:
+    values = np.zeros((3, 4, 5))
+    whole = input_of(np.zeros(COUNTS[::-1]), 0.0, 1.0, 0.5, first=(0, 0, 0))
+    part = input_of(values, 0.0, 1.0, 0.5, first=(2, 4, 6), stride=2)
+    shift = np.array([6.0, 4.0, 2.0])
+    np.testing.assert_array_equal(part.eye, (whole.eye - shift) / 2)
+    np.testing.assert_array_equal(part.forward, whole.forward / 2)
+    np.testing.assert_array_equal(part.box, (whole.box - shift[:, None]) / 2)
+    np.testing.assert_array_equal(part.spacing, 2 * whole.spacing)
+    np.testing.assert_array_equal(part.seen, [[0, 4], [0, 3], [0, 2]])
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1e38), (-3e38, 3e38), (0.0, 1e-30), (2.0**-130, 2.0**-129)]
+)
+def test_values_are_scaled_to_what_float32_can_compute_with(low: float, high: float) -> None:
+    shares = np.linspace(0, 1, 27).reshape(3, 3, 3)
+    given = input_of(low + shares * (high - low), low, high, (low + high) / 2, first=(0, 0, 0))
+    assert 1e-28 < given.high - given.low < MAX_MAGNITUDE
+    scaled = (given.values - given.low) / (given.high - given.low)
+    np.testing.assert_allclose(scaled, shares, atol=1e-5)
+    assert given.levels[0] == pytest.approx((given.low + given.high) / 2)
+
+
+CENTRAL = Lighting(
+    ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True
+)
+CELL = replace(CENTRAL, central=False)
+WHITE = np.ones(3)
+GRADING = Grading(factors=np.interp(np.arange(1025), [0, 300, 900], [0, 1, 0.3]), top=0.2)
+BODY = Body(
+    bounds=np.array([[-0.5, 17.3], [-0.5, 40], [-0.5, 40]]),
+    planes=np.array([[-0.6, 0.8, 0, -4.5], [0, 0.6, -0.8, -7.25]]),
+)
+PATHS = {"quickest": 0, "AVX2": 1, "plain": 2}
+
+
+@pytest.fixture(params=PATHS)
+def path(request):
+    return PATHS[request.param]
+
+
+def marched(values, task, path=0, first=(0, 0, 0)):
+    frame = frame_of(values, first=first)
+    return march_native(native.library(), frame, task, Bricks.of(frame), path=path)
+
+
+def task_of_native_march(shape, extinctions, **more):
+    table = None if extinctions is None else table_of(extinctions, colour=(0.9, 0.6, 0.3))
+    given = {"camera": Camera(azimuth=20.0), "size": (20, 18), "lighting": CENTRAL, **more}
+    return plain_task(shape, table, **given)
+
+
+CASES = {
+    "fog": {},
+    "shaded": {"shaded": True, "lighting": CELL, "depth": True, "normal": True},
+    "central": {"shaded": True, "antialiasing": 2},
+    "jitter": {"jitter": True, "step": 1.7},
+    "surfaces": {"shaded": True, "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),)},
+    "maximum": {"projection": "maximum", "depth": True},
+    "minimum": {"projection": "minimum", "depth": True},
+    "average": {"projection": "average", "depth": True, "extinctions": [1.0] * 100},
+    "attenuated": {"projection": "attenuated", "attenuation": 0.4, "depth": True},
+    "graded": {"shaded": True, "grading": GRADING},
+    "graded fog": {
+        "grading": GRADING,
+        "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),),
+    },
+    "clipped": {"shaded": True, "body": BODY},
+    "narrow": {"extinctions": [0.0] * 50 + [1.0] * 3 + [0.0] * 50},
+}
+
+
+@pytest.mark.parametrize("shape", [(14, 17, 22), (1, 30, 30), (30, 30, 1)])
+@pytest.mark.parametrize("case", CASES)
+def test_all_paths_make_one_picture(path, case, shape) -> None:
+    values = waves(shape)
+    more = {
+        "extinctions": np.concatenate([np.zeros(40), np.linspace(0, 0.4, 60)]),
+        "size": (37, 29),
+        **CASES[case],
+    }
+    for first, counts in (((0, 0, 0), shape), ((0, 2, 0), (shape[0], shape[1] + 5, shape[2]))):
+        task = task_of_native_march(counts, **more)
+        quickest, found = marched(values, task, 0, first), marched(values, task, path, first)
+        assert found.rgba[..., 3].max() > 0.01
+        np.testing.assert_allclose(found.rgba, quickest.rgba, atol=2e-4)
+        for name in ("rays", "samples"):
+            assert found.counters[name] == pytest.approx(quickest.counters[name], rel=0.01)
+        if task.depth:
+            np.testing.assert_array_equal(np.isfinite(found.depth), np.isfinite(quickest.depth))
+
+
+def test_all_paths_make_one_picture_in_a_grid_of_light(path) -> None:
+    values = waves((14, 17, 22))
+    for shaded in (False, True):
+        task = task_of_native_march(values.shape, np.linspace(0, 0.4, 100), shaded=shaded)
+        frame = frame_of(values)
+        light = light_grid(frame, task, shadows=Shadows(), lamp=np.array([0, 0, 1.0]))
+        task = replace(task, light=light)
+        np.testing.assert_allclose(
+            marched(values, task, path).rgba, marched(values, task).rgba, atol=2e-5
+        )
+
+
+@pytest.mark.parametrize("step", [0.3, 0.5, 0.9, 2.5, 3.9, 7.0])
+@pytest.mark.parametrize("jitter", [False, True])
+def test_no_surface_is_lost_by_skipping(path, step, jitter) -> None:
+    values = waves((27, 30, 38), pace=2.0)
+    samples = []
+    for camera in (Camera(azimuth=20.0, elevation=10.0), Camera(view="xy", projection="parallel")):
+        for level in (0.52, 0.9):
+            surface = Surface(value=level, colour=WHITE, opacity=0.5)
+            task = task_of_native_march(
+                values.shape,
+                None,
+                camera=camera,
+                size=(80, 70),
+                step=step,
+                jitter=jitter,
+                surfaces=(surface,),
+            )
+            found, everything = (
+                marched(values, task, path),
+                marched(values, replace(task, skipping=False), path),
+            )
+            np.testing.assert_allclose(found.rgba, everything.rgba, atol=1e-5)
+            samples.append(found.counters["samples"] / everything.counters["samples"])
+    if step < 1:
+        assert max(samples) < 0.9

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Scene, Volume
-from fhash_codec.rendering.march_task import NUMPY
-from fhash_codec.rendering.plan import MAX_RAYS, Plan, plan_picture
+from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.rendering.grid import Grid, Warp
+from fhash_codec.rendering.march_task import (
+    DENSEST,
+    NUMPY,
+    Array,
+    Arrays,
+    Frame,
+    Units,
+    extinctions_in,
+    warped,
+)
+from fhash_codec.rendering.plan import MAX_RAYS, Plan, arrays_on, plan_picture
+from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.transfer_function import Histogram
 from fhash_formats.errors import FhashWarning, InputError, RegionError
+from fhash_formats.series import ArraySeries, Coordinate
 
 
 def plan(volume: Volume, **scene: Any) -> Plan:
@@ -323,3 +340,270 @@ def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: in
         )
         assert given.function.opacity(0.5) == 0.25
         assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
+
+
+def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert arrays_on("cpu") is arrays_on("auto") is NUMPY
+    with pytest.raises(InputError, match="no CUDA device"):
+        arrays_on("cuda")
+    with pytest.raises(InputError, match="'gpu'; allowed: auto, cpu, cuda"):
+        arrays_on("gpu")
+
+
+def test_marching_on_the_processor_loads_no_torch() -> None:
+    code = (
+        "import sys; from fhash_codec.rendering import plan as devices; "
+        "import fhash_codec.rendering.stream_march; devices._driver_exists = lambda: False; "
+        "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )
+
+
+VALUES = np.array([[0.0, -1.75, 2.5], [3.25, 0.0, -0.5]])
+
+
+def results(arrays: Arrays) -> dict[str, Array]:
+    """The result of each operation, on the host."""
+    values = arrays.array(VALUES)
+    order = arrays.array([[2, 0, 1], [0, 0, 2]], "int64")
+    sums = arrays.full((3, 2), 1.0)
+    rows = arrays.array([2, 0, 2], "int64")
+    arrays.add_rows(sums, rows, arrays.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
+    copy = arrays.copy(values)
+    copy[0] = 9.0
+    found = {
+        "array": values,
+        "float32": arrays.to_float32(values),
+        "int64": arrays.to_int64(values),
+        "float64": arrays.to_float64(arrays.to_int64(values)),
+        "range": arrays.range(4),
+        "full": arrays.full((2, 2), 7, "int64"),
+        "row": arrays.nonzero(values)[0],
+        "column": arrays.nonzero(values)[1],
+        "taken": arrays.take_along(values, order, 1),
+        "sums": sums,
+        "copied from": values,
+    }
+    return {name: arrays.host(array) for name, array in found.items()}
+
+
+def test_operations_equal_those_of_numpy(tensors: Arrays) -> None:
+    expected, result = results(NUMPY), results(tensors)
+    for name, array in expected.items():
+        assert result[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(result[name], array, err_msg=name)
+
+
+def test_a_device_without_memory_is_an_input_error(tensors: Arrays) -> None:
+    import torch
+
+    with pytest.raises(InputError, match="smaller"), tensors.guarded():
+        raise torch.OutOfMemoryError("too much")
+
+
+GRID = Grid(counts=(11, 9, 1), origin=np.zeros(3), spacing=np.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("first", "shape", "stride", "bounds"),
+    [
+        ((0, 0, 0), (1, 9, 11), 1, [[0, 10], [0, 8], [-0.5, 0.5]]),
+        ((0, 2, 3), (1, 4, 5), 1, [[3, 7], [2, 5], [-0.5, 0.5]]),
+        # No further vertex would fit: the last values stand up to the end.
+        ((0, 0, 0), (1, 3, 4), 3, [[0, 10], [0, 8], [-0.5, 0.5]]),
+        ((0, 0, 0), (1, 2, 3), 3, [[0, 6], [0, 3], [-0.5, 0.5]]),
+    ],
+)
+def test_the_bounds_of_a_frame_reach_to_where_it_has_values(
+    first: tuple[int, int, int], shape: tuple[int, ...], stride: int, bounds: list[list[float]]
+) -> None:
+    frame = Frame(values=np.zeros(shape, dtype=np.float32), first=first, stride=stride)
+    np.testing.assert_array_equal(frame.bounds(GRID), bounds)
+
+
+def test_extinctions_in_another_length_stay_finite() -> None:
+    extinctions = np.array([0.0, 2.0, 1e300])
+    np.testing.assert_array_equal(extinctions_in(extinctions, 1e20), [0.0, 2e20, DENSEST])
+
+
+def volume(low: float, high: float, dtype: str) -> Volume:
+    fields = SimpleNamespace(value_range=ValueRange(low, high), float_dtype=np.dtype(dtype))
+    return cast(Volume, fields)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1.0), (1e6, 1e6 + 1), (-1e-300, 1e-300), (-1e300, 1e300), (5.0, 5.0)]
+)
+def test_converted_values_have_a_size_near_one(low: float, high: float) -> None:
+    units = Units.of(volume(low, high, "float64"))
+    assert math.frexp(units.factor)[0] == 0.5, "a power of two"
+    ends = units.to([low, high])
+    assert np.isfinite(ends).all()
+    assert np.abs(ends).max() <= 1
+
+
+def test_integers_that_are_one_float_cannot_be_drawn() -> None:
+    top = 2**64 - 1
+    with pytest.raises(InputError, match=f"cannot tell values from {top - 998} to {top} apart"):
+        Units.of(volume(top - 998, top, "float64"))
+    assert Units.of(volume(2**60, 2**60 + 998, "float64")).factor == 2.0**-10
+    assert Units.of(volume(top, top, "float64")).factor > 0
+
+
+PLACES = np.array([0, 0.25, 0.5, 1, 1.5, 2, 3, 4.0])
+WARP = Warp(counts=(5, 2, 3), places=(PLACES, None, None))
+
+
+def frame(values: np.ndarray, first: tuple[int, int, int] = (0, 0, 0), stride: int = 1) -> Frame:
+    return Frame(values=values.astype(np.float32), first=first, stride=stride)
+
+
+def test_a_vertex_without_a_value_takes_those_beside_it_along() -> None:
+    values = np.arange(5.0)
+    values[2] = np.nan
+    line = warped(frame(np.broadcast_to(values, (3, 2, 5)).copy()), WARP).values[0, 0]
+    np.testing.assert_array_equal(line, [0, 0.25, 0.5, 1, np.nan, np.nan, 3, 4])
+    np.testing.assert_array_equal(values, [0, 1, np.nan, 3, 4])
+
+
+def test_a_region_keeps_its_place() -> None:
+    drawn = warped(frame(np.arange(1.0, 4.0)[None, None].repeat(2, axis=1), (1, 0, 1)), WARP)
+    assert drawn.first == (1, 0, 3)
+    np.testing.assert_allclose(drawn.values[0, 0], [1, 1.5, 2, 3])
+    nothing = warped(frame(np.ones((1, 1, 1)), (0, 0, 4)), WARP)
+    assert nothing.values.shape == (1, 1, 1)
+    assert nothing.first == (0, 0, 7)
+
+
+def test_a_coarse_frame_reaches_to_the_end() -> None:
+    warp = Warp(counts=(6, 1, 1), places=(np.linspace(0, 5, 11), None, None))
+    drawn = warped(frame(np.array([0.0, 2, 4])[None, None], stride=2), warp)
+    assert drawn.stride == 2
+    np.testing.assert_allclose(drawn.values[0, 0], [0, 1, 2, 3, 4, 4])
+
+
+EVEN = np.linspace(-1, 1, 27)
+UNEVEN = np.sign(EVEN) * np.abs(EVEN) ** 1.7
+LINEAR = {"opacity": [[0.0, 0.0], [1.0, 0.4]], "unit_distance": 0.05}
+
+
+def ball(z: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A ball of radius 0.6 about the middle, with a soft surface."""
+    radius = np.sqrt(z[:, None, None] ** 2 + y[:, None] ** 2 + x**2)
+    return np.asarray(1 / (1 + np.exp((radius - 0.6) / 0.08)))
+
+
+def written(path: Path, values: np.ndarray, config: EncodeConfig, **coords: Any) -> Path:
+    """A container of one step or more, with coordinates (values, attributes) or values."""
+    axes = {"t": np.arange(len(values)), **coords}
+    made = {}
+    for axis, given in axes.items():
+        at, attributes = given if isinstance(given, tuple) else (given, {})
+        made[axis] = Coordinate(
+            name=axis, values=np.asarray(at, dtype=np.float64), attributes=attributes
+        )
+    series = ArraySeries(values.astype(np.float32), name="q", units="K", coords=made)
+    fhash_codec.encode(series, path, config)
+    return path
+
+
+def picture(path: Path, **scene: Any) -> np.ndarray:
+    with fhash_codec.open(path) as volume:
+        return Renderer(volume).render(Scene.from_dict({"size": [48, 48], **scene})).rgba
+
+
+FINE = EncodeConfig(effort=1, psnr=70)
+
+
+@pytest.mark.parametrize("descending", [False, True])
+def test_a_ball_on_uneven_axes_is_the_ball_on_even_ones(tmp_path: Path, descending: bool) -> None:
+    x = UNEVEN[::-1] if descending else UNEVEN
+    uneven = written(tmp_path / "u.fhz", ball(UNEVEN, EVEN, x)[None], FINE, z=UNEVEN, y=EVEN, x=x)
+    even = written(tmp_path / "e.fhz", ball(EVEN, EVEN, EVEN)[None], FINE, z=EVEN, y=EVEN, x=EVEN)
+    wrong = written(tmp_path / "w.fhz", ball(UNEVEN, EVEN, x)[None], FINE, z=EVEN, y=EVEN, x=EVEN)
+    for scene in (
+        {"transfer_function": LINEAR},
+        {"transfer_function": {"nothing": True}, "effects": {"isosurfaces": [{"value": 0.5}]}},
+        {"transfer_function": LINEAR, "effects": {"shading": True}, "camera": {"zoom": 3.0}},
+    ):
+        found, expected, other = (picture(path, **scene) for path in (uneven, even, wrong))
+        error = float(np.sqrt(np.mean((found - expected) ** 2)))
+        assert error < 0.02
+        assert error < 0.2 * float(np.sqrt(np.mean((other - expected) ** 2)))
+
+
+def test_every_level_draws_uneven_axes_alike(tmp_path: Path) -> None:
+    axis, even = UNEVEN[::2], EVEN[::2]
+    values = ball(axis, even, even)[None]
+    path = written(tmp_path / "u.fhz", values, FINE, z=axis, y=even, x=even)
+    scene = {"size": [16, 16], "transfer_function": LINEAR}
+    fine, coarse = (picture(path, **scene, march={"lod": lod}) for lod in (0, 1))
+    assert np.abs(coarse - fine).mean() < 0.03
+
+
+def test_a_network_is_sampled_where_uneven_axes_say(tmp_path: Path) -> None:
+    axis, even = UNEVEN[::3], EVEN[::3]
+    values = np.repeat(ball(even, even, axis)[None], 2, axis=0)
+    config = EncodeConfig(profile="paper", features=("interval:0.3:2",), epochs=8, width=8)
+    path = written(tmp_path / "p.fhz", values, config, z=even, y=even, x=axis)
+    scene = {"size": [12, 12], "transfer_function": LINEAR, "effects": {"shading": True}}
+    cache, arm, stream = (
+        picture(path, **scene, march={"mode": mode}) for mode in ("cache", "arm", "stream")
+    )
+    assert cache[..., 3].max() > 0.2
+    np.testing.assert_allclose(arm, stream, atol=0.01)
+    assert np.abs(arm - cache).mean() < 0.03
+
+
+def test_depths_are_drawn_downwards(tmp_path: Path) -> None:
+    depth = np.array([5.0, 10, 50, 200, 500, 1000, 2000, 3000, 4000, 5000])
+    values = np.zeros((1, 10, 12, 12))
+    values[:, 0] = 1
+    shown = {"opacity": [[0.0, 0.0], [0.5, 0.0], [1.0, 1.0]]}
+    units = {"units": "km"}
+    rest = {"y": (np.arange(12.0), units), "x": (np.arange(12.0), units)}
+    rows = {}
+    for positive in ("down", "up"):
+        z = depth / 500, {"units": "km", "positive": positive}
+        path = written(tmp_path / f"{positive}.fhz", values, FINE, z=z, **rest)
+        seen = picture(path, transfer_function=shown, camera={"view": "xz"})[..., 3]
+        rows[positive] = np.average(np.arange(48), weights=seen.sum(axis=1))
+    assert rows["down"] < 24 < rows["up"]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_plane_is_an_opaque_picture_of_its_values(tmp_path: Path, axis: int) -> None:
+    across, up = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 18))
+    plane = across * up
+    plane[9:, 12:] = np.nan
+    values = np.expand_dims(plane, axis)[None].repeat(2, axis=0)
+    values[1] *= 0.5
+    coords = {
+        name: np.arange(n, dtype=float) for name, n in zip("zyx", values.shape[1:], strict=True)
+    }
+    path = written(tmp_path / "f.fhz", values, FINE, **coords)
+    shown = {"size": [96, 72], "transfer_function": {"colours": "grey"}}
+    cache = picture(path, **shown)
+    assert cache[40:68, 4:90, 3].min() > 0.99
+    # Right and up in the picture are right and up of the axes; there the values are missing.
+    assert cache[4:30, 56:92, 3].max() == 0
+    brightness = cache[60, 4:90, 0]
+    assert np.all(np.diff(brightness[::8]) > 0)
+    assert picture(path, **shown, step=1)[60, 80, 0] < 0.7 * brightness[76]
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 9), (1, 9, 1), (9, 1, 1), (1, 1, 1)])
+def test_lines_and_points_are_seen(tmp_path: Path, shape: tuple[int, int, int]) -> None:
+    values = np.linspace(1, 2, int(np.prod(shape))).reshape((1, *shape))
+    coords = {name: np.arange(n, dtype=float) for name, n in zip("zyx", shape, strict=True)}
+    seen = picture(written(tmp_path / "l.fhz", values, FINE, **coords))[..., 3]
+    assert seen.max() > 0.99
+    assert (seen > 0.99).sum() >= 45

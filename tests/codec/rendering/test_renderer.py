@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import itertools
 import subprocess
 import sys
 import threading
@@ -12,17 +14,51 @@ from typing import Any
 import numpy as np
 import pytest
 from forked import ended_well, forked, needs_fork
+from PIL import Image as Pictures
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering import render
 from fhash_codec.rendering import renderer as module
+from fhash_codec.rendering.cameras import Rays
+from fhash_codec.rendering.colours import named_map
+from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.image import Image, Pen, overlay, surrounded, time_text
+from fhash_codec.rendering.layout import (
+    TITLE_GAP,
+    Layout,
+    end_texts,
+    lay_out,
+    length,
+    line_height,
+    quantity_of,
+    scales,
+    strips,
+    ticks,
+    wrapped,
+)
 from fhash_codec.rendering.march_task import Units
 from fhash_codec.rendering.renderer import evolution
-from fhash_codec.rendering.scenes import Effects, Evolution, scene_in_png
-from fhash_codec.rendering.scenes import Scene as Scene_evolution
-from fhash_formats.errors import InputError
+from fhash_codec.rendering.scenes import (
+    Camera,
+    Effects,
+    Evolution,
+    LegendEntry,
+    scene_in_png,
+)
+from fhash_codec.rendering.scenes import (
+    Scene as Scene_evolution,
+)
+from fhash_codec.rendering.scenes import (
+    Scene as Scene_image,
+)
+from fhash_codec.rendering.scenes import (
+    Scene as Scene_layout,
+)
+from fhash_codec.rendering.view import edges
+from fhash_formats.errors import InputError, OutputExistsError
+from fhash_formats.series import Coordinate
 
 SMALL = Scene(size=(40, 32))
 
@@ -328,3 +364,380 @@ def test_evolutions_that_cannot_be(volume: Volume, drawing: Any) -> None:
         Renderer(volume).plan(
             dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0,)))
         )
+
+
+SCENE = Scene_image(
+    size=(3, 2), camera=Camera(view="xz", position=(1.5, 2.0, 3.25)), background="#204060", step=3.5
+)
+
+
+def image(**arguments: Any) -> Image:
+    rgba = np.zeros((2, 3, 4), dtype=np.float32)
+    rgba[0, 0] = 0.5, 0, 0, 0.5
+    rgba[1, 2] = 0, 1, 0, 1
+    return Image(**{"rgba": rgba, "scene": SCENE.to_dict(), "source": "/data/run.fhz", **arguments})
+
+
+def test_pixels_over_a_background() -> None:
+    pixels = image().to_uint8()
+    assert (pixels.shape, pixels.dtype) == ((2, 3, 3), np.uint8)
+    assert pixels[0, 1].tolist() == [0x20, 0x40, 0x60]
+    assert pixels[0, 0].tolist() == [144, 32, 48]
+    assert pixels[1, 2].tolist() == [0, 255, 0]
+    assert image().to_uint8("white")[0, 0].tolist() == [255, 128, 128]
+
+
+def test_a_notebook_shows_the_picture() -> None:
+    with Pictures.open(io.BytesIO(image()._repr_png_())) as found:
+        np.testing.assert_array_equal(np.asarray(found), image().to_uint8())
+    assert repr(image()) == "<fhash Image 3x2 of run.fhz in 0 s>"
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPEG"])
+def test_a_jpeg_holds_the_pixels(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"view{suffix}"
+    rgba = np.ones((40, 60, 4), dtype=np.float32)
+    rgba[:, :30, 0] = 0
+    wide = image(rgba=rgba)
+    assert wide.save(path) == [path]
+    with Pictures.open(path) as found:
+        assert found.format == "JPEG"
+        difference = np.asarray(found).astype(int) - wide.to_uint8()
+    assert np.abs(difference).max() < 24
+    with pytest.raises(OutputExistsError):
+        wide.save(path)
+
+
+def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"written as \.png, \.jpg or \.jpeg"):
+        image().save(tmp_path / "view.gif")
+    clear = image(scene=Scene_image(background="transparent").to_dict())
+    with pytest.raises(InputError, match="JPEG cannot be transparent"):
+        clear.save(tmp_path / "view.jpg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_colour_bar_and_a_legend_are_drawn_in_their_colours() -> None:
+    colours = named_map("viridis").rescaled(0, 2)
+    entry = LegendEntry(text="fast", colour="#ff0000")
+    layout = strips((160, 120), Effects(colour_bar=True, legend=(entry,)), colours, "u [m/s]")
+    assert layout.bar is not None
+    assert layout.legend is not None
+    pen = Pen(160, 120, "white")
+    drawn, opacity = pen.colour_bar(layout.bar, colours)
+    left, top, right, bottom = layout.bar.box
+    middle = (left + right) // 2
+    np.testing.assert_allclose(drawn[top, middle], colours(2.0), atol=0.05)
+    np.testing.assert_allclose(drawn[bottom - 1, middle], colours(0.0), atol=0.05)
+    assert opacity[:, : left - 2].max() == 0
+    squares, opacity = pen.legend(layout.legend)
+    at, row, _ = layout.legend.entries[0]
+    np.testing.assert_allclose(squares[int(row) + 3, int(at) + 3], [1, 0, 0])
+
+
+COORDS = {
+    axis: Coordinate(name=axis, values=np.linspace(0, extent, 11), attributes={"units": "km"})
+    for axis, extent in zip("xyz", (4, 3, 2), strict=True)
+}
+
+
+GRID = Grid.of(COORDS)
+
+
+SIZES = [(256, 256), (300, 700), (1024, 512)]
+
+
+NAMES = ("box", "axes", "colour_bar", "time_label")
+
+
+def drawn(
+    effects: Effects,
+    size: tuple[int, int] = (256, 256),
+    background: str = "#ffffff",
+    fill: float = 0.0,
+    **camera: Any,
+) -> Image:
+    rgba = np.zeros((size[1], size[0], 4), dtype=np.float32)
+    scene = Scene_image(background=background, size=size, effects=effects, camera=Camera(**camera))
+    colours = named_map("plasma").rescaled(-3, 5)
+    layout, rays = lay_out(scene, GRID, COORDS, colours, "speed [m/s]")
+    left, top, width, height = layout.view
+    rgba[top : top + height, left : left + width, 3] = fill
+    image = Image(rgba=rgba, scene=scene.to_dict())
+    return overlay(image, effects, rays, layout, colours=colours, label="step 3   t = 1 s")
+
+
+def test_nothing_is_drawn_unless_asked_for() -> None:
+    image = Image(rgba=np.zeros((4, 4, 4), dtype=np.float32))
+    rays = Rays.of(Camera(), GRID, (4, 4))
+    layout = Layout(size=(4, 4), view=(0, 0, 4, 4))
+    assert overlay(image, Effects(), rays, layout, colours=named_map("grey")) is image
+    assert surrounded(image, Effects(box=True), colours=named_map("grey"), quantity="") is image
+
+
+@pytest.mark.parametrize("background", ["#ffffff", "#10121c", "transparent"])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_effect_is_seen_on_any_background(
+    name: str, size: tuple[int, int], background: str
+) -> None:
+    image = drawn(Effects(**{name: True}), size, background)
+    assert image.rgba.shape == (size[1], size[0], 4)
+    assert np.all((image.rgba >= 0) & (image.rgba <= 1 + 1e-6))
+    assert np.all(image.rgba[..., :3] <= image.rgba[..., 3:] + 1e-6)
+    paper = np.array(
+        [0, 0, 0] if background == "transparent" else list(bytes.fromhex(background[1:]))
+    )
+    drawn_on = np.abs(image.to_uint8()[..., :3].astype(int) - paper).max(axis=-1) > 100
+    if background == "transparent":
+        drawn_on = image.to_uint8()[..., 3] > 100
+    assert drawn_on.sum() > 100
+    assert drawn_on.mean() < 0.2
+
+
+def test_edges_at_the_back_are_hidden_by_an_opaque_volume_and_those_at_the_front_are_not() -> None:
+    clear, filled = (drawn(Effects(box=True), fill=fill).rgba for fill in (0.0, 1.0))
+    rays = Rays.of(Camera(), GRID, (256, 256))
+    back = [edge for edge in edges(rays) if edge.fronts == 0]
+    front = [edge for edge in edges(rays) if edge.fronts == 2]
+    outline = [edge for edge in edges(rays) if edge.fronts == 1]
+    assert (len(back), len(front), len(outline)) == (3, 3, 6)
+
+    def at(picture: np.ndarray, edge: Any) -> float:
+        x, y = edge.ends.mean(axis=0)
+        return float(picture[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2, :3].max())
+
+    for edge in back:
+        assert at(filled, edge) == 0
+        assert at(clear, edge) > 0
+    for edge in front + outline:
+        assert at(filled, edge) > 0
+
+
+def test_from_inside_the_volume_the_overlay_is_finite() -> None:
+    everything = Effects(box=True, axes=True, colour_bar=True, time_label=True)
+    inside = drawn(
+        everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
+    )
+    assert np.all(np.isfinite(inside.rgba))
+
+
+def test_the_text_of_a_time() -> None:
+    def times(values: list[float], units: str) -> Coordinate:
+        return Coordinate(name="time", values=np.array(values), attributes={"units": units})
+
+    assert time_text(3, 0.25, times([0, 0.25], "s")) == "step 3   t = 0.25 s"
+    assert time_text(3.5, 1e-9, times([0, 2e-9], "")) == "step 3.5   t = 1e-09"
+    late = times([347921.001, 347921.002], "s")
+    assert time_text(0, 347921.001, late) == "step 0   t = 347921.001 s"
+    dated = times([40.0, 40.25], "days since 2001-01-01")
+    assert time_text(1, 40.25, dated) == "step 1   2001-02-10 06:00"
+    assert time_text(0, 40.0, dated) == "step 0   2001-02-10"
+
+
+LONG = "sea_water_potential_temperature [degree_Celsius]"
+
+
+@pytest.mark.parametrize("limit", [12.0, 40.0, 90.0, 150.0, 1000.0])
+def test_lines_are_no_longer_than_their_limit_and_hold_every_letter(limit: float) -> None:
+    lines = wrapped(LONG, 10, limit)
+    assert all(length(line, 10) <= limit for line in lines)
+    assert "".join(lines).replace(" ", "") == LONG.replace(" ", "")
+    assert (len(lines) == 1) is (limit == 1000)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-12, 1.0, 3e7, 1e300])
+@pytest.mark.parametrize("count", [1, 2, 5, 12])
+def test_ticks_lie_within_the_ends_at_any_scale(scale: float, count: int) -> None:
+    for low, high in ((0.13, 0.97), (-5.0, 3.0), (99.99, 100.01)):
+        marks = ticks(low * scale, high * scale, count)
+        values, texts = [value for value, _ in marks], [text for _, text in marks]
+        assert 1 <= len(marks) <= 2.6 * count + 2
+        assert len(set(texts)) == len(texts)
+        assert all(
+            low * scale - 1e-9 * abs(scale) <= value <= high * scale + 1e-9 * scale
+            for value in values
+        )
+        np.testing.assert_allclose(
+            [float(text) for text in texts], values, rtol=1e-6, atol=1e-9 * scale
+        )
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "texts"),
+    [
+        (0, 4, ("0", "4")),
+        (88, -88, ("88", "-88")),
+        (5, 5000, ("5", "5000")),
+        (1234567.125, 1234890.5, ("1234567.1", "1234890.5")),
+        (0.001, 0.0025, ("0.001", "0.0025")),
+        (0.1 + 0.2, 1, ("0.3", "1")),
+        (3, 3, ("3", "3")),
+        (-0.00001, 1, ("0", "1")),
+        (1e12, 1.0001e12, ("1e+12", "1.0001e+12")),
+        (0, 3e-9, ("0", "3e-09")),
+    ],
+)
+def test_ends_are_told_apart_in_few_letters(
+    first: float, last: float, texts: tuple[str, str]
+) -> None:
+    assert end_texts(first, last) == texts
+
+
+def test_ends_that_are_out_of_view_have_no_number() -> None:
+    grid, view = Grid.of(COORDS), (0.0, 0.0, 400.0, 400.0)
+    near = Rays.of(Camera(view="xz", zoom=3), grid, (400, 400))
+    labels, _ = scales(near, view, view, COORDS, 12, breaking=0)
+    assert not labels
+    beside = Rays.of(
+        Camera(view="xz", zoom=3, focal_point=(0.0, 1.5, 0.0), position=(0.0, -15.0, 0.0)),
+        grid,
+        (400, 400),
+    )
+    texts = [label.lines[0] for label in scales(beside, view, view, COORDS, 12, breaking=0)[0]]
+    assert sorted(texts) == ["0", "0", "x [km]", "z [km]"]
+
+
+SIZES_LAYOUT = [(256, 256), (512, 512), (1024, 1024), (480, 270), (270, 480), (256, 700)]
+Box = tuple[float, float, float, float]
+LOW = 9.87e14
+HIGH = 9.88e14
+
+
+def coords(kind: str) -> dict[str, Coordinate]:
+    def at(name: str, first: float, last: float, count: int, units: str) -> Coordinate:
+        values = np.linspace(first, last, count)
+        return Coordinate(name=name, values=values, attributes={"units": units})
+
+    return {
+        "plain": {axis: at(axis, -1, 1, 9, "m") for axis in "xyz"},
+        "flat": {
+            "x": at("longitude", 0, 358, 90, "degrees_east"),
+            "y": at("latitude", 89, -89, 45, "degrees_north"),
+            "z": at("level", 0, 0, 1, "1"),
+        },
+        "long": {
+            "x": at("projection_x_coordinate", 1234567.125, 1234890.5, 20, "kilometres"),
+            "y": at("projection_y_coordinate", -1234567.1, -1234890.5, 20, "kilometres"),
+            "z": at("geopotential_height_above_ellipsoid", 1e5, 1.003e5, 20, "kilometres"),
+        },
+    }[kind]
+
+
+EVERYTHING = Effects(
+    box=True,
+    axes=True,
+    colour_bar=True,
+    time_label=True,
+    legend=(
+        LegendEntry(text="sea_water_temperature 12.5 to 13.75 degree_Celsius", colour="red"),
+        LegendEntry(text="sea_water_temperature = 20 degree_Celsius", colour="blue"),
+    ),
+)
+
+
+def laid_out(
+    kind: str,
+    size: tuple[int, int],
+    effects: Effects = EVERYTHING,
+    quantity: str = "atmosphere_mass_content_of_cloud_condensed_water [kg m-2 s-1]",
+    **camera: Any,
+) -> tuple[Layout, Rays]:
+    axes = coords(kind)
+    scene = Scene_layout(size=size, effects=effects, camera=Camera(**camera))
+    colours = named_map("viridis").rescaled(LOW, HIGH)
+    return lay_out(scene, Grid.of(axes), axes, colours, quantity)
+
+
+def covered(layout: Layout, rays: Rays) -> np.ndarray:
+    """The pixels (H, W) of the picture whose rays meet the drawn box."""
+    origins, directions = rays.pixels()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (rays.grid.bounds.T[:, None, None] - origins) / directions
+    enter = np.nanmax(np.minimum(ends[0], ends[1]), axis=-1)
+    leave = np.nanmin(np.maximum(ends[0], ends[1]), axis=-1)
+    whole = np.zeros(layout.size[::-1], dtype=bool)
+    left, top, width, height = layout.view
+    whole[top : top + height, left : left + width] = enter < leave
+    return whole
+
+
+def texts(layout: Layout) -> list[tuple[str, Box]]:
+    """Every text with the box that it takes, as the pen writes it."""
+    found = [(" ".join(label.lines), label.box) for label in layout.labels]
+    bar = layout.bar
+    if bar is not None:
+        left, top, right, bottom = bar.box
+        pitch = line_height(bar.size)
+        for value, text in bar.marks:
+            row = bottom - (value - LOW) / (HIGH - LOW) * (bottom - top)
+            at = right + bar.size // 4 + 2
+            box = at, row - pitch / 2, at + length(text, bar.size) + 2, row + pitch / 2
+            found.append((text, box))
+        for number, line in enumerate(reversed(bar.title)):
+            row = top - (number + TITLE_GAP) * pitch
+            box = left - 2, row - pitch / 2, left + length(line, bar.size), row + pitch / 2
+            found.append((line, box))
+    if layout.legend is not None:
+        side = layout.legend.size
+        for at, top, entry in layout.legend.entries:
+            wide = 1.4 * side + length(entry.text, side) + 2
+            found.append((entry.text, (at, top - side / 4, at + wide, top + 1.25 * side)))
+    return found
+
+
+@pytest.mark.parametrize("size", SIZES_LAYOUT, ids=str)
+@pytest.mark.parametrize(
+    ("kind", "camera"),
+    [
+        ("plain", {}),
+        ("plain", {"azimuth": 77.0, "elevation": -20.0}),
+        ("plain", {"view": "xz", "projection": "parallel"}),
+        ("plain", {"zoom": 2.5}),
+        ("flat", {}),
+        ("flat", {"view": "iso"}),
+        ("long", {}),
+    ],
+    ids=str,
+)
+def test_nothing_covers_the_volume_or_is_cut(
+    kind: str, camera: dict[str, Any], size: tuple[int, int]
+) -> None:
+    layout, rays = laid_out(kind, size, **camera)
+    volume = covered(layout, rays)
+    assert volume.sum() > 0.02 * volume.size
+    left, top, width, height = layout.view
+    assert width >= 0.15 * size[0]
+    assert height >= 0.15 * size[1]
+    boxes = texts(layout)
+    for text, box in boxes:
+        assert box[0] >= -0.5, text
+        assert box[1] >= -0.5, text
+        assert box[2] <= size[0] + 0.5, text
+        assert box[3] <= size[1] + 0.5, text
+        rows = slice(max(int(box[1]), 0), int(np.ceil(box[3])))
+        columns = slice(max(int(box[0]), 0), int(np.ceil(box[2])))
+        assert not volume[rows, columns].any(), text
+    for (one, first), (other, second) in itertools.combinations(boxes, 2):
+        apart = (
+            first[2] <= second[0] + 1
+            or second[2] <= first[0] + 1
+            or first[3] <= second[1] + 1
+            or second[3] <= first[1] + 1
+        )
+        assert apart, (one, other)
+    assert layout.bar is not None
+    assert layout.bar.box[0] >= left + width
+    assert layout.time is not None
+    assert layout.time[3] <= top
+
+
+def test_in_a_tiny_picture_the_volume_keeps_its_place() -> None:
+    layout, rays = laid_out("plain", (24, 20))
+    assert rays.size == layout.view[2:]
+    assert rays.size[0] >= 0.3 * 24 - 1
+
+
+def test_names_of_quantities() -> None:
+    assert quantity_of("speed", "m s-1") == "speed [m s-1]"
+    assert quantity_of("share", "1") == quantity_of("share", "") == "share"

@@ -2,32 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from math import prod
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import fhash_codec
+from fhash_codec.config import EncodeConfig
+from fhash_codec.encoding import encode
+from fhash_codec.paper.model import sample_points
+from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.march_task import Frame, Surface, Table, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_codec.selftest import field_cases, network_cases, ray_cases, value_cases
+from fhash_codec.selftest.case import Case, Check, Run
 from fhash_codec.selftest.field_cases import (
     COMPACT,
     EXACT,
     MORE,
     PAPER,
     QUICK,
-    SHAPE,
     lattice,
     noise,
     of_all,
     series,
     waves,
 )
-from fhash_codec.selftest.run import cases, choose_cases
+from fhash_codec.selftest.field_cases import (
+    SHAPE as SHAPE_CASES,
+)
+from fhash_codec.selftest.network_cases import (
+    Oracle,
+    constant_tables,
+    diverged,
+    ends_of_half_precision,
+    engines,
+    kinks,
+    large_tables,
+    recovered,
+)
+from fhash_codec.selftest.ray_cases import (
+    blocks,
+    closed_form,
+    key_times,
+    reference_picture,
+    scene,
+    scenes,
+)
+from fhash_codec.selftest.run import cases, choose_cases, run_case
 from fhash_formats.errors import InputError
 
 CASES = {case.name: case for case in cases()}
@@ -161,7 +192,7 @@ def test_features_lie_where_their_names_say() -> None:
     for case in field_cases.FEATURE_CASES:
         configs = [*case.settings.values(), *case.more.values()]
         assert len({(config.features, config.dilation) for config in configs}) == 1, case.name
-    surface = np.ones(SHAPE, dtype=bool)
+    surface = np.ones(SHAPE_CASES, dtype=bool)
     surface[:, 1:-1, 1:-1, 1:-1] = False
     np.testing.assert_array_equal(in_feature("at-every-border"), surface)
     assert alone(in_feature("every-second-vertex"), range(4))
@@ -270,7 +301,7 @@ def test_the_camera_along_an_axis_aims_at_vertices(view: str) -> None:
 
 
 def test_fields_and_series_are_made_as_asked() -> None:
-    for shape in (SHAPE, (2, 2, 2, 2), (1, 1, 1, 5)):
+    for shape in (SHAPE_CASES, (2, 2, 2, 2), (1, 1, 1, 5)):
         assert waves(shape).shape == shape
         assert (waves(shape).min(), waves(shape).max()) == (0.0, 1.0)
     assert waves((1, 1, 1, 1)).tolist() == [[[[0.0]]]]
@@ -318,3 +349,326 @@ def test_guises_keep_the_values_in_another_order() -> None:
     for name, guise in guises.items():
         np.testing.assert_array_equal(np.sort(guise, axis=None), np.sort(values, axis=None))
         assert guise.shape != values.shape or not np.array_equal(guise, values), name
+
+
+Broken = Callable[[Run, Check], set[str]]
+ALONE = (constant_tables, ends_of_half_precision, kinks, large_tables)
+"""Checks that make networks of their own and do not look at the run."""
+
+
+@pytest.mark.parametrize("check", ALONE)
+def test_sound_networks_keep_every_property(broken: Broken, check: Check) -> None:
+    assert broken(None, check) == set()
+
+
+def shifted(value: float, slope: float) -> Callable[..., object]:
+    """`sample_points` with an error in values and slopes."""
+    sample_points = network_cases.sample_points
+
+    def sample(*given: object, gradient: bool = False) -> object:
+        if not gradient:
+            return sample_points(*given) + np.float32(value)
+        values, slopes = sample_points(*given, gradient=True)
+        return values + np.float32(value), slopes + np.float32(slope)
+
+    return sample
+
+
+@pytest.mark.parametrize(
+    ("check", "value", "slope", "properties"),
+    [
+        (constant_tables, 1e-6, 0.0, {"constant tables"}),
+        (constant_tables, 0.0, 1e-6, {"constant tables, slopes"}),
+        (kinks, 0.0, 1e-6, {"derivatives about kinks"}),
+        (kinks, 1e-5, 0.0, {"derivatives about kinks, differences"}),
+        (large_tables, 1e-3, 0.0, {"large tables"}),
+    ],
+)
+def test_wrong_values_and_slopes_are_seen(
+    broken: Broken,
+    monkeypatch: pytest.MonkeyPatch,
+    check: Check,
+    value: float,
+    slope: float,
+    properties: set[str],
+) -> None:
+    monkeypatch.setattr(network_cases, "sample_points", shifted(value, slope))
+    assert broken(None, check) >= properties
+
+
+def test_a_number_type_that_accepts_too_much_is_seen(
+    broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Careless:
+        @classmethod
+        def of(cls, table: np.ndarray, kind: str) -> Careless:
+            return cls()
+
+        def stored(self, table: np.ndarray) -> np.ndarray:
+            return np.minimum(table, 65_000)
+
+    monkeypatch.setattr(network_cases, "NumberType", Careless)
+    assert broken(None, ends_of_half_precision) == {"too large for float16", "largest of float16"}
+
+
+def trained(run: Run, **training: object) -> Run:
+    """The run as if its header said this of the training."""
+    volume = SimpleNamespace(container=SimpleNamespace(header={"training": training}))
+    return replace(run, volume=volume)
+
+
+def test_a_training_that_does_not_tell_its_restarts_is_seen(
+    compact_run: Run, broken: Broken, spoiled: Callable[..., Run]
+) -> None:
+    rate = compact_run.config.learning_rate
+    true = compact_run.decoded
+    mean = np.full_like(true, compact_run.values.mean())
+    told = trained(compact_run, learning_rate=rate / 16, restarts=2)
+    assert broken(spoiled(told, true), recovered) == set()
+    assert broken(spoiled(told, mean), recovered) == {"better than a constant"}
+    untold = trained(compact_run, learning_rate=rate / 16)
+    assert broken(spoiled(untold, true), recovered) == {"rate and restarts told"}
+    assert broken(told, diverged) == set()
+    assert broken(untold, diverged) == {"divergence not found"}
+
+
+def test_an_engine_that_trains_another_network_is_seen(
+    paper_run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another seed stands for another engine."""
+    encode = network_cases.encode
+
+    def other(source: object, path: object, config: object, **rest: object) -> object:
+        assert config.engine == "slab"
+        return encode(source, path, replace(config, seed=1), **rest)
+
+    assert [finding.holds for finding in engines(paper_run)] == [True]
+    monkeypatch.setattr(network_cases, "encode", other)
+    assert [finding.holds for finding in engines(paper_run)] == [False]
+
+
+@pytest.fixture(scope="module")
+def layers() -> Case:
+    """A network of one hidden layer, hardly trained."""
+    case = next(case for case in network_cases.NETWORK_CASES if case.name == "layers")
+    config = replace(case.settings["hidden-layers-1"], epochs=5)
+    return replace(case, settings={"hidden-layers-1": config})
+
+
+def broken_of(case: Case) -> set[str]:
+    result = run_case(case, checks=())
+    assert not result.errors
+    return {finding.name for finding in result.findings if not finding.holds}
+
+
+def small_network() -> Network:
+    """One level of 2 x 2 x 2 x 3 corners with the value t + 10 z + 100 y + 1000 x.
+
+    A ReLU lets values above 500 through; the readout doubles them and adds 0.25.
+    """
+    t, z, y, x = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (2, 2, 2, 3)), indexing="ij")
+    table = ArrayTable((t + 10 * z + 100 * y + 1000 * x)[..., None])
+    first = (np.ones((1, 1), np.float32), np.array([-500.0], np.float32))
+    last = (np.full((1, 1), 2.0, np.float32), np.array([0.25], np.float32))
+    return Network(
+        levels=((2, 2, 2, 3),),
+        embedding_size=1,
+        tables=[table],
+        layers=(first, last),
+        box_size=(3, 3, 3),
+        key_frames=5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("point", "table_value"),
+    [
+        ((0, 0, 0, 0), 0.0),
+        ((4, 2, 2, 2), 2111.0),
+        ((2, 0, 0, 1), 1000.5),
+        ((1, 1, 0.5, 1.75), 0.25 + 5 + 25 + 1750),
+    ],
+)
+def test_the_oracle_is_the_definition(point: tuple[float, ...], table_value: float) -> None:
+    answer = Oracle(small_network()).at(point)
+    assert answer.value == pytest.approx(2 * max(0.0, table_value - 500) + 0.25, rel=1e-14)
+    assert answer.active == (table_value > 500,)
+    sampled = sample_points(small_network(), *point)
+    assert abs(float(sampled[0]) - answer.value) <= answer.rounding
+    assert answer.rounding < 1e-2
+
+
+def test_a_sound_network_keeps_the_bounds(layers: Case) -> None:
+    assert broken_of(layers) == set()
+
+
+def test_an_error_beyond_the_bound_of_rounding_is_seen(
+    layers: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        network_cases,
+        "sample_points",
+        lambda *given, **more: sample_points(*given, **more) + np.float32(1e-3),
+    )
+    case = replace(layers, checks=(network_cases.agrees,))
+    assert broken_of(case) == {"float64 oracle", "float64 oracle, error"}
+
+
+def turned(sample: Callable[..., object]) -> Callable[..., object]:
+    """`sample_points` with the derivatives by other coordinates."""
+
+    def other(*given: object, gradient: bool) -> object:
+        values, slopes = sample(*given, gradient=gradient)
+        return values, slopes[:, ::-1]
+
+    return other
+
+
+def test_wrong_gradients_are_seen(layers: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_cases, "sample_points", turned(sample_points))
+    case = replace(layers, checks=(network_cases.gradients,))
+    assert broken_of(case) == {"gradient = differences"}
+
+
+FOG = {"opacity": [[0.0, 0.02], [1.0, 0.5]]}
+SMALL = scene(size=[6, 5], transfer_function=FOG)
+EVEN = scene(size=[2, 2], transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 0.1})
+
+
+@contextmanager
+def opened(run: Run, path: Path, values: np.ndarray) -> Iterator[Run]:
+    """A run of other values; few, since the oracle takes its time."""
+    source = series(values.astype(np.float32))
+    encode(source, path, EncodeConfig(max_error_rel=1e-3, effort=1))
+    with fhash_codec.open(path) as volume:
+        yield replace(run, series=source, values=values, path=path, volume=volume)
+
+
+@pytest.fixture(scope="module")
+def waves_run(compact_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    with opened(
+        compact_run, tmp_path_factory.mktemp("waves") / "a.fhz", waves((2, 4, 5, 6))
+    ) as run:
+        yield run
+
+
+@pytest.fixture(scope="module")
+def even_run(compact_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    with opened(
+        compact_run, tmp_path_factory.mktemp("even") / "a.fhz", np.ones((1, 2, 3, 3))
+    ) as run:
+        yield run
+
+
+@pytest.mark.parametrize("check", [scenes({"small": SMALL}), blocks, key_times])
+def test_easy_scenes_keep_every_property(waves_run: Run, broken: Broken, check: Check) -> None:
+    assert broken(waves_run, check) == set()
+
+
+def test_an_even_volume_has_its_closed_form(even_run: Run, broken: Broken) -> None:
+    assert broken(even_run, closed_form({"even": EVEN}, 1.0)) == set()
+
+
+def test_a_longer_path_breaks_the_closed_form(
+    even_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = ray_cases._path
+    monkeypatch.setattr(ray_cases, "_path", lambda plan: 2 * path(plan))
+    assert broken(even_run, closed_form({"even": EVEN}, 1.0)) == {"closed form"}
+
+
+def test_a_picture_that_differs_from_the_oracle_is_seen(
+    waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reference = ray_cases.reference_picture
+    monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: reference(*given) + 2e-3)
+    assert broken(waves_run, scenes({"small": SMALL})) == {"float64 picture"}
+
+
+def test_an_empty_picture_proves_nothing(
+    waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: np.zeros((5, 6, 4)))
+    assert "empty pictures" in broken(waves_run, scenes({"small": SMALL}))
+
+
+def test_a_part_that_is_drawn_too_bright_is_seen(
+    waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    march = ray_cases.march
+
+    def brighter(frame: object, task: object) -> object:
+        marched = march(frame, task)
+        return replace(marched, rgba=marched.rgba * np.float32(1 + 1e-4 * (frame.first[0] > 0)))
+
+    monkeypatch.setattr(ray_cases, "march", brighter)
+    assert broken(waves_run, blocks) == {"blocks = whole"}
+
+
+def test_pictures_that_depend_on_the_name_of_the_step_are_seen(
+    waves_run: Run, broken: Broken, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render = ray_cases.Renderer.render
+
+    def other(renderer: object, given: object) -> object:
+        image = render(renderer, given)
+        return image if given.time is None else replace(image, rgba=image.rgba + np.float32(1e-6))
+
+    monkeypatch.setattr(ray_cases.Renderer, "render", other)
+    assert broken(waves_run, key_times) == {"picture at a key time"}
+
+
+SHAPE = (5, 4, 4)
+
+
+def task_of(**more: object) -> Task:
+    """Four parallel rays from above, through a volume of `SHAPE`."""
+    grid = Grid(counts=SHAPE[::-1], origin=np.zeros(3), spacing=np.ones(3))
+    camera = Camera(view="xy", projection="parallel", parallel_scale=1.0)
+    return Task(rays=Rays.of(camera, grid, (2, 2)), step=0.3, threshold=0.0, **more)
+
+
+@pytest.mark.parametrize("extinction", [1e-6, 0.3, 50.0])
+def test_a_constant_slab_has_its_closed_form(extinction: float) -> None:
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.tile(np.float32([1.0, 0.5, 0.0]), (3, 1)),
+        extinctions=np.full(3, extinction),
+    )
+    frame = Frame(values=np.full(SHAPE, 0.5, np.float32), first=(0, 0, 0))
+    opacity = -np.expm1(-4 * extinction)
+    np.testing.assert_allclose(
+        reference_picture(frame, task_of(table=table)),
+        np.broadcast_to(opacity * np.array([1, 0.5, 0, 1]), (2, 2, 4)),
+        rtol=1e-9,
+    )
+
+
+def test_surfaces_are_drawn_over_those_behind_them() -> None:
+    ramp = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None, None], SHAPE)
+    surfaces = tuple(
+        Surface(value=value, colour=np.array(colour), opacity=0.5)
+        for value, colour in ((1.0, (0, 1, 0)), (4.0, (1, 0, 0)))
+    )
+    picture = reference_picture(
+        Frame(values=ramp, first=(0, 0, 0)), task_of(table=None, surfaces=surfaces)
+    )
+    # Seen from above, the surface at 4 lies on the face where the rays enter, and the one at 1
+    # behind it, exactly on vertices.
+    np.testing.assert_allclose(
+        picture, np.broadcast_to([0.5, 0.25, 0.0, 0.75], (2, 2, 4)), rtol=1e-12
+    )
+
+
+def test_nothing_is_seen_where_a_vertex_with_a_weight_has_no_value() -> None:
+    values = np.full(SHAPE, 0.5, np.float32)
+    values[2] = np.nan
+    table = Table(
+        low=0.0, high=1.0, colours=np.ones((2, 3), np.float32), extinctions=np.full(2, 0.1)
+    )
+    picture = reference_picture(Frame(values=values, first=(0, 0, 0)), task_of(table=table))
+    # Samples lie at 0.15, 0.45, ..., 3.75; one of length 0.1 lies at 3.95. Those from 1 to 3 lie
+    # beside the layer without values.
+    lengths = 0.3 * np.count_nonzero(np.abs(np.arange(0.15, 3.9, 0.3) - 2) >= 1) + 0.1
+    np.testing.assert_allclose(picture[..., 3], -np.expm1(-0.1 * lengths), rtol=1e-6)

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import base64
+import itertools
+import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from numpy.typing import NDArray
+from tiles import SETTINGS, SHAPE, same, wave
 
-from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.chunk import (
-    candidates,
-    decode_chunk,
-    encode_chunk,
-    tile_shape,
+from fhash_formats.errors import DamagedFileError, FhashError, InputError, UnsupportedFileError
+from fhash_formats.transform.chunk import candidates, decode_chunk, encode_chunk, tile_shape
+from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.spec import (
+    MAX_DEPTH,
+    MAX_EXPONENT,
+    MAX_LENGTH,
+    AxisTransform,
+    Basis,
+    TransformSpec,
+    _dct,
+    fit_basis,
 )
-from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED
+from fhash_formats.transform.stream import TILE_AXES, ArrayAxes, TransformCoder, take_axes
+from fhash_formats.transform.tile_format import KIND, LABELS, TRANSFORMED, TileSettings
 
 
 @pytest.mark.parametrize("shape", [(8, 16, 32, 48), (1, 1, 1, 3), (1, 5, 40, 40), (2, 1, 1, 1)])
@@ -290,3 +304,416 @@ def test_an_origin_is_of_64_bit_integers_alone() -> None:
     # As the other type of 64 bits the same integers come out, within its range.
     again = decode_chunk(data, values.shape, np.uint64)
     assert (again == decode_chunk(data, values.shape, np.int64).astype(np.uint64)).all()
+
+
+def smooth(n: int, count: int = 400) -> NDArray[np.float64]:
+    """Columns of random walks."""
+    return np.cumsum(np.random.default_rng(n).standard_normal((n, count)), axis=0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 61, 200])
+@pytest.mark.parametrize("step", [1e-3, 0.5, 8.0])
+def test_analysis_and_synthesis_lose_less_than_the_step(n: int, step: float) -> None:
+    columns = smooth(n)
+    basis = fit_basis(columns @ columns.T, step)
+    assert 0 < basis.rank <= n
+    assert basis.synthesis.shape == (n, basis.rank)
+    again = basis.synthesis.astype(np.float64) @ (basis.analysis @ columns)
+    # Each dropped vector had a total amplitude below the step; each kept one is off by at most
+    # about a step per entry.
+    assert np.sum((again - columns) ** 2) < 2 * n * n * step**2
+    assert np.allclose(basis.analysis @ basis.synthesis, np.eye(basis.rank), atol=1e-10)
+
+
+def test_the_vectors_are_the_eigenvectors() -> None:
+    columns = smooth(32)
+    gram = columns @ columns.T
+    synthesis = fit_basis(gram, 1e-6).synthesis
+    first = np.linalg.eigh(gram)[1][:, ::-1][:, :4]
+    assert np.allclose(np.abs(np.sum(synthesis[:, :4] * first, axis=0)), 1.0, atol=1e-3)
+    assert np.allclose(np.sum(synthesis.astype(float) ** 2, axis=0), 1.0, atol=0.02)
+
+
+def test_nothing_to_keep_is_a_basis_of_rank_0() -> None:
+    basis = fit_basis(np.zeros((5, 5)), 1.0)
+    assert basis.rank == 0
+    assert Basis.from_bytes(basis.to_bytes(), 5) == basis
+    assert basis.synthesis.shape == (5, 0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 17, 64])
+@pytest.mark.parametrize("step", [0.1, 10.0])
+def test_bytes_there_and_back(n: int, step: float) -> None:
+    columns = smooth(n)
+    basis = fit_basis(columns @ columns.T, step)
+    again = Basis.from_bytes(basis.to_bytes(), n)
+    assert again == basis
+    assert hash(again) == hash(basis)
+    assert again.synthesis.tobytes() == basis.synthesis.tobytes()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 64, 127, MAX_LENGTH])
+def test_the_cosines_are_those_of_the_library(n: int) -> None:
+    rows = np.array(_dct(n))
+    exact = [
+        [
+            math.cos(math.pi * (2 * i + 1) * k / (2 * n)) * math.sqrt((2 if k else 1) / n)
+            for i in range(n)
+        ]
+        for k in range(n)
+    ]
+    assert np.allclose(rows, exact, rtol=0, atol=2e-14)
+
+
+def test_every_cut_and_many_flips_end_in_an_error_or_a_basis() -> None:
+    columns = smooth(12)
+    packed = fit_basis(columns @ columns.T, 2.0).to_bytes()
+    for end in range(min(len(packed), 12)):
+        with pytest.raises(DamagedFileError):
+            Basis.from_bytes(packed[:end], 12)
+    for place in range(len(packed)):
+        for bit in (0, 3, 7):
+            broken = bytearray(packed)
+            broken[place] ^= 1 << bit
+            try:
+                basis = Basis.from_bytes(bytes(broken), 12)
+            except DamagedFileError:
+                continue
+            assert np.isfinite(basis.synthesis).all()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x01\x00\x01",
+        b"\x00\x00\x00\x00",
+        b"\x03\x00\x04\x00" + bytes(9),
+        b"\xff\xff\x01\x00" + bytes(9),
+        b"\x03\x00\x00\x00more",
+        b"\x03\x00\x02\x00" + bytes(40),
+    ],
+)
+def test_hostile_headers(data: bytes) -> None:
+    with pytest.raises(DamagedFileError):
+        Basis.from_bytes(data)
+
+
+def test_a_basis_for_another_length_is_refused() -> None:
+    with pytest.raises(DamagedFileError, match="of length 5 where 6"):
+        Basis.from_bytes(fit_basis(np.eye(5), 0.1).to_bytes(), 6)
+
+
+@pytest.mark.parametrize(
+    ("integers", "exponents"),
+    [
+        (np.zeros((1, 3), np.int32), (2,)),
+        (np.ones((1, 3), np.int64), (2,)),
+        (np.ones((1, 3), np.int32), (MAX_EXPONENT + 1,)),
+        (np.ones((1, 3), np.int32), (-1,)),
+        (np.ones((2, 3), np.int32), (2, 3)),
+        (np.ones((1, 3), np.int32), ()),
+        (np.ones((4, 3), np.int32), (1, 1, 1, 1)),
+        (np.full((1, 3), 100, np.int32), (2,)),
+        (np.full((1, 3), -(2**31), np.int32), (2,)),
+        (np.ones((1, MAX_LENGTH + 1), np.int32), (2,)),
+    ],
+)
+def test_impossible_bases_are_refused(
+    integers: NDArray[np.int32], exponents: tuple[int, ...]
+) -> None:
+    with pytest.raises(InputError):
+        Basis(integers=integers, exponents=exponents)
+
+
+@pytest.mark.parametrize(
+    ("gram", "step"),
+    [
+        (np.eye(3)[:2], 1.0),
+        (np.full((2, 2), np.nan), 1.0),
+        (np.eye(2), 0.0),
+        (np.eye(2), math.inf),
+        (np.zeros((0, 0)), 1.0),
+        (np.zeros((513, 513)), 1.0),
+    ],
+)
+def test_impossible_fits_are_refused(gram: NDArray[np.float64], step: float) -> None:
+    with pytest.raises(InputError):
+        fit_basis(gram, step)
+
+
+def test_dependent_vectors_can_be_decoded_but_not_encoded_with() -> None:
+    basis = Basis(integers=np.array([[2, 0, 0], [2, 0, 0]], np.int32), exponents=(2, 2))
+    assert basis.synthesis.shape == (3, 2)
+    with pytest.raises(FhashError, match="depend on each other"):
+        _ = basis.analysis
+
+
+PLAIN: dict[str, Any] = {"t": ["haar", 2], "z": "none", "y": ["9/7", 4], "x": ["9/7", 4]}
+
+
+def some_basis() -> Basis:
+    columns = np.cumsum(np.random.default_rng(1).standard_normal((9, 50)), axis=0)
+    return fit_basis(columns @ columns.T, 0.5)
+
+
+def test_there_and_back() -> None:
+    spec = TransformSpec.from_dict(PLAIN)
+    assert spec.axes[0] == AxisTransform(kind="haar", depth=2)
+    assert spec.to_dict() == PLAIN
+    assert TransformSpec.from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
+
+
+def test_a_basis_is_no_json() -> None:
+    axis = AxisTransform(kind="klt", basis=some_basis())
+    with pytest.raises(InputError, match="no JSON value"):
+        axis.to_json()
+
+
+@pytest.mark.parametrize(
+    ("y", "x", "coupled"),
+    [
+        (["9/7", 3], ["9/7", 3], True),
+        (["9/7", 3], ["9/7", 2], False),
+        (["9/7", 3], ["5/3", 3], False),
+        ("none", "none", False),
+    ],
+)
+def test_the_plane_is_coupled_by_equal_wavelets(y: Any, x: Any, coupled: bool) -> None:
+    assert TransformSpec.from_dict({**PLAIN, "y": y, "x": x}).coupled is coupled
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        7,
+        "dct",
+        "9/7",
+        "klt",
+        "",
+        [],
+        ["9/7"],
+        ["9/7", 0],
+        ["9/7", -1],
+        ["9/7", MAX_DEPTH + 1],
+        ["9/7", 10**30],
+        ["9/7", 2.0],
+        ["9/7", True],
+        ["9/7", "2"],
+        ["none", 1],
+        ["klt", 0],
+        [["9/7"], 2],
+        ["9/7", 2, 2],
+        {},
+        {"klt": 3},
+        {"klt": ""},
+        {"klt": "no base64!"},
+        {"klt": "\u00e4"},
+        {"klt": "AAAA"},
+        {"klt": "A" * (1 << 22)},
+        {"klt": base64.b64encode(b"\xff\xff\xff\xff" + bytes(100)).decode()},
+        {"klt": base64.b64encode(b"\x04\x00\x02\x00").decode()},
+        {"klt": "AAAA", "more": 1},
+    ],
+)
+@pytest.mark.parametrize("key", ["t", "x"])
+def test_a_bad_value_is_refused_by_name(key: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f"key '{key}'") as caught:
+        TransformSpec.from_dict({**PLAIN, key: value})
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({**PLAIN, "w": "none"}, "unknown key 'w'"),
+        ({key: PLAIN[key] for key in "tzy"}, "missing key 'x'"),
+        ({}, "missing key 't'"),
+        ([1, 2], "a mapping"),
+        (None, "a mapping"),
+        (dict[Any, Any](PLAIN) | {3: "none"}, "unknown key 3"),
+    ],
+)
+def test_a_bad_set_of_keys_is_refused(values: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TransformSpec.from_dict(values)
+
+
+def test_axes_hold_what_they_need() -> None:
+    with pytest.raises(InputError, match="needs a basis"):
+        AxisTransform(kind="klt")
+    with pytest.raises(InputError, match="nothing else"):
+        AxisTransform(kind="none", basis=some_basis())
+    with pytest.raises(InputError, match="four axes"):
+        TransformSpec(axes=(AxisTransform(kind="none"),) * 3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("names", list(itertools.permutations(TILE_AXES)), ids="".join)
+def test_a_tile_has_the_axes_in_its_own_order_and_gives_the_chunk_back(
+    names: tuple[str, ...],
+) -> None:
+    lengths = {"t": 2, "z": 3, "y": 4, "x": 5}
+    chunk = np.arange(120).reshape([lengths[name] for name in names])
+    axes = ArrayAxes(names)
+    tile = axes.to_tile(chunk)
+    assert tile.shape == axes.tile_shape(chunk.shape) == (2, 3, 4, 5)
+    place = dict(zip(TILE_AXES, (1, 2, 3, 4), strict=True))
+    assert tile[1, 2, 3, 4] == chunk[tuple(place[name] for name in names)]
+    assert np.array_equal(axes.from_tile(tile), chunk)
+    assert axes.usual == (names == TILE_AXES)
+
+
+@pytest.mark.parametrize(
+    ("names", "chunk", "tile"),
+    [
+        (("t", "y", "x"), (2, 3, 4), (2, 1, 3, 4)),
+        (("z", "y", "x"), (2, 3, 4), (1, 2, 3, 4)),
+        (("x",), (7,), (1, 1, 1, 7)),
+        (("", "x", "", "t"), (1, 5, 1, 3), (3, 1, 1, 5)),
+        (("x", "t", "", "y", "z"), (5, 2, 1, 3, 4), (2, 4, 3, 5)),
+    ],
+)
+def test_an_axis_that_is_not_named_has_length_1(
+    names: tuple[str, ...], chunk: tuple[int, ...], tile: tuple[int, ...]
+) -> None:
+    values = np.arange(np.prod(chunk)).reshape(chunk)
+    axes = ArrayAxes(names)
+    assert axes.to_tile(values).shape == tile
+    assert np.array_equal(axes.from_tile(axes.to_tile(values)), values)
+
+
+def test_a_tile_with_less_detail_gives_a_smaller_chunk() -> None:
+    tile = np.arange(24).reshape(2, 3, 4, 1)
+    assert ArrayAxes(("y", "t", "z")).from_tile(tile).shape == (4, 2, 3)
+
+
+def test_the_last_axes_are_the_usual_ones() -> None:
+    assert ArrayAxes(("y", "x")).usual
+    assert not ArrayAxes(("t", "y", "x")).usual
+
+
+def test_they_are_taken_from_a_configuration() -> None:
+    assert take_axes({"step": 1}) == ({"step": 1}, None)
+    assert take_axes({"step": 1, "axes": ["t", "x"]}) == ({"step": 1}, ArrayAxes(("t", "x")))
+
+
+@pytest.mark.parametrize("wrong", [[], ["t", "t"], ["u"], "tzyx", 3, [1], ["t", None]], ids=str)
+def test_other_axes_are_refused(wrong: object) -> None:
+    with pytest.raises(InputError, match="axes are"):
+        take_axes({"axes": wrong})
+
+
+def test_chunks_of_another_form_are_refused() -> None:
+    axes = ArrayAxes(("t", "", "x"))
+    with pytest.raises(InputError, match="of 2 axes"):
+        axes.tile_shape((2, 3))
+    with pytest.raises(InputError, match="length 1"):
+        axes.tile_shape((2, 3, 4))
+
+
+FLOAT = np.dtype(np.float32)
+
+
+def named(settings: TileSettings) -> dict[str, Any]:
+    return {"settings": settings.to_text()}
+
+
+def coder(settings: TileSettings | None, shape: tuple[int, ...] = SHAPE) -> TransformCoder:
+    configuration = {} if settings is None else named(settings)
+    return TransformCoder([{"configuration": configuration}], FLOAT, shape)
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3, 4])
+def test_a_chunk_of_fewer_axes_comes_back(axes: int) -> None:
+    values = wave()[(0,) * (4 - axes)]
+    shared = coder(SETTINGS, values.shape)
+    decoded = shared.decode(memoryview(shared.encode(values)))
+    assert decoded.shape == values.shape
+    assert np.abs(decoded - values).max() <= 0.4
+
+
+def test_a_reduced_chunk_has_every_second_vertex_of_space() -> None:
+    shared = coder(SETTINGS)
+    assert shared.decode(memoryview(shared.encode(wave())), lod=1).shape == (2, 2, 4, 5)
+
+
+def test_without_shared_settings_each_stream_has_its_own() -> None:
+    coded = encode_tile(wave(), SETTINGS, Coding(own_settings=True))
+    assert same(coder(None).decode(memoryview(coded.data)), coded.decoded)
+    with pytest.raises(InputError, match="only decodes"):
+        coder(None).encode(wave())
+
+
+def test_the_mask_comes_with_the_values() -> None:
+    settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
+    masked = coder(settings)
+    assert masked.masked
+    coded = encode_tile(wave(), settings, in_coreset=occupied)
+    values, mask = masked.decode_masked(memoryview(coded.data))
+    assert same(values, coded.decoded)
+    assert np.array_equal(mask, occupied)
+
+
+@pytest.mark.parametrize(
+    ("codecs", "shape", "error", "message"),
+    [
+        ([{}, {}], SHAPE, UnsupportedFileError, "no codec may follow"),
+        ([{}], (1, *SHAPE), DamagedFileError, "at most 4 axes"),
+        ([{"configuration": {"transform": 3}}], SHAPE, DamagedFileError, "has settings, and axes"),
+        ([{"configuration": {"settings": "a"}}], SHAPE, DamagedFileError, "no base64"),
+    ],
+)
+def test_other_configurations_are_refused(
+    codecs: list[dict[str, Any]], shape: tuple[int, ...], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        TransformCoder(codecs, FLOAT, shape)
+
+
+AXES = ("y", "x", "t", "z")
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, None])
+def test_a_chunk_is_coded_along_the_axes_that_are_named(settings: TileSettings | None) -> None:
+    order = ["tzyx".index(axis) for axis in AXES]
+    values = wave().transpose(order)
+    configuration = {**({} if settings is None else named(settings)), "axes": list(AXES)}
+    given = TransformCoder([{"configuration": configuration}], FLOAT, values.shape)
+    coded = encode_tile(wave(), SETTINGS, Coding(own_settings=settings is None))
+    assert not given.parted
+    assert same(given.decode(coded.data), coded.decoded.transpose(order))
+    if settings is not None:
+        assert given.encode(values) == coded.data
+
+
+def test_a_level_of_detail_keeps_every_position_along_the_first_axis() -> None:
+    plain, data = coder(SETTINGS), encode_tile(wave(), SETTINGS).data
+    time_first = {**named(SETTINGS), "axes": ["t", "x", "y", "z"]}
+    shape = tuple(wave().transpose(0, 3, 2, 1).shape)
+    given = TransformCoder([{"configuration": time_first}], FLOAT, shape)
+    assert same(given.decode(data, lod=1), plain.decode(data, lod=1).transpose(0, 3, 2, 1))
+    swapped = {**named(SETTINGS), "axes": ["z", "t", "y", "x"]}
+    shape = tuple(wave().transpose(1, 0, 2, 3).shape)
+    given = TransformCoder([{"configuration": swapped}], FLOAT, shape)
+    everything = plain.decode(data).transpose(1, 0, 2, 3)
+    assert same(given.decode(data, lod=1), everything[:, ::2, ::2, ::2])
+
+
+def test_axes_come_with_masks() -> None:
+    settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
+    configuration = {**named(settings), "axes": ["x", "z", "y", "t"]}
+    shape = tuple(wave().transpose(3, 1, 2, 0).shape)
+    given = TransformCoder([{"configuration": configuration}], FLOAT, shape)
+    coded = encode_tile(wave(), settings, in_coreset=occupied)
+    values, mask = given.decode_masked(coded.data)
+    assert same(values, coded.decoded.transpose(3, 1, 2, 0))
+    assert np.array_equal(mask, occupied.transpose(3, 1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    "axes", [["t", "z", "y"], ["t", "t", "y", "x"], "tzyx", ["", "z", "y", "x"]]
+)
+def test_axes_that_do_not_fit_are_damage(axes: object) -> None:
+    with pytest.raises(DamagedFileError, match=r"axes|chunks"):
+        TransformCoder([{"configuration": {"axes": axes}}], FLOAT, SHAPE)

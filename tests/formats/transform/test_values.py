@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
+import dask.array
+import numcodecs
 import numpy as np
 import numpy.typing as npt
 import pytest
+import xarray
+import zarr
+from specs import spec_of
+from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.codecs.numcodecs import FixedScaleOffset
 
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform import values as elementwise
+from fhash_formats.transform.chunk import encode_chunk
+from fhash_formats.transform.encoding import encode_tile
+from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
+from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import (
     all_finite,
     cast,
@@ -21,6 +35,7 @@ from fhash_formats.transform.values import (
     residual_of,
     within,
 )
+from fhash_formats.transform.zarr_codec import TransformCodec
 
 Values = npt.NDArray[Any]
 SHAPE = (2, 5, 7, 311)  # more than a native piece, and not a multiple of anything
@@ -245,3 +260,341 @@ def test_six_offsets_tell_odd_from_even(dtype: Any) -> None:
     integers = np.array([0, 1, -2, 3, -4, 5, 6, -7, 1000], np.int32)
     values = dequantise(integers, 1.0, (64, 32, 16, 8, -64, -32), dtype)
     assert values.tolist() == [0.0, 1.5, -2.25, 3.125, -4.0625, 4.5, 5.75, -6.5, 999.75]
+
+
+WAVES = spec_of(("haar", "9/7", "9/7", "9/7"), 1, (2, 2, 2, 2))
+SHARED = TileSettings(transform=WAVES, step=0.05, center=0.0, low=-3.0, high=3.0)
+
+
+def field(
+    shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, scale: float = 1.0
+) -> npt.NDArray[Any]:
+    grid = np.meshgrid(*(np.linspace(0, 3, n) for n in shape), indexing="ij")
+    return (scale * (1 + np.sin(sum((i + 1) * x for i, x in enumerate(grid))))).astype(dtype)
+
+
+def create(store: Any, values: npt.NDArray[Any], chunks: tuple[int, ...], **options: Any) -> Any:
+    options = {
+        "serializer": TransformCodec(max_error=0.01),
+        "compressors": None,
+        "fill_value": np.nan if values.dtype.kind == "f" else 0,
+        **options,
+    }
+    array = zarr.create_array(
+        store, shape=values.shape, chunks=chunks, dtype=values.dtype, **options
+    )
+    array[...] = values
+    return array
+
+
+@pytest.mark.parametrize("shape", [(50,), (13, 20), (5, 9, 12), (3, 4, 9, 10), (2, 2, 3, 5, 6)])
+def test_arrays_come_back_within_the_bound(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    values = field(shape)
+    values.flat[3] = np.nan
+    create(tmp_path / "a.zarr", values, tuple((n + 1) // 2 for n in shape))
+    read = zarr.open_array(tmp_path / "a.zarr", mode="r")
+    assert (
+        json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())["codecs"][0]["name"]
+        == "fhash.transform"
+    )
+    assert np.isnan(read[...].flat[3])
+    assert np.nanmax(np.abs(read[...] - values)) <= 0.01
+    region = tuple(slice(1, n - 1) for n in shape)
+    assert np.array_equal(read[region], read[...][region], equal_nan=True)
+
+
+def test_all_three_qualities_are_kept_in_the_metadata(tmp_path: Path) -> None:
+    for n, codec in enumerate(
+        (
+            TransformCodec(max_error=0.5),
+            TransformCodec(max_error_rel=0.01, effort=1),
+            TransformCodec(step=0.1, transform=WAVES),
+            TransformCodec(settings=SHARED),
+        )
+    ):
+        create(tmp_path / f"{n}.zarr", field((4, 6, 8)), (4, 6, 8), serializer=codec)
+        assert zarr.open_array(tmp_path / f"{n}.zarr", mode="r").serializer == codec
+        assert TransformCodec.from_dict(codec.to_dict()) == codec
+
+
+def test_settings_that_all_chunks_share_in_shards_with_checksums(tmp_path: Path) -> None:
+    values = field((4, 4, 8, 8))
+    for n, codec in enumerate((TransformCodec(settings=SHARED), TransformCodec(max_error=0.05))):
+        shards = ShardingCodec(
+            chunk_shape=(2, 4, 4, 8),
+            codecs=[codec, Crc32cCodec()],
+            index_codecs=[BytesCodec(), Crc32cCodec()],
+        )
+        create(tmp_path / f"{n}.zarr", values, (4, 4, 8, 8), serializer=shards)
+        read = zarr.open_array(tmp_path / f"{n}.zarr", mode="r")
+        assert np.abs(read[...] - values).max() <= 0.1
+        assert np.array_equal(read[2:, 1, 4:, 3], read[...][2:, 1, 4:, 3])
+
+
+def test_an_empty_configuration_reads_streams_with_their_own_settings(tmp_path: Path) -> None:
+    values = field((2, 3, 8, 8))
+    create(tmp_path / "a.zarr", values, values.shape)
+    written = zarr.open_array(tmp_path / "a.zarr", mode="r")[...]
+    path = tmp_path / "a.zarr" / "zarr.json"
+    path.write_text(
+        json.dumps(
+            {
+                **json.loads(path.read_text()),
+                "codecs": [{"name": "fhash.transform", "configuration": {}}],
+            }
+        )
+    )
+    array = zarr.open_array(tmp_path / "a.zarr", mode="r+")
+    assert np.array_equal(array[...], written)
+    with pytest.raises(InputError, match="only decodes"):
+        array[...] = values
+
+
+def test_shared_settings_give_the_tile_that_containers_have(tmp_path: Path) -> None:
+    values = field((2, 3, 8, 8))
+    create(tmp_path / "a.zarr", values, values.shape, serializer=TransformCodec(settings=SHARED))
+    stored = (tmp_path / "a.zarr" / "c" / "0" / "0" / "0" / "0").read_bytes()
+    assert stored == encode_tile(values, SHARED).data
+
+
+def test_padding_with_nan_leaves_the_relative_bound(tmp_path: Path) -> None:
+    values = field((7, 11)) + 1000
+    read = create(
+        tmp_path / "a.zarr", values, (5, 8), serializer=TransformCodec(max_error_rel=0.001)
+    )[...]
+    assert np.abs(read - values).max() <= 0.001 * np.ptp(values)
+
+
+@pytest.mark.parametrize("dtype", ["i4", "f4", "i8", "u2", "f8"])
+@pytest.mark.parametrize("shards", [None, (10, 16)])
+@pytest.mark.parametrize("fill", [0, 9])
+def test_padding_leaves_the_relative_bound(
+    dtype: str, shards: tuple[int, int] | None, fill: float
+) -> None:
+    base = {"u2": 60_000, "i8": 2**61}.get(dtype, 1_900_000_000)
+    values = (base + np.random.default_rng(0).integers(0, 50, (17, 21))).astype(dtype)
+    codec = TransformCodec(max_error_rel=0.1)
+    options: dict[str, Any] = {"serializer": codec, "fill_value": fill, "shards": shards}
+    whole = create(zarr.storage.MemoryStore(), values, (5, 8), **options)
+    bound = 0.1 * float(np.ptp(values))
+    assert np.abs((whole[...] - values).astype(float)).max() <= bound
+    # Chunks that were coded beside fill values are coded once more with the others.
+    parts = create(zarr.storage.MemoryStore(), np.full_like(values, fill), (5, 8), **options)
+    for part in (np.s_[:7, :9], np.s_[7:, 9:], np.s_[:7, 9:], np.s_[7:, :9]):
+        parts[part] = values[part]
+    assert np.abs((parts[...] - values).astype(float)).max() <= 4 * bound
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr")
+def test_padding_that_a_filter_changed_leaves_the_relative_bound() -> None:
+    values = np.random.default_rng(0).normal(5000, 1, (17, 21))
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(),
+        shape=values.shape,
+        chunks=(5, 8),
+        dtype="f8",
+        fill_value=0.0,
+        filters=FixedScaleOffset(offset=-7.0, scale=100.0, dtype="f8", astype="f8"),
+        serializer=TransformCodec(max_error_rel=0.1),
+        compressors=None,
+    )
+    array[...] = values
+    assert np.abs(array[...] - values).max() <= 0.1 * np.ptp(values) + 0.005
+
+
+def test_xarray_writes_and_reads_lazily(tmp_path: Path) -> None:
+    values = field((3, 4, 8, 10))
+    data = xarray.Dataset({"speed": (("t", "z", "y", "x"), values)}, {"t": [0.0, 0.5, 1.0]})
+    encoding = {
+        "speed": {
+            "serializer": TransformCodec(max_error=0.01),
+            "compressors": None,
+            "chunks": (2, 4, 4, 10),
+        }
+    }
+    data.to_zarr(tmp_path / "a.zarr", zarr_format=3, encoding=encoding, consolidated=False)
+    with xarray.open_zarr(tmp_path / "a.zarr", consolidated=False) as read:
+        assert isinstance(read["speed"].data, dask.array.Array)
+        assert np.abs(read["speed"].isel(t=1).compute().values - values[1]).max() <= 0.01
+        assert read["t"].values.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_dask_writes_and_reads_chunks_in_threads(tmp_path: Path) -> None:
+    values = field((4, 12, 14))
+    array = zarr.create_array(
+        tmp_path / "a.zarr",
+        shape=values.shape,
+        chunks=(2, 6, 7),
+        dtype="f4",
+        fill_value=np.nan,
+        serializer=TransformCodec(max_error=0.01),
+        compressors=None,
+    )
+    dask.array.from_array(values, chunks=(2, 6, 7)).store(array, lock=False, scheduler="threads")
+    lazy = dask.array.from_zarr(zarr.open_array(tmp_path / "a.zarr", mode="r"))
+    assert lazy.chunks == ((2, 2), (6, 6), (7, 7))
+    assert np.abs(lazy.compute(scheduler="threads") - values).max() <= 0.01
+    assert abs(float(lazy.mean().compute(scheduler="threads")) - float(values.mean())) <= 0.01
+
+
+def test_a_damaged_chunk_is_an_error(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", field((8, 8)), (8, 8))
+    path = tmp_path / "a.zarr" / "c" / "0" / "0"
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(DamagedFileError):
+        zarr.open_array(tmp_path / "a.zarr", mode="r")[...]
+
+
+@pytest.mark.parametrize("dtype", ["bool", "complex64"])
+def test_unsuitable_types_are_refused_at_creation(dtype: str) -> None:
+    with pytest.raises(InputError, match="codes float16"):
+        zarr.create_array(
+            {},
+            shape=(4,),
+            chunks=(4,),
+            dtype=dtype,
+            serializer=TransformCodec(max_error=1),
+            compressors=None,
+        )
+
+
+def test_unsuitable_configurations_are_refused() -> None:
+    with pytest.raises(InputError, match="one of max_error"):
+        TransformCodec()
+    with pytest.raises(InputError, match="nothing else"):
+        TransformCodec(max_error=1, settings=SHARED)
+    with pytest.raises(InputError, match="nothing else"):
+        TransformCodec(effort=3, settings=SHARED)
+    for configuration, said in (
+        ({"max_eror": 1}, "max_eror"),
+        ({"max_error": "a"}, "max_error"),
+        ({"max_error": 1, "effort": 10}, "effort is 10; a whole number from 1 to 9"),
+        ({"center": 1}, "transform|missing"),
+    ):
+        with pytest.raises(InputError, match=said):
+            TransformCodec.from_dict({"name": "fhash.transform", "configuration": configuration})
+
+
+def test_a_codec_is_shown_in_one_short_line() -> None:
+    for codec, shown in (
+        (TransformCodec(max_error=0.5), "TransformCodec(max_error=0.5)"),
+        (TransformCodec(reading=True), "TransformCodec(reading=True)"),
+        (TransformCodec(settings=SHARED), "TransformCodec(step=0.05)"),
+    ):
+        assert repr(codec) == shown
+
+
+@pytest.mark.parametrize(
+    "codec",
+    [
+        TransformCodec(max_error=0.01, axes=("t", "y", "x")),
+        TransformCodec(settings=SHARED, axes=("t", "y", "x")),
+        TransformCodec(reading=True, axes=["t", "y", "x"]),
+    ],
+    ids=["quality", "settings", "reading"],
+)
+def test_axes_stand_in_the_metadata(codec: TransformCodec) -> None:
+    document = json.loads(json.dumps(codec.to_dict()))
+    assert document["configuration"]["axes"] == ["t", "y", "x"]
+    assert TransformCodec.from_dict(document).to_dict() == codec.to_dict()
+
+
+def test_an_array_is_coded_along_the_axes_that_are_named(tmp_path: Path) -> None:
+    values = field((6, 9, 12))
+    codec = TransformCodec(max_error=0.01, axes=("t", "y", "x"))
+    create(tmp_path / "a.zarr", values, (3, 9, 6), serializer=codec)
+    assert np.abs(zarr.open_array(tmp_path / "a.zarr", mode="r")[...] - values).max() <= 0.01
+    tile = np.ascontiguousarray(values[:3, :, :6])[:, None]
+    assert (tmp_path / "a.zarr" / "c" / "0" / "0" / "0").read_bytes() == encode_chunk(
+        tile, max_error=0.01
+    )
+
+
+def test_axes_of_another_array_are_refused(tmp_path: Path) -> None:
+    codec = TransformCodec(max_error=0.01, axes=("t", "x"))
+    with pytest.raises(InputError, match="with 3 axes"):
+        create(tmp_path / "a.zarr", field((6, 9, 12)), (3, 9, 6), serializer=codec)
+
+
+def test_it_is_found_by_its_name_and_configuration() -> None:
+    transform = {"t": "none", "z": "none", "y": ["9/7", 1], "x": ["9/7", 1]}
+    for config in (
+        {"max_error": 0.5},
+        {"max_error": 0.5, "effort": 4},
+        {"max_error_rel": 0.01},
+        {"step": 2.0, "transform": transform},
+    ):
+        codec = numcodecs.get_codec({"id": "fhash.transform", **config})
+        assert isinstance(codec, NumcodecsTransform)
+        assert codec.get_config() == {"id": "fhash.transform", **config}
+        assert numcodecs.get_codec(codec.get_config()) == codec
+
+
+@pytest.mark.parametrize(
+    "dtype", ["f2", "f4", "f8", ">f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"]
+)
+@pytest.mark.parametrize("shape", [(), (0, 3), (40,), (6, 8), (2, 3, 4, 5), (2, 1, 3, 4, 5)])
+def test_shape_and_type_come_back(dtype: str, shape: tuple[int, ...]) -> None:
+    values = (np.arange(np.prod(shape)).reshape(shape) % 120).astype(dtype)
+    codec = NumcodecsTransform(max_error=1)
+    decoded = codec.decode(codec.encode(values))
+    assert decoded.shape == shape
+    assert decoded.dtype == np.dtype(dtype).newbyteorder("=")
+    assert np.abs(decoded.astype(float) - values.astype(float)).max(initial=0) <= 1
+    out = np.empty(shape, decoded.dtype)
+    assert codec.decode(codec.encode(values), out) is out
+    assert np.array_equal(out, decoded)
+
+
+def test_zarr_format_2(tmp_path: Path) -> None:
+    values = np.sin(np.arange(12 * 20) / 30).reshape(12, 20).astype("f4")
+    codec = NumcodecsTransform(max_error=0.001)
+    array = zarr.create_array(
+        tmp_path / "a.zarr",
+        shape=(12, 20),
+        chunks=(6, 20),
+        dtype="f4",
+        zarr_format=2,
+        filters=None,
+        compressors=codec,
+    )
+    array[...] = values
+    assert np.abs(zarr.open_array(tmp_path / "a.zarr", mode="r")[...] - values).max() <= 0.001
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("fill", [0, None, 5])
+def test_padding_in_zarr_format_2_leaves_the_relative_bound(order: str, fill: int | None) -> None:
+    values = (1_900_000_000 + np.random.default_rng(0).integers(0, 50, (17, 21))).astype("i4")
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(),
+        shape=values.shape,
+        chunks=(5, 8),
+        dtype=values.dtype,
+        zarr_format=2,
+        filters=None,
+        fill_value=fill,
+        order=order,
+        compressors=NumcodecsTransform(max_error_rel=0.1),
+    )
+    array[...] = values
+    assert np.abs(array[...] - values).max() <= 0.1 * np.ptp(values)
+
+
+def test_damage_and_bytes_are_refused() -> None:
+    codec = NumcodecsTransform(max_error=0.01)
+    values = np.sin(np.arange(30.0)).reshape(5, 6)
+    data = codec.encode(values)
+    sound = codec.decode(data)
+    for n in range(len(data)):
+        for damaged in (data[:n], data[:n] + bytes([data[n] ^ 0x10]) + data[n + 1 :]):
+            try:
+                decoded = codec.decode(damaged)
+            except DamagedFileError:
+                continue
+            assert n >= 27
+            assert np.array_equal(decoded, sound)
+    with pytest.raises(InputError, match="not bytes"):
+        codec.encode(b"abcd")
+    with pytest.raises(InputError, match="one of max_error"):
+        NumcodecsTransform()

@@ -29,7 +29,6 @@ from fhash_formats.writers.common import (
     safe_names,
     variable_attributes,
 )
-from fhash_formats.writers.common import Region as Region_outline
 from fhash_formats.writers.registry import save_region
 
 
@@ -325,9 +324,9 @@ METADATA = SourceMetadata(
 )
 
 
-def region_outline(metadata: SourceMetadata | None = METADATA, **coords: Any) -> Region_outline:
+def region_outline(metadata: SourceMetadata | None = METADATA, **coords: Any) -> Region:
     usual = {axis: index_coordinate(axis, n) for axis, n in zip("tzyx", OUTLINE_SHAPE, strict=True)}
-    return Region_outline(
+    return Region(
         name="u",
         units="K",
         dtype=np.dtype("f4"),

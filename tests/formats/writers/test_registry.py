@@ -8,13 +8,27 @@ import os
 import subprocess
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
-from regions import READ
+import xarray
+from regions import (
+    COORDS,
+    READ,
+    labelled_region,
+    region_of,
+)
+from regions import (
+    DATA as DATA_NPY,
+)
+from regions import (
+    SHAPE as SHAPE_SEVERAL,
+)
 
 from fhash_formats.errors import (
     FhashError,
@@ -23,9 +37,10 @@ from fhash_formats.errors import (
     OutputError,
     OutputExistsError,
 )
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import Coordinate
 from fhash_formats.writers.common import Region
-from fhash_formats.writers.registry import WRITERS, save_check, save_region
+from fhash_formats.writers.registry import WRITERS, save_check, save_region, save_regions
 
 SUFFIXES = [suffix for writer in WRITERS for suffix in writer.suffixes]
 SHAPE = (3, 4, 5, 6)
@@ -312,3 +327,248 @@ def test_no_file_that_is_written_may_be_a_source(tmp_path: Path, suffix: str) ->
     save_region(
         tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[tmp_path / "other"]
     )
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "i2"])
+def test_the_file_is_the_one_that_numpy_writes(tmp_path: Path, dtype: str) -> None:
+    values = np.nan_to_num(DATA_NPY * 10).astype(dtype)
+    region = labelled_region(dtype=np.dtype(dtype))
+    (path,) = save_region(tmp_path / "out.npy", region, iter(values))
+    np.save(tmp_path / "expected.npy", values)
+    assert path.read_bytes() == (tmp_path / "expected.npy").read_bytes()
+
+
+POSITIONS = {
+    "t": [347921.000277, 347922.0],
+    "z": [0.0, 0.25],
+    "y": [3.0, 2.0, 1.0],
+    "x": [1.0, 1.1, 1.2, 1.3],
+}
+DATA = np.arange(48, dtype="f4").reshape(2, 2, 3, 4)
+
+
+def region_raw(positions: dict[str, list[float]] = POSITIONS, **changes: Any) -> Region:
+    made = region_of(positions)
+    coords = {axis: replace(each, name=f"{axis} name") for axis, each in made.coords.items()}
+    coords["t"] = replace(coords["t"], name="time", attributes={"units": "hours"})
+    return replace(made, **{"coords": coords, **changes})
+
+
+def header(path: Path) -> dict[str, str]:
+    lines = path.read_text().splitlines()
+    assert lines[0] == "NRRD0005"
+    assert lines[-1] == ""
+    return dict(line.split(":=" if ":=" in line else ": ", 1) for line in lines[1:-1])
+
+
+@pytest.mark.parametrize("name", ["run_4x3x2x2_float32.raw", "a_b_4x3x2x2_FLOAT32.RAW"])
+def test_a_name_that_says_the_layout_needs_nothing_beside_it(tmp_path: Path, name: str) -> None:
+    (path,) = save_region(tmp_path / name, region_raw(), DATA)
+    np.testing.assert_array_equal(np.fromfile(path, "<f4").reshape(2, 2, 3, 4), DATA)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_name_that_says_big_endian_is_true(tmp_path: Path) -> None:
+    (path,) = save_region(tmp_path / "run_4x3x2x2_float32_be.raw", region_raw(), DATA)
+    np.testing.assert_array_equal(np.fromfile(path, ">f4").reshape(2, 2, 3, 4), DATA)
+    with open_series(path) as series:
+        np.testing.assert_array_equal(np.stack(list(series.frames())), DATA)
+
+
+def test_a_type_that_there_is_not_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="v2"):
+        save_region(tmp_path / "run_4x3x2x2_v2.raw", region_raw(), DATA)
+
+
+def test_one_step_may_be_left_out_of_the_name(tmp_path: Path) -> None:
+    (path,) = save_region(
+        tmp_path / "run_4x3x2_float16.raw",
+        region_raw({**POSITIONS, "t": [0.0]}, dtype=np.dtype("f2")),
+        DATA[:1].astype("f2"),
+    )
+    np.testing.assert_array_equal(np.fromfile(path, "<f2"), DATA[0].ravel())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "run_2x2x3x4_float32.raw",
+        "run_4x3x2_float32.raw",
+        "run_4x3x2x2_float64.raw",
+        "run_4x3x2x2_uint8.raw",
+        "4x4x4_float32.raw",
+    ],
+)
+def test_a_name_that_says_another_layout_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(
+        InputError,
+        match=r"the name says another layout than the values have; use \*_4x3x2x2_float32\.raw",
+    ):
+        save_region(tmp_path / name, region_raw(), DATA)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_header_beside_any_other_name(tmp_path: Path) -> None:
+    paths = save_region(tmp_path / "out.raw", region_raw(units="m/s"), DATA)
+    assert paths == [tmp_path / "out.raw", tmp_path / "out.nhdr"]
+    np.testing.assert_array_equal(np.fromfile(paths[0], "<f4").reshape(2, 2, 3, 4), DATA)
+    assert header(paths[1]) == {
+        "content": "wind",
+        "type": "float",
+        "dimension": "4",
+        "sizes": "4 3 2 2",
+        "kinds": "space space space time",
+        "space dimension": "3",
+        "space directions": "(0.10000000000000002,0,0) (0,-1.0,0) (0,0,0.25) none",
+        "space origin": "(1.0,3.0,0.0)",
+        "endian": "little",
+        "encoding": "raw",
+        "sample units": "m/s",
+        "data file": "out.raw",
+        "name_t": "time",
+        "units_t": "hours",
+        "coordinates_t": "347921.000277 347922.0",
+        "name_z": "z name",
+        "coordinates_z": "0.0 0.25",
+        "name_y": "y name",
+        "coordinates_y": "3.0 2.0 1.0",
+        "name_x": "x name",
+        "coordinates_x": "1.0 1.1 1.2 1.3",
+    }
+
+
+def test_one_step_is_a_plain_volume_and_uneven_axes_have_no_place(tmp_path: Path) -> None:
+    paths = save_region(
+        tmp_path / "out.raw", region_raw({**POSITIONS, "t": [0.5], "y": [0.0, 1.0, 3.0]}), DATA[:1]
+    )
+    found = header(paths[1])
+    assert (found["dimension"], found["sizes"], found["kinds"]) == (
+        "3",
+        "4 3 2",
+        "space space space",
+    )
+    assert not [field for field in found if field.startswith("space")]
+    assert found["coordinates_y"] == "0.0 1.0 3.0"
+
+
+def test_text_cannot_break_the_header(tmp_path: Path) -> None:
+    paths = save_region(tmp_path / "out.raw", region_raw(name="a\n\nb: c"), DATA)
+    assert header(paths[1])["content"] == "a  b: c"
+    with pytest.raises(InputError, match="control characters"):
+        save_region(tmp_path / "a\nb.raw", region_raw(), DATA)
+
+
+def test_pynrrd_reads_it(tmp_path: Path) -> None:
+    import nrrd
+
+    paths = save_region(tmp_path / "out.raw", region_raw(), DATA)
+    data, _ = nrrd.read(str(paths[1]))
+    np.testing.assert_array_equal(data.T, DATA)
+
+
+def test_a_header_that_exists_stops_it(tmp_path: Path) -> None:
+    (tmp_path / "out.nhdr").write_text("old")
+    with pytest.raises(OutputExistsError, match=r"out\.nhdr exists"):
+        save_region(tmp_path / "out.raw", region_raw(), DATA)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.nhdr"]
+
+
+RNG = np.random.default_rng(5)
+VALUES = {
+    "u": RNG.normal(size=SHAPE_SEVERAL).astype("f4"),
+    "v": RNG.normal(size=SHAPE_SEVERAL),
+    "n": RNG.integers(-9, 9, SHAPE_SEVERAL).astype("i2"),
+}
+
+
+def region_several(name: str, coords: Mapping[str, Coordinate] = COORDS) -> Region:
+    return labelled_region(
+        name=name, dtype=VALUES[name].dtype, coords=coords, attributes={}, units=f"units of {name}"
+    )
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """Every variable and coordinate of an output."""
+    if path.suffix == ".h5":
+        with h5py.File(path) as file:
+            return {name: np.asarray(values) for name, values in file.items()}
+    engine = "zarr" if path.suffix == ".zarr" else "h5netcdf"
+    with xarray.open_dataset(path, decode_times=False, engine=engine) as data:
+        return {str(name): np.asarray(values) for name, values in data.variables.items()}
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+def test_all_are_there_and_what_they_share_is_there_once(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"out{suffix}"
+    assert save_regions(path, [(region_several(name), VALUES[name]) for name in VALUES]) == [path]
+    found = read(path)
+    assert set(found) == {*VALUES, "time", "height", "lat", "lon"}
+    for name, values in VALUES.items():
+        np.testing.assert_array_equal(found[name], values)
+        assert found[name].dtype == values.dtype
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+def test_one_is_written_as_it_is_alone(tmp_path: Path, suffix: str) -> None:
+    save_region(tmp_path / f"one{suffix}", region_several("u"), VALUES["u"])
+    save_regions(tmp_path / f"all{suffix}", [(region_several("u"), VALUES["u"])])
+    one, both = read(tmp_path / f"one{suffix}"), read(tmp_path / f"all{suffix}")
+    assert one.keys() == both.keys()
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, both[name])
+
+
+def test_other_positions_of_one_name_have_another_name_in_hdf5(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    staggered = {**COORDS, "x": replace(COORDS["x"], values=COORDS["x"].values + 0.05)}
+    save_regions(
+        path, [(region_several("u"), VALUES["u"]), (region_several("v", staggered), VALUES["v"])]
+    )
+    with h5py.File(path) as file:
+        assert set(file) == {"u", "v", "time", "height", "lat", "lon", "lon_2"}
+        np.testing.assert_array_equal(file["v"].dims[3]["lon_2"], staggered["x"].values)
+        np.testing.assert_array_equal(file["u"].dims[3]["lon"], COORDS["x"].values)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+def test_what_does_not_fit_together_is_refused_and_leaves_nothing(
+    tmp_path: Path, suffix: str
+) -> None:
+    path = tmp_path / f"out{suffix}"
+    moved = {**COORDS, "x": replace(COORDS["x"], values=COORDS["x"].values + 0.05)}
+    short = {**COORDS, "t": replace(COORDS["t"], values=COORDS["t"].values[:2])}
+    first = (region_several("u"), VALUES["u"])
+    with pytest.raises(InputError, match="variable v has another lon than the one before; write"):
+        save_regions(path, [first, (region_several("v", moved), VALUES["v"])])
+    two_steps = labelled_region(
+        name="v",
+        dtype=VALUES["v"].dtype,
+        coords=short,
+        shape=(2, *SHAPE_SEVERAL[1:]),
+        attributes={},
+    )
+    with pytest.raises(InputError, match="variable v has 2 of time, another 3; write"):
+        save_regions(path, [first, (two_steps, VALUES["v"][:2])])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+def test_two_of_one_name_and_missing_frames_leave_nothing(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"out{suffix}"
+    again = (region_several("u"), VALUES["u"])
+    with pytest.raises(InputError, match="two variables would have the name u"):
+        save_regions(path, [again, again])
+    with pytest.raises(InputError, match="region 'v': only 2 frames came for its 3 steps"):
+        save_regions(path, [again, (region_several("v"), VALUES["v"][:2])])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".raw", ".vti", ".vtkhdf"])
+def test_other_formats_hold_one(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"out{suffix}"
+    told = r"holds one variable, and there are 2; choose one, or use one of .h5, .*\.zarr"
+    with pytest.raises(InputError, match=told):
+        save_regions(path, [(region_several("u"), VALUES["u"]), (region_several("v"), VALUES["v"])])
+    with pytest.raises(InputError, match=told):
+        save_check(path, variables=2)
+    assert list(tmp_path.iterdir()) == []

@@ -2,12 +2,39 @@
 
 from __future__ import annotations
 
+import importlib
+import re
+import sys
+import types
+from collections.abc import Callable
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from pretended_cuda import CUDA, MixedDevices, pretended_cuda
+from readable_paper import NaiveEngine, bucket_index, interpolate, locate
 
+from fhash_codec.features.bricks import Coreset
 from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.engines import describe_engine, make_engine
+from fhash_codec.paper.engines.parameters import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    SPREAD,
+    Upsampling,
+    adam_step,
+    adam_step_on_device,
+    catch_up,
+    catch_up_numbers,
+    corrections,
+    initial_parameters,
+    true_positions,
+)
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
 
@@ -66,3 +93,331 @@ def test_restoring_a_state_goes_on_bit_for_bit(noise_coreset, name) -> None:
     resumed = run(9, 20, state)
     for name_of_array, array in uninterrupted.state().items():
         np.testing.assert_array_equal(array, resumed.state()[name_of_array], err_msg=name_of_array)
+
+
+DEVICE = re.compile(
+    r"\.to\((?:self\.)?device(?:, self\.dtype)?\)|device=device, "
+    r"|, device=(?:(?:self|mask|bricks)\.)?_?device\b"
+)
+"""Every place of an engine's source that puts a tensor on the device."""
+ON_THE_CPU = "self._scratch_memory[name] = torch.empty"
+"""A line that no other device comes to."""
+SHAPE = (2, 6, 10, 20)
+"""Shape of the series."""
+LOW = 0.8
+"""Smallest value of the feature: few vertices are samples."""
+FILES = (
+    "fhash_codec.paper.engines.slab",
+    "fhash_codec.paper.engines.parameters",
+    "fhash_codec.paper.engines.parameters",
+)
+"""Modules of the slab engine, the one with its class first."""
+
+
+def text_of(name: str) -> str:
+    """The source of a module."""
+    return Path(str(importlib.import_module(name).__file__)).read_text(encoding="utf-8")
+
+
+def faulty(module: str, source: str) -> type[Any]:
+    """The class of the engine with one module compiled from another source."""
+    compiled: dict[str, types.ModuleType] = {}
+    for name in reversed(FILES):
+        text = source if name == module else text_of(name)
+        made = types.ModuleType(name)
+        sys.modules[name], before = made, sys.modules[name]
+        try:
+            exec(compile(text, name, "exec"), made.__dict__)
+        finally:
+            sys.modules[name] = before
+        for earlier in compiled.values():
+            for attribute in set(vars(earlier)) & set(vars(made)):
+                value = vars(earlier)[attribute]
+                if getattr(value, "__module__", None) == earlier.__name__:
+                    setattr(made, attribute, value)
+        compiled[name] = made
+    return compiled[FILES[0]].SlabEngine  # type: ignore[no-any-return]
+
+
+def faults() -> list[Any]:
+    """Parameters (module, source), one for each place that may forget the device."""
+    found = []
+    for name in FILES:
+        text = text_of(name)
+        for match in DEVICE.finditer(text):
+            line = text[: match.start()].count("\n") + 1
+            if ON_THE_CPU in text.splitlines()[line - 1]:
+                continue
+            source = text[: match.start()] + text[match.end() :]
+            found.append(pytest.param(name, source, id=f"{name.split('.')[-1]}:{line}"))
+    return found
+
+
+def traffic(trained: Callable[..., Any], coreset: Coreset) -> dict[str, int]:
+    """Waits for the device and copies to it of a training, a continuation and an evaluation."""
+    with pretended_cuda() as pretended:
+        trained(coreset, {"width": 8}, "slab", "cuda")
+    return {name: pretended.counts[name] for name in ("waits", "copies", "pageable")}
+
+
+@pytest.fixture(scope="module")
+def rightly(noise_coreset: Callable[..., Coreset], trained: Callable[..., Any]) -> dict[str, int]:
+    """The traffic of the engine without a fault."""
+    return traffic(trained, noise_coreset(SHAPE, LOW))
+
+
+@pytest.mark.parametrize(("module", "source"), faults())
+def test_a_forgotten_device_is_seen(
+    noise_coreset: Callable[..., Coreset],
+    trained: Callable[..., Any],
+    rightly: dict[str, int],
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    source: str,
+) -> None:
+    monkeypatch.setattr(sys.modules[FILES[0]], "SlabEngine", faulty(module, source))
+    try:
+        found = traffic(trained, noise_coreset(SHAPE, LOW))
+    except (MixedDevices, TypeError, AssertionError):
+        return
+    # What CUDA allows, but by a wait or a copy in each step.
+    assert found != rightly
+
+
+def test_there_are_faults_of_every_module() -> None:
+    assert {parameter.values[0] for parameter in faults()} == set(FILES)
+    assert len(faults()) >= 8
+
+
+def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
+    coreset = noise_coreset((2, 5, 6, 7))
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    one, same, other = (initial_parameters(architecture, coreset, seed) for seed in (4, 4, 5))
+    assert torch.equal(one.fine, same.fine)
+    assert torch.equal(one.coarse, same.coarse)
+    assert torch.equal(one.network, same.network)
+    assert not torch.equal(one.network, other.network)
+    assert (
+        one.coarse.numel() + one.network.numel() + prod(architecture.levels[0]) * 2
+        == architecture.parameters
+    )
+
+
+def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
+    noise_coreset, in_coreset, monkeypatch
+) -> None:
+    coreset = noise_coreset((2, 9, 10, 20), 0.7)
+    architecture = Architecture.for_box(coreset.box.shape, 2)
+    shape = (len(coreset.bricks), 2, prod(coreset.brick_shape))
+    random = torch.Generator().manual_seed(3)
+    whole = torch.empty(shape).uniform_(-SPREAD, SPREAD, generator=random)
+    expected = whole.transpose(0, 1)[:, torch.from_numpy(in_coreset(coreset))]
+    for bricks in (1, 3, 1024):
+        monkeypatch.setattr("fhash_codec.paper.engines.parameters.BRICKS_AT_A_TIME", bricks)
+        assert torch.equal(initial_parameters(architecture, coreset, 3).fine, expected)
+
+
+@pytest.mark.parametrize(("shape", "low"), [((3, 9, 10, 20), 0.3), ((2, 20, 30, 40), 0.9995)])
+def test_upsampling_equals_the_sixteen_corners(noise_coreset, shape, low) -> None:
+    coreset = noise_coreset(shape, low)
+    architecture = Architecture.for_box(coreset.box.shape, shape[0])
+    upsampling = Upsampling(architecture, coreset, CPU)
+    random = torch.Generator().manual_seed(0)
+    numbers = sum(prod(level) for level in architecture.levels[1:]) * 2
+    tables = torch.randn(numbers, generator=random)
+    bricks = torch.from_numpy(coreset.bricks.astype(np.int64))[:40]
+    lattices = upsampling.lattices(bricks)
+    levels = len(architecture.levels) - 1
+    embeddings = torch.empty(levels, 2, len(bricks), *coreset.brick_shape)
+    lattices.interpolate(tables[upsampling.used], embeddings)
+
+    inside = torch.cartesian_prod(*(torch.arange(n) for n in coreset.brick_shape))
+    space = bricks[:, None, 1:] * torch.tensor(coreset.brick_shape) + inside
+    points = torch.cat([bricks[:, None, :1].expand(-1, len(inside), 1), space], dim=2)
+    last = torch.tensor(architecture.sizes) - 1
+    points = torch.minimum(points, last).double().reshape(-1, 4)
+    start = 0
+    for level, out in zip(architecture.levels[1:], embeddings, strict=True):
+        table = tables[start : start + prod(level) * 2].view(-1, 2).double()
+        start += prod(level) * 2
+        expected = interpolate(table, points, architecture.sizes, level)
+        ours = out.flatten(2).permute(1, 2, 0).reshape(-1, 2)
+        torch.testing.assert_close(ours.double(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_transpose_is_the_transpose(noise_coreset) -> None:
+    coreset = noise_coreset((3, 9, 10, 20))
+    architecture = Architecture.for_box(coreset.box.shape, 3)
+    upsampling = Upsampling(architecture, coreset, CPU)
+    lattices = upsampling.lattices(torch.from_numpy(coreset.bricks.astype(np.int64)))
+    random = torch.Generator().manual_seed(0)
+    tables = torch.randn(len(upsampling.used), generator=random)
+    out = torch.empty(len(architecture.levels) - 1, 2, len(coreset.bricks), *coreset.brick_shape)
+    gradient = torch.randn(out.shape, generator=random)
+    lattices.interpolate(tables, out)
+    transposed = torch.zeros_like(tables)
+    lattices.add_transposed(transposed, gradient)
+    # <A tables, gradient> = <tables, A' gradient>
+    one = float((out.double() * gradient.double()).sum())
+    other = float((tables.double() * transposed.double()).sum())
+    size = float((out.double() * gradient.double()).abs().sum())
+    assert one == pytest.approx(other, abs=1e-6 * size)
+
+
+def test_a_step_is_that_of_torch() -> None:
+    random = torch.Generator().manual_seed(0)
+    ours = torch.randn(100, generator=random, dtype=torch.float64)
+    theirs = torch.nn.Parameter(ours.clone())
+    adam = torch.optim.Adam([theirs], lr=0.01, betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+    mean, square = torch.zeros_like(ours), torch.zeros_like(ours)
+    for step in range(1, 6):
+        gradient = torch.randn(100, generator=random, dtype=torch.float64)
+        adam_step(ours, gradient, mean, square, step, 0.01)
+        theirs.grad = gradient
+        adam.step()
+    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-10, atol=1e-12)
+
+
+def test_a_step_by_numbers_on_the_device_is_the_same() -> None:
+    random = torch.Generator().manual_seed(1)
+    here = [torch.rand(50, generator=random) for _ in range(4)]
+    there = [tensor.clone() for tensor in here]
+    for step in (1, 2, 30):
+        adam_step(*here, step, 0.01)
+        correction, pace = (torch.tensor(number) for number in corrections(step, 0.01))
+        adam_step_on_device(*there, correction, pace)
+    for ours, theirs in zip(here, there, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)
+    before = there[0].clone()
+    adam_step_on_device(*there, torch.tensor(1.0), torch.tensor(0.0))  # the end of a schedule
+    assert torch.equal(there[0], before)
+
+
+def test_catching_up_equals_stepping_without_gradient() -> None:
+    rates = 0.01 * (0.5 + 0.5 * np.cos(np.linspace(0, np.pi, 400)))
+    visited = np.array([0, 1, 5, 100, 250, 299])
+    for scale in (1e-2, 1e-6, 1e-9):
+        m, v = 0.3 * scale, scale**2
+        effect = catch_up(visited, 299, rates)
+        for number, first in enumerate(visited):
+            mean, square, moved = m, v, 0.0
+            for step in range(first + 1, 300) if first else ():
+                mean, square = BETA1 * mean, BETA2 * square
+                moved -= (
+                    rates[step]
+                    * mean
+                    / (1 - BETA1**step)
+                    / ((square / (1 - BETA2**step)) ** 0.5 + EPSILON)
+                )
+            ours = -float(effect.factor[number]) * m / (v**0.5 + float(effect.epsilon[number]))
+            # The one approximation shows only where sqrt(v) is near eps within Adam's first steps,
+            # while its correction still moves.
+            assert ours == pytest.approx(
+                moved, rel=0.05 if scale < 1e-8 and first < 100 else 2e-3, abs=1e-12
+            )
+            assert effect.mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
+            assert effect.square_decay[number] == pytest.approx(square / v, rel=1e-5)
+
+
+def test_numbers_that_catch_up_move_by_the_effect_and_their_moments_decay() -> None:
+    random = torch.Generator().manual_seed(2)
+    numbers = torch.rand(3, 2, 4, generator=random)
+    effect = catch_up(np.array([0, 3, 5, 9]), 9, np.full(10, 0.01))
+    factor, epsilon, mean_decay, square_decay = map(torch.from_numpy, effect)
+    parameter, mean, square = numbers.clone()
+    catch_up_numbers(numbers, torch.from_numpy(np.stack(effect)))
+    moved = parameter - factor * mean / (square.sqrt() + epsilon)
+    torch.testing.assert_close(numbers[0], moved)
+    torch.testing.assert_close(numbers[1], mean * mean_decay)
+    torch.testing.assert_close(numbers[2], square * square_decay)
+    # Without steps, or without a gradient before them, nothing changes.
+    assert torch.equal(numbers[0][:, [0, 3]], parameter[:, [0, 3]])
+    assert not torch.equal(numbers[0][:, 1], parameter[:, 1])
+
+
+MASKS = [[], [0], [1], [0, 1, 1, 0, 0, 1], [1, 1, 1], [0, 0, 0]]
+
+
+@pytest.mark.parametrize("mask", MASKS)
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8])
+def test_positions_are_those_of_nonzero_without_a_wait(mask: list[int], dtype: torch.dtype) -> None:
+    expected = np.nonzero(mask)[0]
+    here = true_positions(torch.tensor(mask, dtype=dtype), len(expected))
+    with pretended_cuda() as pretended:
+        on_device = torch.tensor(mask, dtype=dtype, device="cuda")
+        there = true_positions(on_device, len(expected))
+        assert pretended.counts["waits"] == 0
+        assert there.device == CUDA
+        there = there.cpu()
+    for found in (here, there):
+        assert found.dtype == torch.int64
+        np.testing.assert_array_equal(found.numpy(), expected)
+
+
+DOUBLE = torch.float64
+
+
+@pytest.mark.parametrize("resolution", [(1, 1, 1, 1), (2, 3, 5, 7), (1, 4, 1, 2)])
+def test_bucket_index_is_a_bijection(resolution) -> None:
+    corners = torch.tensor(list(product(*(range(n) for n in resolution))))
+    assert bucket_index(corners, resolution).tolist() == list(range(len(corners)))
+
+
+def test_bucket_index_is_the_papers_linearisation() -> None:
+    t, z, y, x, (_, rz, ry, rx) = 3, 2, 4, 1, (5, 6, 7, 8)
+    assert (
+        int(bucket_index(torch.tensor([t, z, y, x]), (5, rz, ry, rx)))
+        == t * rx * ry * rz + z * rx * ry + y * rx + x
+    )
+
+
+def test_vertices_of_the_finest_level_are_corners_exactly() -> None:
+    sizes = (7, 11, 25, 125)
+    vertices = torch.tensor(list(product(*(range(n) for n in (7, 11, 3, 3)))), dtype=DOUBLE)
+    before, after_weight = locate(vertices, sizes, sizes)
+    # A vertex is the corner before it, or at the end of an axis the corner after it.
+    assert torch.equal(before + after_weight, vertices)
+    assert set(after_weight.unique().tolist()) <= {0.0, 1.0}
+
+
+def test_corners_align_at_every_level() -> None:
+    sizes, resolution = (4, 9, 10, 33), (2, 5, 3, 17)
+    ends = torch.tensor([[0, 0, 0, 0], [3, 8, 9, 32]], dtype=DOUBLE)
+    before, after_weight = locate(ends, sizes, resolution)
+    assert (before + after_weight).tolist() == [[0, 0, 0, 0], [1, 4, 2, 16]]
+
+
+def test_interpolation_reproduces_a_multilinear_function() -> None:
+    sizes = resolution = (3, 4, 5, 6)
+    corners = torch.tensor(list(product(*(range(n) for n in resolution))), dtype=DOUBLE)
+
+    def function(p: torch.Tensor) -> torch.Tensor:
+        return ((1 + p[:, 0]) * (2 - p[:, 1]) * (0.5 + p[:, 2]) * (1 + 0.1 * p[:, 3])).unsqueeze(1)
+
+    random = torch.Generator().manual_seed(0)
+    points = torch.rand(200, 4, dtype=DOUBLE, generator=random) * (torch.tensor(sizes) - 1)
+    torch.testing.assert_close(
+        interpolate(function(corners), points, sizes, resolution), function(points)
+    )
+
+
+def test_an_axis_of_one_vertex_does_not_matter() -> None:
+    table = torch.rand(6, 2, dtype=DOUBLE, generator=torch.Generator().manual_seed(0))
+    points = torch.tensor([[0.0, 0.0, 0.3, 1.7], [5.0, -1.0, 0.3, 1.7]], dtype=DOUBLE)
+    value, other = interpolate(table, points, (1, 1, 2, 3), (1, 1, 2, 3))
+    torch.testing.assert_close(value, other)
+    (a, b), (c, d) = table.reshape(2, 3, 2)[:, 1:]
+    torch.testing.assert_close(value, 0.7 * (0.3 * a + 0.7 * b) + 0.3 * (0.3 * c + 0.7 * d))
+
+
+def test_errors_are_those_of_the_values_at_the_samples(noise_coreset) -> None:
+    coreset = noise_coreset((3, 6, 10, 20))
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
+    engine = NaiveEngine(architecture, coreset, np.full(10, 0.01), seed=1)
+    bricks = np.arange(len(coreset.bricks))
+    for _ in range(3):
+        values = engine.infer(bricks).numpy()
+        expected = float(np.square(values - coreset.values).sum())
+        assert float(engine.train(bricks)) == pytest.approx(expected, rel=1e-10)
+    assert np.square(engine.infer(bricks).numpy() - coreset.values).sum() < expected
+    assert engine.parameters().fine.shape == (2, len(coreset.values))

@@ -18,9 +18,19 @@ from fhash_codec import EncodeConfig, Renderer, Volume, encode_dataset
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering import film as film_module
 from fhash_codec.rendering.film import Animated, Target, film, rendered_by_workers
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.image import Draw, Image
-from fhash_codec.rendering.scenes import Effects, Scene, TransferFunctionSpec, scene_in_png
-from fhash_codec.rendering.timeline import Animation
+from fhash_codec.rendering.scenes import (
+    Camera,
+    Effects,
+    Isosurface,
+    Scene,
+    TransferFunctionSpec,
+    scene_in_png,
+)
+from fhash_codec.rendering.timeline import Animation, Key, mixed
+from fhash_codec.rendering.tracking import COLOURS, Tracked, follow, parse_tracked, tracking_scene
+from fhash_codec.rendering.transfer_function import TransferFunction
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import (
     FhashError,
@@ -29,6 +39,7 @@ from fhash_formats.errors import (
     MissingDependencyError,
     OutputError,
     OutputExistsError,
+    RegionError,
 )
 
 SMALL = Scene(size=(20, 14))
@@ -253,3 +264,244 @@ def test_outputs_of_other_kinds_are_refused(volume: Volume, tmp_path: Path, draw
             animate(volume, SMALL, animation, tmp_path / output, pictures=pictures, draw=draw)
     assert draw.scenes == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_mixing_keeps_order_and_kinds() -> None:
+    one, other = (
+        Isosurface(value=1.0, colour="white", opacity=1.0),
+        Isosurface(value=3.0, colour="black", opacity=0.0),
+    )
+    between = mixed((one,), (other,), 0.25)
+    assert between == (Isosurface(value=1.5, colour="#bfbfbf", opacity=0.75),)
+    assert mixed("viridis", "plasma", 0.5) == "viridis"
+    assert mixed(None, one, 0.9) is None
+    assert mixed(one, other, 1.0) is other
+
+
+def test_keys_are_met_and_their_settings_mixed(volume: Volume) -> None:
+    keys = (
+        Key(
+            at=0.0,
+            background="#000000",
+            step=0.0,
+            transfer_function=TransferFunctionSpec(opacity=((0.0, 0.0), (1.0, 0.2))),
+        ),
+        Key(
+            at=0.5,
+            background="#804020",
+            step=4.0,
+            transfer_function=TransferFunctionSpec(opacity=((0.5, 0.4), (3.0, 0.6))),
+        ),
+        Key(at=1.0, background="#804020", step=4.0, effects=Effects(shadows=True)),  # type: ignore[arg-type]
+    )
+    scenes = Animation(frames=9, keys=keys).scenes(SMALL, volume)
+    assert [scene.step for scene in scenes[:5]] == [0, 1, 2, 3, 4]
+    assert scenes[2].background == "#402010"
+    np.testing.assert_allclose(scenes[2].transfer_function.opacity, [[0.25, 0.2], [2.0, 0.4]])
+    assert [scene.effects.shadows is None for scene in scenes] == [True] * 8 + [False]
+    assert scenes[4].transfer_function == keys[1].transfer_function
+
+
+def test_times_may_be_dates(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+    dated = dataclasses.replace(volume.coords["t"], attributes={"units": "days since 2001-02-10"})
+    monkeypatch.setitem(volume.coords, "t", dated)
+    animation = Animation.parse("time=2001-02-11T12:00:2001-02-14:0.5,orbit=90", volume)
+    assert (animation.times, animation.every, animation.orbit) == ((1.5, 4.0), 0.5, 90.0)
+    assert [scene.time for scene in animation.scenes(SMALL, volume)] == [1.5, 2, 2.5, 3, 3.5, 4]
+    with pytest.raises(InputError, match="'time=2001-02-11' is malformed"):
+        Animation.parse("time=2001-02-11", volume)
+    with pytest.raises(RegionError, match="outside the series"):
+        Animation.parse("time=2001-02-11:2002-01-01", volume)
+    monkeypatch.setitem(volume.coords, "t", dataclasses.replace(dated, attributes={"units": "s"}))
+    with pytest.raises(InputError, match="the times are no dates"):
+        Animation.parse("time=2001-02-11:2002-01-01", volume)
+
+
+def test_a_whole_turn_ends_before_it_begins_again(volume: Volume) -> None:
+    animation = dataclasses.replace(Animation.parse("orbit", volume), frames=8)
+    scene = dataclasses.replace(SMALL, camera=Camera(azimuth=10), step=2.0)
+    scenes = animation.scenes(scene, volume)
+    assert [each.camera.azimuth for each in scenes] == [10 + 45 * number for number in range(8)]
+    assert {each.step for each in scenes} == {2.0}
+    half = dataclasses.replace(Animation.parse("orbit=180", volume), frames=3).scenes(scene, volume)
+    assert [each.camera.azimuth for each in half] == [10, 100, 190]
+
+
+def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
+    toml = tmp_path / "animation.toml"
+    toml.write_text(
+        "steps = [0, 4]\norbit = 90\nframes = 3\n"
+        '[[keys]]\ncamera = {view = "xy"}\n'
+        '[[keys]]\ncamera = {view = "xy", zoom = 4}\n'
+    )
+    animation = Animation.parse(str(toml), volume)
+    scenes = animation.scenes(SMALL, volume)
+    assert [scene.camera.azimuth for scene in scenes] == [0, 45, 90]
+    np.testing.assert_allclose([scene.camera.zoom for scene in scenes], [1, 2, 4])
+    assert Animation.from_dict(animation.to_dict()) == animation
+    other = tmp_path / "scene.json"
+    other.write_text('{"camera": {"view": "yz"}, "background": "#102030", "size": [999, 9]}')
+    keyed = Key(scene=str(other), step=1.0).over(SMALL)
+    assert (keyed.camera.view, keyed.background, keyed.size, keyed.step) == (
+        "yz",
+        "#102030",
+        SMALL.size,
+        1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("steps=3", "malformed"),
+        ("orbit=left", "malformed"),
+        ("steps=0:4:1:1", "malformed"),
+        ("steps=0:4:x", "malformed"),
+        ("steps=0:4:0", "allowed"),
+        ("nowhere.toml", "no such animation"),
+    ],
+)
+def test_words_that_mean_nothing(words: str, part: str, volume: Volume) -> None:
+    with pytest.raises(InputError, match=part):
+        Animation.parse(words, volume)
+
+
+@pytest.mark.parametrize(
+    ("values", "part"),
+    [
+        ({"steps": [0, 1], "times": [0, 1]}, "exclude"),
+        ({"frame": 3}, "did you mean 'frames'"),
+        ({"keys": [{"at": 0.5}, {"at": 0.5}]}, "ascend"),
+        ({"keys": [{"at": 0.5}, {}]}, "ascend"),
+        ({"keys": [{"camra": {}}]}, "did you mean 'camera'"),
+        ({"steps": [0, 1], "keys": [{"step": 1}, {}]}, "not by both"),
+        ({"frames": 0}, "allowed"),
+        ({"steps": [0, 4], "every": 2, "frames": 3}, "exclude each other"),
+        ({"orbit": 90, "every": 2}, "is of steps or times"),
+        ({"steps": [0, 4], "every": 0}, "allowed"),
+    ],
+)
+def test_animations_that_are_none(values: dict[str, Any], part: str) -> None:
+    with pytest.raises(InputError, match=part):
+        Animation.from_dict(values)
+
+
+def test_nothing_changes_and_steps_outside_are_refused(volume: Volume) -> None:
+    with pytest.raises(InputError, match="nothing changes"):
+        Animation(frames=4).scenes(SMALL, volume)
+    for animation in (
+        Animation(steps=(0, 5)),
+        Animation(times=(-1, 2)),
+        Animation(steps=(0, 5), every=4.0),
+        Animation(times=(0, 9), every=4.0),
+        Animation(keys=(Key(step=9.0), Key())),
+    ):
+        with pytest.raises(RegionError):
+            animation.scenes(SMALL, volume)
+
+
+@pytest.mark.parametrize(
+    ("words", "steps"),
+    [
+        ("steps=0:4:2", [0, 2, 4]),
+        ("steps=0:4:3", [0, 3]),
+        ("steps=4:0:2", [4, 2, 0]),
+        ("steps=::2", [0, 2, 4]),
+        ("steps=1::0.5", [1, 1.5, 2, 2.5, 3, 3.5, 4]),
+        ("steps=:3:1", [0, 1, 2, 3]),
+        ("steps=0:3:0.1", [number / 10 for number in range(31)]),
+        ("steps=2:3:5", [2]),
+    ],
+)
+def test_every_n_th_step(words: str, steps: list[float], volume: Volume) -> None:
+    animation = Animation.parse(words, volume)
+    assert [scene.step for scene in animation.scenes(SMALL, volume)] == steps
+    assert animation.rate == (8.0 if all(float(step).is_integer() for step in steps) else 24.0)
+
+
+def test_features_get_colours_and_thresholds(volume: Volume) -> None:
+    tracked = parse_tracked(["interval:0.2:0.4", "isosurface:0.7=#ff0000", "segmentation"], volume)
+    assert [str(item.feature).split(":")[0] for item in tracked] == [
+        "interval",
+        "isosurface",
+        "segmentation",
+    ]
+    assert [item.colour for item in tracked] == [COLOURS[0], "#ff0000", COLOURS[2]]
+    assert 0.1 < tracked[2].feature.threshold < 0.9  # type: ignore[attr-defined]
+    assert [str(item.feature) for item in parse_tracked([], volume)] == ["interval:-1:9"]
+
+
+@pytest.mark.parametrize(
+    "text", ["all", "mask:m.npy", "interval:0:1=#12", "blob:3", "interval:3:1"]
+)
+def test_features_that_values_do_not_tell(text: str, volume: Volume) -> None:
+    with pytest.raises(InputError):
+        parse_tracked([text], volume)
+
+
+def test_a_value_of_two_features_has_both_colours_and_the_larger_opacity(volume: Volume) -> None:
+
+    scene = tracking_scene(
+        SMALL,
+        parse_tracked(
+            ["interval:0.2:0.6=#ff0000", "interval:0.4:0.8=#0000ff", "isosurface:0.9=#00ff00"],
+            volume,
+        ),
+        volume,
+    )
+    assert scene.effects.isosurfaces == (Isosurface(value=0.9, colour="#00ff00"),)
+    # The volume is thin: three vertices along z.
+    full = 1 - (1 - 0.3) ** (8 / Grid.of(volume.coords).thinnest[1])
+    function = TransferFunction.of(scene.transfer_function, value_range=(0.0, 1.0), spacing=1.0)
+    np.testing.assert_allclose(
+        function.colour([0.3, 0.5, 0.7]), [[1, 0, 0], [0.5, 0, 0.5], [0, 0, 1]], atol=0.01
+    )
+    np.testing.assert_allclose(
+        function.opacity([0.1, 0.3, 0.5, 0.7, 0.85]), [0, full, full, full, 0], atol=1e-9
+    )
+    assert scene.effects.box
+    assert [(entry.text, entry.colour) for entry in scene.effects.legend] == [
+        (f"{volume.name}: 0.2 to 0.6", "#ff0000"),
+        (f"{volume.name}: 0.4 to 0.8", "#0000ff"),
+        (f"{volume.name} = 0.9", "#00ff00"),
+    ]
+
+
+def test_features_without_an_end_are_named_by_the_other(volume: Volume) -> None:
+    texts = ["interval:0.3:inf", "interval:-inf:0.2", "segmentation:0.4"]
+    scene = tracking_scene(SMALL, parse_tracked(texts, volume), volume)
+    name = volume.name
+    assert [entry.text for entry in scene.effects.legend] == [
+        f"{name} ≥ 0.3",
+        f"{name} ≤ 0.2",
+        f"{name} ≥ 0.4",
+    ]
+
+
+def test_isosurfaces_alone_leave_the_volume_out(volume: Volume) -> None:
+    scene = tracking_scene(SMALL, parse_tracked(["isosurface:0.5"], volume), volume)
+    assert scene.transfer_function.nothing
+    with pytest.raises(InputError, match="no feature"):
+        tracking_scene(SMALL, [], volume)
+
+
+def test_a_feature_is_followed(volume: Volume) -> None:
+    (followed,) = follow(volume, parse_tracked(["segmentation:0.5"], volume), [0.0, 3.0])
+    first, last = followed["steps"]
+    assert (first["time"], last["time"]) == (0, 4)
+    np.testing.assert_allclose(first["centroid"], [8, 4, 1.5], atol=0.3)  # x descends from 10
+    np.testing.assert_allclose(last["centroid"], [5, 4, 1.5], atol=0.3)
+    assert first["vertices"] > 10
+    assert first["bounds"][2] == [1.0, 2.0]
+    (nowhere,) = follow(
+        volume,
+        [Tracked(feature=parse_tracked(["interval:5:6"], volume)[0].feature, colour="red")],
+        [0.0],
+    )
+    assert nowhere["steps"][0] == {
+        "step": 0.0,
+        "time": 0.0,
+        "vertices": 0,
+        "centroid": None,
+        "bounds": None,
+    }
