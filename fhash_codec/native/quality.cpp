@@ -435,7 +435,7 @@ FHASH_EXPORT int64_t fhash_histogram_f64(const double* values, int64_t n, double
     return histogram(values, n, scale, low, factor, bins, counts);
 }
 
-// The structural similarity over a tile of two frames (fhash_codec/measure/metrics.py). shape: (z, y,
+// The structural similarity over a tile of two frames (measure/metrics.py). shape: (z, y,
 // x) of the frames. tile: first and stop along each axis. numbers: scale, mean after scaling, c1,
 // c2, and the window's six weights from its middle outwards. Returns the number of the vertices
 // that count (finite in the original, and set in the mask, nullptr being all); -1 where a decoded

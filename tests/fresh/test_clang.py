@@ -30,7 +30,7 @@ runpy.run_path("setup.py")
 RUN = """
 import os, pathlib, pytest, sys
 import numpy as np
-import fhash_codec, fhash_formats.native
+import fhash_codec, fhash_formats.native as native
 native._FOLDER = pathlib.Path(sys.argv[1])
 code = 0
 for tests, long, names in (
