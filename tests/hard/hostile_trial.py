@@ -27,16 +27,15 @@ from typing import Any
 import mutations
 import numpy as np
 from containers import unpack
-from documents import header_of, path_of
+from documents import Documents, header_of
 from further_trials import Further
-from mutated_payload import documents_of, inner_chunks, settings_of
+from mutated_tiles import inner_chunks, settings_of
 from PIL import Image
 
 import fhash_cli.main
 import fhash_codec
 from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
-from fhash_formats.container.header import TABLE
 from fhash_formats.errors import FhashError, FhashWarning
 from fhash_formats.transform.tile_format import PREDICTED, TRANSFORMED, TileSettings, parse_stream
 
@@ -72,9 +71,7 @@ class Trial:
                 header = container.variables[self.variable].header if self.variable else {}
                 return tuple((header or container.header)["domain"]["shape"])
         except FhashError:
-            return tuple(
-                mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"]
-            )
+            return tuple(header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"])
         except Exception:  # the first command reports it
             return (5, 6, 7, 9)
 
@@ -241,7 +238,7 @@ class Trial:
 
     def beyond(self, values: Any, region: list[tuple[int, int]] | None) -> bool:
         """Whether values lie beyond the range to which their tile clips them."""
-        fill = header_of(unpack(self.mutation.data))[2]["variable"].get("fill")
+        fill = header_of(unpack(self.mutation.data))["variable"].get("fill")
         ends = clip_ends(self.mutation)
         if region is not None:
             ends = ends[:, *(slice(low, high) for low, high in region)]
@@ -285,8 +282,8 @@ def clip_ends(mutation: mutations.Mutation) -> Any:
     differences.
     """
     parts = unpack(mutation.data)
-    table = path_of(header_of(parts)[2], TABLE)
-    document = documents_of(parts)[table]
+    file = Documents(parts)
+    table, document = file.table, file.arrays[file.table]
     shared = settings_of(document)
     shape, dtype = document["shape"], np.dtype(document["data_type"])
     ends = np.empty((2, *shape), dtype)

@@ -10,77 +10,26 @@ from collections.abc import Callable
 from math import prod
 
 from containers import Parts, directory_of, pack, pack_members, resealed, with_crc
+from documents import DOCUMENT, GROUP, array_of_zeros, dumped
 from numcodecs.zstd import compress
 
 from fhash_formats.container.zip_file import ENTRY, comment, deflated
 
 NUMBERS = (
-    0,
-    1,
-    7,
-    8,
-    20,
-    63,
-    255,
-    256,
-    0x7FFF,
-    0x8000,
-    0xFFFF,
-    0x10000,
-    0x7FFFFFFF,
-    0x80000000,
-    0xFFFFFFFE,
-    0xFFFFFFFF,
+    *(0, 1, 7, 8, 20, 63, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x10000),
+    *(0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF),
 )
 NAMES = (
-    *(
-        "../x",
-        "a/../../x",
-        "/etc/passwd",
-        "..",
-        ".",
-        "",
-        "a\\x",
-        "C:x",
-        "c:/x",
-        "x/",
-        "x//y",
-        "./x",
-        "~/x",
-        "a b",
-        "a\nb",
-        "a\x00b",
-        ".x",
-    ),
-    *(
-        "x/.y",
-        "%2e%2e/x",
-        "CON",
-        "x:y",
-        "x" * 512,
-        "x" * 513,
-        "x" * 65535,
-        "x/" * 250 + "y",
-        "zarr.json/zarr.json",
-        "c/0",
-        "tables/c/0",
-    ),
+    *("../x", "a/../../x", "/etc/passwd", "..", ".", "", "a\\x", "C:x", "c:/x", "x/", "x//y"),
+    *("./x", "~/x", "a b", "a\nb", "a\x00b", ".x", "x/.y", "%2e%2e/x", "CON", "x:y"),
+    *("x" * 512, "x" * 513, "x" * 65535, "x/" * 250 + "y", "zarr.json/zarr.json", "c/0"),
+    "tables/c/0",
 )
 FIELDS = (
-    (0, "I"),
-    (4, "H"),
-    (6, "H"),
-    (8, "H"),
-    (10, "H"),
-    (12, "H"),
-    (14, "H"),
-    (16, "I"),
-    (20, "I"),
-    (24, "I"),
-    (28, "H"),
-    (30, "H"),
+    *((at, "H") for at in (4, 6, 8, 10, 12, 14, 28, 30, 32, 34, 36)),
+    *((at, "I") for at in (0, 16, 20, 24, 38, 42)),
 )
-LATER_FIELDS = ((32, "H"), (34, "H"), (36, "H"), (38, "I"), (42, "I"))
+"""Offset and form of each field of an entry of the directory; END_FIELDS of the end record."""
 END_FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "I"), (16, "I"), (20, "H"))
 
 
@@ -93,9 +42,13 @@ def _entries(data: bytes) -> list[int]:
     return offsets
 
 
-def _number(chance: random.Random, form: str, old: int) -> int:
+def _put(chance: random.Random, data: bytearray, at: int, form: str) -> int:
+    """Change a number of a file, and return it."""
+    old = struct.unpack_from(f"<{form}", data, at)[0]
     new = chance.choice((*NUMBERS, old + 1, old - 1, old * 2, old // 2))
-    return new % (1 << 16 if form == "H" else 1 << 32)
+    new %= 1 << 16 if form == "H" else 1 << 32
+    struct.pack_into(f"<{form}", data, at, new)
+    return int(new)
 
 
 def _field(chance: random.Random, parts: Parts) -> bytes:
@@ -104,10 +57,8 @@ def _field(chance: random.Random, parts: Parts) -> bytes:
     start = directory_of(bytes(data))
     for _ in range(chance.choice((1, 1, 2, 4))):
         entry = chance.choice(_entries(bytes(data)) or [start])
-        at, form = chance.choice((*FIELDS, *LATER_FIELDS))
-        old = struct.unpack_from(f"<{form}", data, entry + at)[0]
-        new = _number(chance, form, old)
-        struct.pack_into(f"<{form}", data, entry + at, new)
+        at, form = chance.choice(FIELDS)
+        new = _put(chance, data, entry + at, form)
         local = struct.unpack_from("<I", data, entry + 42)[0]
         if 6 <= at <= 30 and chance.random() < 0.5 and local + 30 < start:
             struct.pack_into(f"<{form}", data, local + at - 2, new)
@@ -118,39 +69,23 @@ def _end(chance: random.Random, parts: Parts) -> bytes:
     """Change a field of the end record, or put records before it."""
     data = bytearray(pack(parts))
     start, end = directory_of(bytes(data)), len(data) - len(comment(b"")) - 22
-    if chance.random() < 0.3:
-        record = struct.pack(
-            "<4sQ2H2I4Q",
-            b"PK\x06\x06",
-            44,
-            45,
-            45,
-            0,
-            0,
-            *(chance.choice((*NUMBERS, 2**60, 2**63, 2**64 - 1)) for _ in range(4)),
-        )
-        locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, chance.choice((end, 0, 2**63)), 1)
-        struct.pack_into("<I", data, end + 16, 0xFFFFFFFF)
-        return resealed(bytes(data[:end]) + record + locator + bytes(data[end:]), start)
-    at, form = chance.choice(END_FIELDS)
-    struct.pack_into(
-        f"<{form}",
-        data,
-        end + at,
-        _number(chance, form, struct.unpack_from(f"<{form}", data, end + at)[0]),
-    )
-    return resealed(bytes(data), start)
+    if chance.random() >= 0.3:
+        at, form = chance.choice(END_FIELDS)
+        _put(chance, data, end + at, form)
+        return resealed(bytes(data), start)
+    numbers = chance.choices((*NUMBERS, 2**60, 2**63, 2**64 - 1), k=4)
+    record = struct.pack("<4sQ2H2I4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, *numbers)
+    locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, chance.choice((end, 0, 2**63)), 1)
+    struct.pack_into("<I", data, end + 16, 0xFFFFFFFF)
+    return resealed(bytes(data[:end]) + record + locator + bytes(data[end:]), start)
 
 
 def _signature(chance: random.Random, parts: Parts) -> bytes:
     """Put another version or another text into the comment."""
-    data = pack(parts)
-    new = chance.choice(
-        (b"fhash 0", b"fhash 1", b"fhash 3", b"fhash 9999", b"fhash -", b"FHASH 2", b"fhash 02")
-    )
-    return (
-        data.replace(b"fhash 2", new) if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
-    )
+    data, words = pack(parts), ("fhash 0", "fhash 1", "fhash 3", "fhash 9999", "fhash -", "FHASH 2")
+    new = chance.choice((*words, "fhash 02")).encode()
+    other = data.replace(b"fhash 2", new)
+    return other if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
 
 
 def _named(chance: random.Random, parts: Parts) -> bytes:
@@ -188,30 +123,20 @@ def _shuffled(chance: random.Random, parts: Parts) -> bytes:
 def _nested(chance: random.Random, parts: Parts) -> bytes:
     """Put nodes into nodes: an array into an array, groups hundreds deep, a hierarchy below its own
     array."""
-    prefix = chance.choice(
-        (
-            "coords/time",
-            "tables/level_1",
-            "tables",
-            "tables/level_1/c",
-            "a/" * chance.choice((1, 60, 200)) + "a",
-        )
-    )
+    deep = "a/" * chance.choice((1, 60, 200)) + "a"
+    prefix = chance.choice(("coords/time", "tables/level_1", "tables", "tables/level_1/c", deep))
     below = [(f"{prefix}/{name}", data) for name, data in parts if len(prefix) + len(name) < 512]
     if chance.random() < 0.5:
         path = prefix.split("/")
-        below += [
-            ("/".join(path[:n]) + "/zarr.json", b'{"zarr_format":3,"node_type":"group"}')
-            for n in range(1, len(path) + 1)
-        ]
+        below += [("/".join([*path[:n], DOCUMENT]), GROUP) for n in range(1, len(path) + 1)]
     return pack([*dict([*below, *parts]).items()])
 
 
 def _many(chance: random.Random, parts: Parts) -> bytes:
     """Add thousands of members."""
     count = chance.choice((100, 3000))
-    document = chance.choice((b'{"zarr_format":3,"node_type":"group"}', b"{}", b""))
-    return pack([*((f"g{number}/zarr.json", document) for number in range(count)), *parts])
+    document = chance.choice((GROUP, b"{}", b""))
+    return pack([*((f"g{number}/{DOCUMENT}", document) for number in range(count)), *parts])
 
 
 def _bomb(chance: random.Random, parts: Parts) -> bytes:
@@ -220,20 +145,16 @@ def _bomb(chance: random.Random, parts: Parts) -> bytes:
     at = chance.randrange(len(parts))
     name, data = parts[at]
     size = 1 << chance.choice((20, 24, 26, 30, 31))
-    if name.endswith("zarr.json"):
-        text = chance.choice((b" ", b"[", b'{"a":', b"0", b'"'))
+    bomb: tuple[str, bytes, int | None, int]
+    if name.endswith(DOCUMENT):
+        block = chance.choice((b" ", b"[", b'{"a":', b"0", b'"')) * (1 << 20)
         small = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-        block = text * ((1 << 20) // len(text))
-        stored = (
-            b"".join(small.compress(block) for _ in range(min(size, 1 << 26) >> 20)) + small.flush()
-        )
-        declared = chance.choice((size, len(data), 16 << 20, (16 << 20) + 1, 2**32 - 1)) % (1 << 32)
-        bomb = (name, stored, declared, zlib.crc32(data))
+        pieces = [small.compress(block[: 1 << 20]) for _ in range(min(size, 1 << 26) >> 20)]
+        full = chance.choice((size, len(data), 16 << 20, (16 << 20) + 1, 2**32 - 1)) % (1 << 32)
+        bomb = (name, b"".join(pieces) + small.flush(), full, zlib.crc32(data))
     else:
-        frame = _zeros(
-            min(size, 1 << 30), declared=chance.choice((None, size, 64, 2**63, 2**64 - 1))
-        )
-        stored = with_crc(frame)
+        declared = chance.choice((None, size, 64, 2**63, 2**64 - 1))
+        stored = with_crc(_zeros(min(size, 1 << 30), declared))
         bomb = (name, stored, None, zlib.crc32(stored))
     plain = [(other, content, None, zlib.crc32(content)) for other, content in parts]
     return pack_members([*plain[:at], bomb, *plain[at + 1 :]])
@@ -241,21 +162,18 @@ def _bomb(chance: random.Random, parts: Parts) -> bytes:
 
 def _zeros(size: int, declared: int | None) -> bytes:
     """Return a zstd frame of zeros in blocks of one repeated byte: 128 KiB from 4 bytes."""
-    head = (
-        struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88"
-        if declared is None
-        else struct.pack("<IBBQ", 0xFD2FB528, 0xC0, 0x88, declared)
-    )
-    blocks = -(-size // (1 << 17))
-    body = struct.pack("<I", (1 << 17) << 3 | 2)[:3] + b"\0"
-    return head + body * (blocks - 1) + struct.pack("<I", (1 << 17) << 3 | 3)[:3] + b"\0"
+    head = struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88"
+    if declared is not None:
+        head = struct.pack("<IBBQ", 0xFD2FB528, 0xC0, 0x88, declared)
+    block, last = (struct.pack("<I", (1 << 17) << 3 | end)[:3] + b"\0" for end in (2, 3))
+    return head + block * (-(-size // (1 << 17)) - 1) + last
 
 
 def _deflated(chance: random.Random, parts: Parts) -> bytes:
     """Deflate members that may or may not be deflated, with sizes that are right or wrong."""
     given = []
     for name, data in parts:
-        packed = name.endswith("zarr.json") or chance.random() < 0.1
+        packed = name.endswith(DOCUMENT) or chance.random() < 0.1
         full = max(0, len(data) + chance.choice((0, 0, 0, 0, 1, -1))) if packed else None
         given.append((name, deflated(data) if packed else data, full, zlib.crc32(data)))
     return pack_members(given)
@@ -265,37 +183,18 @@ def _extra(chance: random.Random, parts: Parts) -> bytes:
     """Add another array, sound or not."""
     shape = [chance.choice((1, 2, 2**20, 2**31, 2**60)) for _ in range(chance.choice((1, 2, 4, 8)))]
     chunk = [chance.choice((1, n, min(n, 2**28))) for n in shape]
-    document = {
-        **{
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": shape,
-            "data_type": "uint8",
-            "fill_value": 0,
-        },
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": [
-            {"name": "bytes"},
-            {"name": "zstd", "configuration": {"level": 1, "checksum": False}},
-            {"name": "crc32c"},
-        ],
-    }
-    name = chance.choice(
-        ("extra", "missing/bits", "occupancy/bits", "occupancy/mask", "key_frames", "coords/time")
-    )
+    names = ("extra", "missing/bits", "occupancy/bits", "occupancy/mask", "key_frames")
+    name = chance.choice((*names, "coords/time"))
+    small = array_of_zeros(name, [1], "uint8")
+    document = json.loads(small[0][1])
+    document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"] = shape, chunk
     size = min(1 << 28, max(1, prod(chunk)))
-    data = with_crc(
-        _zeros(size, declared=size)
-        if chance.random() < 0.5
-        else compress(bytes(min(size, 1 << 20)), 1)
-    )
+    frame = _zeros(size, size) if chance.random() < 0.5 else compress(bytes(min(size, 1 << 20)), 1)
     members = {
-        f"{name}/zarr.json": json.dumps(document).encode(),
-        f"{name}/c/" + "/".join("0" * len(shape)): data,
+        small[0][0]: dumped(document),
+        f"{name}/c/" + "/".join("0" * len(shape)): with_crc(frame),
+        **({f"{name.split('/')[0]}/{DOCUMENT}": GROUP} if "/" in name else {}),
     }
-    if "/" in name:
-        members[f"{name.split('/')[0]}/zarr.json"] = b'{"zarr_format":3,"node_type":"group"}'
     return pack([*{**dict(parts), **members}.items()])
 
 

@@ -8,25 +8,19 @@ reaches the code behind them. A sealed file may even be sound.
 from __future__ import annotations
 
 import contextlib
+import json
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
-import documents
-import mutated_json
-import mutated_labels
-import mutated_parts
-import mutated_payload
-import mutated_plain
-import mutated_settings
-import mutated_source
-import mutated_sparse
-import mutated_variables
+import mutated_documents
+import mutated_giants
+import mutated_tiles
 import mutated_zip
 from containers import Parts, pack, unpack
+from documents import DOCUMENT, Documents, NothingFitsError, dumped, replaced
 
 GOLDENS = Path(__file__).parents[1] / "golden"
 NEWEST = (
@@ -83,7 +77,7 @@ def mutation(number: int) -> Mutation:
     for name in (first, *random.Random(number).sample(names, len(names))):
         try:
             return _mutation(number, name, kinds[place])
-        except mutated_payload.NothingFitsError:
+        except NothingFitsError:
             continue
     raise AssertionError(f"no golden has what {kinds[place]} changes")
 
@@ -91,8 +85,8 @@ def mutation(number: int) -> Mutation:
 def _mutation(number: int, golden: str, kind: str) -> Mutation:
     chance = random.Random(number)
     data, parts = goldens()[golden]
-    if kind in OF_ONE and mutated_variables.is_several(parts):
-        raise mutated_payload.NothingFitsError
+    if kind in OF_ONE and len(Documents(parts).headers) > 1:
+        raise NothingFitsError
     if kind in DAMAGES:
         return Mutation(
             number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data)
@@ -172,46 +166,47 @@ def _packed(
 
     def changed(chance: random.Random, parts: Parts) -> bytes:
         after = change(chance, parts)
-        with contextlib.suppress(ValueError, KeyError, RecursionError):
+        with contextlib.suppress(ValueError, KeyError, RecursionError, TypeError):
             if chance.random() < 0.85:
-                after = mutated_variables.consolidated(after)
+                after = _consolidated(after)
         return pack(after)
 
     return changed
 
 
-_MODULES = (
-    mutated_json,
-    mutated_payload,
-    mutated_settings,
-    mutated_labels,
-    mutated_plain,
-    mutated_sparse,
-    mutated_variables,
-    mutated_source,
-    mutated_parts,
-)
+def _consolidated(parts: Parts) -> Parts:
+    """Return the file with the documents as they are in its consolidated metadata."""
+    root = json.loads(dict(parts)[DOCUMENT])
+    if "consolidated_metadata" not in root:
+        return parts
+    root["consolidated_metadata"] = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": {
+            name.removesuffix(f"/{DOCUMENT}"): json.loads(data)
+            for name, data in parts
+            if name.endswith(f"/{DOCUMENT}")
+        },
+    }
+    return replaced(parts, {DOCUMENT: dumped(root)})
+
+
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
-    **{name: _packed(change) for module in _MODULES for name, change in module.KINDS.items()},
+    **{
+        name: _packed(change)
+        for module in (mutated_documents, mutated_tiles, mutated_giants)
+        for name, change in module.KINDS.items()
+    },
 }
 KINDS = (*DAMAGES, *SEALED)
-PLAIN_KINDS = frozenset(mutated_plain.KINDS)
+PLAIN_KINDS = frozenset(("plain", "plain numbers", "plain giant", "occupancy"))
 """Kinds that change plain files, or arrays of occupancy, only."""
-SPARSE_KINDS = frozenset(mutated_sparse.KINDS)
-"""Kinds that change tables of needed vertices only."""
-SEVERAL_KINDS = frozenset(("consolidated",))
-"""Kinds that change files of several variables only."""
-SOURCE_KINDS = frozenset(mutated_source.KINDS)
-"""Kinds that change metadata of a source only."""
-PART_KINDS = frozenset(mutated_parts.KINDS)
-"""Kinds that change parts of a series or files that grew only."""
-OF_ONE = frozenset(("length", "giant", "clip", "integers", "occupancy", "grown")) | (
-    PLAIN_KINDS | SPARSE_KINDS
-)
+PARTIAL = PLAIN_KINDS | {
+    *("sparse", "sparse giant", "consolidated", "source", "source giant"),
+    *("part", "errors", "grown"),
+}
+"""Kinds that pass over goldens without what they change."""
+OF_ONE = frozenset(("length", "giant", "clip", "integers", "grown", "sparse", "sparse giant"))
+OF_ONE |= PLAIN_KINDS
 """Kinds that change files of one variable only."""
-
-
-def header_of(parts: Parts) -> Any:
-    """Return the header of a golden; of several variables, that of the first."""
-    return documents.header_of(parts)[2]

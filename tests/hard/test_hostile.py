@@ -19,14 +19,6 @@ import numpy as np
 import pytest
 from reporting import LONG, record
 
-PARTIAL = (
-    mutations.PLAIN_KINDS
-    | mutations.SPARSE_KINDS
-    | mutations.SEVERAL_KINDS
-    | mutations.SOURCE_KINDS
-    | mutations.PART_KINDS
-)
-"""Kinds that pass over goldens without what they change."""
 MANY = 12_000
 """Mutations; kinds and goldens take turns."""
 
@@ -59,7 +51,7 @@ def test_every_kind_meets_labels_and_clipped_values(report: hostile.Report) -> N
     """Kinds pass over goldens without what they change, so some could meet none of the newest."""
     clipped, labelled = set(mutations.NEWEST[::2]), set(mutations.NEWEST[1::2])
     # These kinds change ordinary arrays, clipped values or labels only.
-    kinds = set(mutations.KINDS) - PARTIAL
+    kinds = set(mutations.KINDS) - mutations.PARTIAL
     for kind in kinds - {"values", "clip"}:
         assert report.met[kind] & labelled, kind
     for kind in kinds - {"values", "labels"}:
@@ -88,7 +80,7 @@ def test_damage_is_refused_and_much_of_what_is_sealed_reaches_the_decoders(
         for kind in (
             *("stream", "settings", "values", "coordinates", "header", "giant", "shuffled"),
             *("labels", "clip", "integers"),
-            *sorted(PARTIAL),
+            *sorted(mutations.PARTIAL),
         )
     )
     # A sealed mutation gets past the checksums and is refused for its contents only.
