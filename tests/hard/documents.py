@@ -89,7 +89,7 @@ def places(value: Any) -> Iterator[Place]:
 GONE = object()
 """Value of a rule that removes the key."""
 Rule = tuple[str, Sequence[Any] | Callable[[random.Random, Any], Any]]
-"""Where a document changes, and what may stand there: values, or a function of the old one.
+"""Places where a document changes, and what may stand there: values, or a function of the old one.
 
 Words of a path are keys; `*` is any key or index, `a|b` one of two, `**` any place below."""
 

@@ -223,7 +223,7 @@ VARIABLES: tuple[Rule, ...] = (
     ("variables.*.**", hostile),
     ("*", hostile),
 )
-"""What says how many variables there are, their names and order, and the keys of the root."""
+"""Keys that say how many variables there are, their names and order, and the root's keys."""
 SHARED = (
     *("auxiliary/lat", "auxiliary/lon", "auxiliary/none", "tables/level_1", "coords/x", "../u"),
     *("auxiliary/", "", "occupancy/bits"),
@@ -381,7 +381,7 @@ GROWN: tuple[Rule, ...] = (
     ("history", HISTORIES),
     ("quality.**", hostile),
 )
-"""What the next layers depend on: promise, range, figures, times, history."""
+"""Keys that the next layers depend on: promise, range, figures, times, history."""
 
 
 def _grown(chance: random.Random, parts: Parts) -> Parts:
@@ -460,7 +460,7 @@ SPARSE: tuple[Rule, ...] = (
         ),
     ],
 )
-"""What says which vertices a table has: header, counts, levels, features."""
+"""Keys that say which vertices a table has: header, counts, levels, features."""
 
 
 def _moved(chance: random.Random, counts: Any) -> Any:
