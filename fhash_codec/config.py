@@ -38,6 +38,11 @@ ACCESSES = ("fast", "balanced", "small")
 PAIR = ("psnr", "psnr_bulk")
 """Promises that may be given together."""
 
+DEFAULT_PSNR = 50.0
+"""PSNR in dB that is promised where nothing is asked for."""
+DEFAULT_PSNR_BULK = 40.0
+"""PSNR in dB that is promised of a wide bulk where nothing is asked for."""
+
 
 def option(
     default: Any,
@@ -166,14 +171,14 @@ class EncodeConfig:
     psnr: float | None = option(
         None,
         "promise of quality in dB over the coreset of all steps "
-        "(compact: 50 if nothing is promised); missing it ends with exit code 3",
+        f"(compact: {DEFAULT_PSNR:g} if nothing is promised); missing it ends with exit code 3",
         low=0.0,
         high=400.0,
     )
     psnr_bulk: float | None = option(
         None,
         "promise of quality in dB within the bulk, the range of the middle 98 % of the values "
-        "(compact: 40 if nothing is promised); alone or beside psnr",
+        f"(compact: {DEFAULT_PSNR_BULK:g} if nothing is promised); alone or beside psnr",
         low=0.0,
         high=400.0,
     )

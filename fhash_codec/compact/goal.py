@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from fhash_codec.compact.tiles import BulkPart, Coding
-from fhash_codec.config import PROMISES, EncodeConfig
+from fhash_codec.config import DEFAULT_PSNR, DEFAULT_PSNR_BULK, PROMISES, EncodeConfig
 from fhash_codec.measure.errors import is_wide, whole_psnr
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
@@ -202,10 +202,6 @@ def cheapest(
 
 MAX_INTEGER_ERROR = 2.0**40
 """Bound on integers from which on a half more makes no difference."""
-DEFAULT_PSNR = 50.0
-"""PSNR in dB that is promised where nothing is asked for."""
-DEFAULT_PSNR_BULK = 40.0
-"""PSNR in dB that is promised of a wide bulk where nothing is asked for."""
 RATIO_SLACK = 1.05
 """Factor by which a file may be smaller than a promised ratio asks for, where a step allows it."""
 
