@@ -44,9 +44,7 @@ LONG_ROOMS = (
     "benchmarks/tests/rate/",
     "benchmarks/tests/test_ablate.py",
     "benchmarks/tests/test_train.py",
-    "benchmarks/tests/test_train.py",
     "tests/codec/cost/",
-    "tests/codec/selftest/",
     "tests/codec/paper/engines/fused/",
 )
 """Rooms of measuring tools, and of kernels that are emulated, which the long set alone runs. Not
