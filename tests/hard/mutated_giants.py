@@ -124,6 +124,7 @@ def _rebuilt(file: Documents, arrays: list[tuple[str, list[int], str]], keep: st
     """Return a file whose first variable has these arrays of zeros, and of the old ones those whose
     paths begin with `keep`."""
     header, shape = file.header, file.header["domain"]["shape"]
+    header.pop("coordinates", None)  # they stand in arrays
     positions = [(f"coords/{axis}", [n], "float64") for axis, n in zip(AXES, shape, strict=True)]
     gone = without(file.parts, "parts/", *(f"{name}/" for name in header["dimensions"]))
     kept = [item for item in file.parts if keep and item[0].startswith(keep)]

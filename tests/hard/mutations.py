@@ -204,9 +204,8 @@ PLAIN_KINDS = frozenset(("plain", "plain numbers", "plain giant", "occupancy"))
 """Kinds that change plain files, or arrays of occupancy, only."""
 PARTIAL = PLAIN_KINDS | {
     *("sparse", "sparse giant", "consolidated", "source", "source giant"),
-    *("part", "errors", "grown"),
+    *("part", "errors", "grown", "index"),
 }
 """Kinds that pass over goldens without what they change."""
-OF_ONE = frozenset(("length", "giant", "clip", "integers", "grown", "sparse", "sparse giant"))
-OF_ONE |= PLAIN_KINDS
+OF_ONE = PLAIN_KINDS | {"length", "giant", "clip", "integers", "grown", "sparse", "sparse giant"}
 """Kinds that change files of one variable only."""
