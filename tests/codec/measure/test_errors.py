@@ -146,6 +146,16 @@ def test_errors_are_those_of_plain_numpy(dtype, masked) -> None:
         assert figures.max_abs_error == pytest.approx(np.abs(errors_of_step).max(), rel=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_bulk_has_both_of_its_ends(dtype) -> None:
+    original = np.array([[[1, 2, 3, 4, 5]]], dtype)
+    decoded = original + np.array([0.5, 0.25, 0.125, 0.75, 0.5], dtype)
+    errors = Errors(4.0, ValueRange(2, 4))
+    errors.add(0, original, decoded)
+    mean = (0.25**2 + 0.125**2 + 0.75**2) / 3
+    assert errors.bulk_quality().rmse == pytest.approx(math.sqrt(mean), rel=1e-12)
+
+
 @pytest.mark.parametrize("factor", [2.0**-1040, 2.0**-900, 2.0**900, 2.0**1023])
 def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     original, decoded = frames()
