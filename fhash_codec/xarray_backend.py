@@ -24,7 +24,7 @@ from fhash_codec.features.selection import labelled_series
 from fhash_codec.header import figure_attributes, history_line, source_attributes
 from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, UnsupportedFileError
 from fhash_formats.readers.common.cf import SCALING
 from fhash_formats.series import AXES, NO_AXIS, SourceVariable, meant, renamed, with_history
 from fhash_formats.support.values import PACKING
@@ -262,6 +262,14 @@ VALID = ("valid_min", "valid_max", "valid_range")
 """Attributes that xarray leaves where they are."""
 
 
+def _dataset(variables: Any, attributes: dict[str, Any], place: Any) -> xr.Dataset:
+    """The dataset of a file's variables; UnsupportedFileError where xarray holds no such ones."""
+    try:
+        return xr.Dataset(variables, attrs=attributes)
+    except ValueError as error:
+        raise UnsupportedFileError(f"{place}: no dataset of xarray: {error}") from error
+
+
 class FhashBackend(BackendEntrypoint):
     """xarray's engine `fhash`."""
 
@@ -328,7 +336,7 @@ class FhashBackend(BackendEntrypoint):
             packed[shown_as[name]] = shown.packing()
             arrays.append(array)
         decoded = xr.conventions.decode_cf(
-            xr.Dataset(joined.variables, attrs=attributes),
+            _dataset(joined.variables, attributes, place),
             concat_characters=concat_characters,  # type: ignore[arg-type]
             mask_and_scale=mask_and_scale,  # type: ignore[arg-type]
             decode_times=decode_times,
