@@ -40,7 +40,7 @@ from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import estimated_size, estimated_step, usual_transform
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
-from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.measure.value_range import Mean, ValueRange
 from fhash_codec.progress import Parts, Progress, stage
 from fhash_formats.transform.coder import MAX_LABELS, MaskLevels
 from fhash_formats.transform.encoding import OFFSETS
@@ -142,9 +142,11 @@ def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     return values
 
 
-def _mean(values: npt.NDArray[Any]) -> Any:
-    """Return the mean of some values in their number type, however large they are."""
-    return np.sum(values.astype(np.float64) / values.size).astype(values.dtype)
+def _filled(values: npt.NDArray[Any], counted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+    """Return values with their mean where none counts; some must count."""
+    mean = Mean()
+    mean.add(values[counted])
+    return np.where(counted, values, mean.value())
 
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
@@ -184,7 +186,7 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
     )
     rank = rank_share(
         [
-            values if counted is None else np.where(counted, values, _mean(values[counted]))
+            values if counted is None else _filled(values, counted)
             for values, counted in sample.tiles
             if counted is None or counted.any()
         ]

@@ -469,10 +469,10 @@ def _check_output(
     output: str | None, isosurface: float | None, chosen: RegionOptions, force: bool, run: str
 ) -> None:
     """Refuse an output before any work."""
-    from fhash_codec.isosurface import require_marching_cubes
-    from fhash_formats.writers.vtk import check_mesh_output
-
     if isosurface is not None:
+        from fhash_codec.isosurface import require_marching_cubes
+        from fhash_formats.writers.vtk import check_mesh_output
+
         if output is None or chosen.dtype is not None:
             raise click.UsageError(
                 "--isosurface writes a file of triangles: give -o s.vtp or -o s.ply, and no --dtype"

@@ -18,6 +18,7 @@ from fhash_formats.native import crc32c
 from fhash_formats.readers.common.cf import Packing
 from fhash_formats.readers.common.file_series import FileSeries, Request, condense, refusing
 from fhash_formats.readers.common.layout import Layout, label
+from fhash_formats.readers.common.stored_parts import ABSENT
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.readers.zarr_store import ZarrTree, open_tree, series_in
 from fhash_formats.series import AXES
@@ -36,8 +37,6 @@ SHARD_INDICES = 64
 """Indices of shards that are kept."""
 ENTRY = 16
 """Bytes that the index of a shard has for each chunk: offset and length."""
-ABSENT = 2**64 - 1
-"""Number that stands for both where a chunk is not there."""
 
 Place = tuple[int, ...]
 
