@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.attempt import GainLog, PlanTask
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.tiles import Blocks
+from fhash_codec.compact.tiles import Blocks, Index
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
@@ -45,3 +46,13 @@ def plan_task(
         workers=workers,
         gains=GainLog(100),
     )
+
+
+class SingleTile:
+    """Blocks of one tile; a subclass has `shape`, `tile`, `in_memory` and `read`."""
+
+    def indices(self) -> Iterator[Index]:
+        return iter([(0, 0, 0, 0)])
+
+    def weight(self, index: Index) -> int:
+        return 1

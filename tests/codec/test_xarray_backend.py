@@ -25,9 +25,9 @@ import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
-from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.errors import FhashWarning, InputError, UnsupportedFileError
 from fhash_formats.readers.registry import open_series
-from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 
 SHAPE = (5, 4, 12, 10)
 
@@ -512,6 +512,16 @@ def packed_part(number: int, **encoding: Any) -> xr.Dataset:
     packing = {"dtype": "int16", "scale_factor": step, "add_offset": middle, "_FillValue": -32767}
     data["t2m"].encoding = {**packing, **encoding}
     return data
+
+
+def test_variables_that_no_dataset_holds_are_refused(tmp_path: Path) -> None:
+    series = ArraySeries(smooth(2, 4, 5, 6))
+    scalar = SourceVariable(name="time", dimensions=(), values=np.array(3.0))
+    axes = {"time": "t", "z": "z", "y": "y", "x": "x"}
+    series.metadata = SourceMetadata(dimensions=axes, variables=(scalar,))
+    fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(max_error=0.01))
+    with pytest.raises(UnsupportedFileError, match="'time' already exists as a scalar variable"):
+        xr.open_dataset(tmp_path / "a.fhz", engine="fhash")
 
 
 def test_a_missing_value_that_is_a_text_is_no_packing(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from folders import Listing, listing
 from reporting import LONG
 
 HERE = Path(__file__).parent
@@ -121,8 +122,6 @@ class Server:
         self.process.stdout.close()
 
 
-Listing = dict[str, bytes | None]
-
 COMPACT = ("--effort", "1", "--no-timings", "-q")
 BOUND = ("--max-error", "0.05", "--tile", "2x9x10x12", *COMPACT)
 PAPER = ("--profile", "paper", "--epochs", "2", "--width", "4", "--no-timings", "-q")
@@ -136,14 +135,6 @@ def values(seed: int = 0) -> np.ndarray:
     t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
     blob = 1 + 9 * np.exp(-((z - 4) ** 2 + (y - 5) ** 2 + (x - 3 - 2 * t) ** 2) / 6)
     return (blob + 0.01 * np.random.default_rng(seed).standard_normal(SHAPE)).astype(np.float32)
-
-
-def listing(folder: Path) -> Listing:
-    """Return everything below a folder by path, with its bytes; None for a folder."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 def moments(count: int, most: int = 4) -> list[int]:

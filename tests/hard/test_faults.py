@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faulty import COMMANDS, GROWING, PROFILES, Bench, Listing, moments
+from faulty import COMMANDS, GROWING, PROFILES, Bench, moments
+from folders import Listing
 from injections import BOUND, frame
 from reporting import LONG, record
 

@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from faulty import COMMANDS, COMPACT, PROFILES, Bench, Server, listing, moments, values
+from faulty import COMMANDS, COMPACT, PROFILES, Bench, Server, moments, values
+from folders import listing
 from reporting import LONG, record
 from sources import FORMS
 

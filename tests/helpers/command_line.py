@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from folders import listing
 
 SHAPE = (3, 6, 7, 8)
 SMALL = ["--effort", "1", "--quiet"]
@@ -71,14 +72,6 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert result.exit_code == 0, result.stderr
     return path
-
-
-def listing(folder: Path) -> dict[str, bytes | None]:
-    """Paths below a folder with their bytes, None for a folder; shows the traces of a command."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planned import plan_task, waves
+from planned import SingleTile, plan_task, waves
 from reference.head import Head, clip, inputs_of, moved
 
 import fhash_codec
@@ -477,17 +477,11 @@ def test_lines_are_added_one_after_the_other(
     np.testing.assert_allclose(gram, lines @ lines.T, rtol=0, atol=bound)
 
 
-class Hats:
+class Hats(SingleTile):
     """One tile, linear between every second vertex of y and x: all details of 5/3 are 0."""
 
     shape = tile = (1, 1, 65, 65)
     in_memory = False
-
-    def indices(self) -> Iterator[Index]:
-        return iter([(0, 0, 0, 0)])
-
-    def weight(self, index: Index) -> int:
-        return 1
 
     def read(self, index: Index) -> Tile:
         values = np.zeros((65, 65))
@@ -509,17 +503,11 @@ def test_hats_are_transformed_by_5_3() -> None:
     assert refit(sample, chosen) is chosen
 
 
-class FewShapes:
+class FewShapes(SingleTile):
     """One tile in which each line along x is a sum of two patterns that no wavelet has."""
 
     shape = tile = (1, 8, 24, 40)
     in_memory = True
-
-    def indices(self) -> Iterator[Index]:
-        return iter([(0, 0, 0, 0)])
-
-    def weight(self, index: Index) -> int:
-        return 1
 
     def read(self, index: Index) -> Tile:
         rng = np.random.default_rng(1)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planned import plan_task
+from planned import SingleTile, plan_task
 
 import fhash_codec
 from fhash_codec import EncodeConfig
@@ -295,17 +295,11 @@ def test_a_file_has_the_plateau_as_its_centre(tmp_path, effort: int) -> None:
 GOAL = Goal(psnr=40.0, data_range=8.0)
 
 
-class Patterns:
+class Patterns(SingleTile):
     """One tile in which each line along x is a sum of a few patterns, with a little noise."""
 
     shape = tile = (1, 8, 24, 48)
     in_memory = True
-
-    def indices(self) -> Iterator[Index]:
-        return iter([(0, 0, 0, 0)])
-
-    def weight(self, index: Index) -> int:
-        return 1
 
     def read(self, index: Index) -> Tile:
         rng = np.random.default_rng(0)

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from folders import listing, store
 
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
 from fhash_formats.support import files as interrupts
@@ -38,21 +39,6 @@ from fhash_formats.support.files import (
 )
 
 
-def tree(folder: Path) -> dict[str, bytes | None]:
-    """Every path below a folder with its bytes."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
-
-
-def store(path: Path, text: str = "old") -> Path:
-    (path / "c").mkdir(parents=True)
-    (path / "zarr.json").write_text("{}")
-    (path / "c" / "0").write_text(text)
-    return path
-
-
 def no_links(*_: Any) -> None:
     raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -71,7 +57,7 @@ def test_a_file_takes_its_name(
         assert temporary.parent == tmp_path
         temporary.write_text("new")
         assert path.exists() is (old is not None)
-    assert tree(tmp_path) == {"out.npy": b"new"}
+    assert listing(tmp_path) == {"out.npy": b"new"}
 
 
 def test_a_directory_takes_its_name(tmp_path: Path) -> None:
@@ -79,7 +65,7 @@ def test_a_directory_takes_its_name(tmp_path: Path) -> None:
     with replacing(path, force=True, directory=True) as temporary:
         store(temporary, "new")
         assert (path / "c" / "0").read_text() == "old"
-    assert tree(tmp_path) == {
+    assert listing(tmp_path) == {
         "out.zarr": None,
         "out.zarr/c": None,
         "out.zarr/c/0": b"new",
@@ -108,7 +94,7 @@ def test_a_failure_changes_nothing(
     path = tmp_path / "out.zarr"
     if old:
         store(path) if directory else path.write_text("old")
-    before = tree(tmp_path)
+    before = listing(tmp_path)
     expected = OutputError if type(error) is OSError else type(error)
 
     def fail() -> None:
@@ -119,7 +105,7 @@ def test_a_failure_changes_nothing(
 
     with pytest.raises(expected):
         fail()
-    assert tree(tmp_path) == before
+    assert listing(tmp_path) == before
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
@@ -141,7 +127,7 @@ def test_a_disk_that_fills_up_at_the_end_changes_nothing(
         save()
     assert "\n" not in str(caught.value)
     # os.replace also undoes; the old file is then still under its own name
-    assert tree(tmp_path)["out.npy"] == b"old"
+    assert listing(tmp_path)["out.npy"] == b"old"
     assert not list(tmp_path.glob(".*.partial"))
 
 
@@ -160,7 +146,7 @@ def test_a_file_that_appears_meanwhile_is_kept(
 
     with pytest.raises(OutputExistsError, match=r"appeared meanwhile.*--force"):
         save()
-    assert tree(tmp_path) == {"out.npy": b"somebody else's"}
+    assert listing(tmp_path) == {"out.npy": b"somebody else's"}
 
 
 @pytest.mark.parametrize("directory", [True, False])
@@ -177,7 +163,7 @@ def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(
 
     with pytest.raises(OutputError, match="is a directory"):
         save()
-    assert tree(tmp_path) == {"out.zarr": None, "out.zarr/notes.txt": b"somebody else's"}
+    assert listing(tmp_path) == {"out.zarr": None, "out.zarr/notes.txt": b"somebody else's"}
 
 
 @pytest.mark.parametrize("links", [True, False])
@@ -205,10 +191,10 @@ def test_of_several_outputs_all_or_none_take_their_names(
     monkeypatch.setattr(os, "replace", third_fails)
     with pytest.raises(OutputError, match="cannot be written: Input/output error"):
         save()
-    assert tree(tmp_path) == {"a": b"old a"}
+    assert listing(tmp_path) == {"a": b"old a"}
     monkeypatch.setattr(os, "replace", replace)
     save()
-    assert tree(tmp_path) == {"a": b"new", "b": b"new", "c": b"new"}
+    assert listing(tmp_path) == {"a": b"new", "b": b"new", "c": b"new"}
 
 
 @pytest.mark.parametrize("directory", [True, False])
@@ -281,7 +267,7 @@ def test_an_output_that_exists_stops_all_before_anything_is_written(tmp_path: Pa
         replacing_all([tmp_path / "a", tmp_path / "b"], force=False),
     ):
         pytest.fail("the block must not run")
-    assert tree(tmp_path) == {"b": b"old"}
+    assert listing(tmp_path) == {"b": b"old"}
 
 
 def test_a_link_is_followed(tmp_path: Path) -> None:

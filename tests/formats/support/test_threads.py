@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folders import store
 from forked import ended_well, forked, needs_fork
 from hypothesis import given
 from hypothesis import strategies as st
@@ -321,13 +322,6 @@ def test_a_busy_pool_holds_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         done.set()
         occupied.join()
-
-
-def store(path: Path, text: str = "old") -> Path:
-    (path / "c").mkdir(parents=True)
-    (path / "zarr.json").write_text("{}")
-    (path / "c" / "0").write_text(text)
-    return path
 
 
 def file(path: Path) -> Path:
