@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import TracebackType
@@ -20,7 +20,7 @@ from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.tiles import Coding, Outcome, Tile, Worked, code, code_tiles, padded_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_quality, full_header, write_coordinates
-from fhash_codec.measure.errors import ErrorSums, Values, error_sums, psnr
+from fhash_codec.measure.errors import Errors, ErrorSums, Values, error_sums
 from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container import (
     SOURCE,
@@ -104,30 +104,14 @@ class Figures:
             writer: of the container; it gets an array for the figures of many steps.
             data_range: width of the header's value range.
         """
-        count = sum(step.number for step in self.steps)
-        squares = math.fsum(step.squares for step in self.steps)
-        root = math.sqrt(squares / count)
-        whole = {
-            "psnr": psnr(data_range * self.scale, root),
-            "rmse": self._figure(root),
-            "max_abs_error": self._figure(max(step.largest for step in self.steps)),
-        }
-        per_step = [
-            {
-                "rmse": self._figure(math.sqrt(step.squares / step.number)),
-                "max_abs_error": self._figure(step.largest),
-            }
-            for step in self.steps
-        ]
+        errors = Errors(data_range, scale=self.scale)
+        for number, step in enumerate(self.steps):
+            errors.take(number, step)
+        whole = {name: getattr(errors, name) for name in ("psnr", "rmse", "max_abs_error")}
         everywhere = {f"{name}_domain": value for name, value in whole.items()}
+        per_step = [asdict(step) for step in errors.steps]
         quality: dict[str, Any] = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
         return brief_quality(writer, quality, data_range, len(self.steps))
-
-    def _figure(self, scaled: float) -> float | None:
-        """A scaled error in data units; None where it is not finite."""
-        with np.errstate(over="ignore"):
-            figure = float(np.float64(scaled) / self.scale)
-        return figure if math.isfinite(figure) else None
 
 
 DECODED_AGAIN = 8

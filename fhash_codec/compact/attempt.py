@@ -209,16 +209,14 @@ class Tiling:
         return f"tried {told}{f', on parts of {parts} vertices' if parts else ''}"
 
 
-def region_vertices(shape: Shape, tile: Shape, region: int = REGION) -> float:
+def region_vertices(shape: Shape, tile: Shape) -> float:
     """Return the vertices that a reader decodes for a region of one step, in the mean.
 
-    shape: of the box over all steps.
-    tile: of a tile.
-    region: vertices of the region along each axis in space.
+    shape: of the box over all steps. tile: of a tile.
     """
     mean = 1.0
     for axis, (length, n) in enumerate(zip(shape, tile, strict=True)):
-        span = 1 if axis == 0 else min(region, length)
+        span = 1 if axis == 0 else min(REGION, length)
         mean *= n if n >= length else n + span - 1
     return mean
 

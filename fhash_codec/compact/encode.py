@@ -24,6 +24,7 @@ from fhash_codec.compact.goal import (
     goal_of,
     integer_goal,
     promise,
+    search,
 )
 from fhash_codec.compact.head import HEAD_BYTES
 from fhash_codec.compact.head_training import BATCH_VOXELS
@@ -204,22 +205,21 @@ def code_to_size(table: CodedTable, window: ByteWindow, code_all: CodeAll) -> Co
         although its values are exact. Where no step fits, the best table below the window is, or
         the smallest.
     """
-    plan, best = table.plan, table
+    plan = table.plan
     if plan.goal.data_range <= 0:
         return table
     data_range = max(plan.goal.data_range, 1e-300)
     target = max((window.low + window.high) / 2, 1.0)
-    search = SizeSearch(data_range, (MIN_STEP_SHARE, MAX_STEP_SHARE), target, drifts=False)
-    for _ in range(SIZE_PASSES):
+    steps = SizeSearch(data_range, (MIN_STEP_SHARE, MAX_STEP_SHARE), target, drifts=False)
+
+    def following(table: CodedTable, _number: int) -> CodingPlan | None:
         settings, size = table.plan.settings, table.outcome.size
         if window.holds(table) or (size < window.low and is_exact(table)):
-            break
-        log_step = search.after(math.log(settings.step), size, too_fine=size > window.high)
-        settings = with_step(settings, math.exp(log_step), plan.goal)
-        table = code_all(replace(plan, settings=settings))
-        if window.prefers(table, best):
-            best = table
-    return best
+            return None
+        log_step = steps.after(math.log(settings.step), size, too_fine=size > window.high)
+        return replace(plan, settings=with_step(settings, math.exp(log_step), plan.goal))
+
+    return search(table, following, code_all, SIZE_PASSES, window.prefers)
 
 
 PASSES = 4
@@ -443,28 +443,31 @@ def _search_psnr(
     progress: Progress,
 ) -> CodedTable:
     """Code all tiles with step after step; the best table of these and of the one given."""
-    search = psnr_search(coding_plan.settings)
-    for attempt in range(PASSES):
-        note = f"pass {attempt + 1}" if attempt else ""
-        table = _code_all(coding_plan, workers, progress, note)
-        psnr = aim.psnr_of(table.outcome)
-        if best is None or aim.prefers(table.outcome, best.outcome):
-            best = table
+    secants = psnr_search(coding_plan.settings)
+
+    def following(table: CodedTable, attempt: int) -> tuple[CodingPlan, str] | None:
+        plan, psnr = table.plan, aim.psnr_of(table.outcome)
         if aim.is_met(psnr, attempt):
-            break
-        require_reach(coding_plan.goal, coding_plan.settings, table.outcome)
-        settings = coding_plan.settings
+            return None
+        require_reach(plan.goal, plan.settings, table.outcome)
         unlike = psnr < aim.min_psnr - UNLIKE and attempt == 0
         if unlike and not _head_holds(table, aim, workers):
-            break
-        search.add(settings.step, psnr)
-        step = search.step_for(aim.next_target(psnr, attempt))
-        coding_plan = replace(coding_plan, settings=replace(settings, step=step))
-        if coding_plan.sample is not None and step < settings.step / REFIT_RATIO:
-            refitted = refit(coding_plan.sample, coding_plan.settings)
-            coding_plan = replace(coding_plan, settings=refitted)
-    assert best is not None
-    return best
+            return None
+        before = plan.settings.step
+        step = secants.after(before, psnr, aim.next_target(psnr, attempt))
+        plan = replace(plan, settings=replace(plan.settings, step=step))
+        if plan.sample is not None and step < before / REFIT_RATIO:
+            plan = replace(plan, settings=refit(plan.sample, plan.settings))
+        return plan, f"pass {attempt + 2}"
+
+    def run(task: tuple[CodingPlan, str]) -> CodedTable:
+        return _code_all(task[0], workers, progress, task[1])
+
+    def prefers(table: CodedTable, other: CodedTable) -> bool:
+        return aim.prefers(table.outcome, other.outcome)
+
+    found = search(run((coding_plan, "")), following, run, PASSES - 1, prefers)
+    return found if best is None or prefers(found, best) else best
 
 
 def _head_holds(table: CodedTable, aim: _Aim, workers: ThreadPoolExecutor) -> bool:

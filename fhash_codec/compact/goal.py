@@ -1,10 +1,9 @@
 """Goals of an encode, the search for the coarsest setting that keeps one, and what is promised.
 
-A PSNR is searched by secants of the log step (`PsnrSearch`), a number of bytes by secants within a
-bracket (`SizeSearch`): on a sample in step.py, on all tiles in encode.py. Under a bound the
-cheapest of a few steps is looked for (`cheapest`). The error of trained tables has a search of its
-own in paper/table_step.py, which shares `Bracket`. None of them knows a codec: callers do the
-trials.
+One loop goes from trial to trial (`search`). Where it goes, a PSNR says by secants of the log step
+(`PsnrSearch`), a number of bytes by secants within a bracket (`SizeSearch`): on a sample in
+step.py, on all tiles in encode.py; the error of trained tables likewise in paper/table_step.py.
+Under a bound the cheapest of a few steps is looked for (`cheapest`). None of them knows a codec.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
 
 Result = TypeVar("Result")
+State = TypeVar("State")
 
 SLOPE = 5.5
 """dB by which the PSNR falls when the step grows by a factor of e: the first assumption."""
@@ -38,37 +38,23 @@ MIN_LOSS = 0.02
 """Smallest difference in dB of two outcomes from which their exchange rate is taken."""
 
 
-def secant(points: Sequence[tuple[float, float]], target: float, slope: float) -> float:
-    """Return the log step at which a PSNR should be reached, by the last two points.
-
-    points: pairs (log step, PSNR in dB) that were tried, at least one.
-    target: the PSNR in dB.
-    slope: dB by which the PSNR falls per unit of the log step, for a single point or two points
-        at one place.
-    """
-    log_step, psnr = points[-1]
-    if len(points) > 1 and abs(points[-2][0] - log_step) > MIN_APART:
-        slope = min(max(-(psnr - points[-2][1]) / (log_step - points[-2][0]), MIN_SLOPE), MAX_SLOPE)
-    return log_step + (psnr - target) / slope
-
-
 class PsnrSearch:
     """Search for the quantiser step at which a PSNR is reached, by secants of the log step."""
 
     def __init__(self, min_step: float, max_step: float) -> None:
         """Begin a search between two steps."""
-        self._min_step, self._max_step = min_step, max_step
-        self._points: list[tuple[float, float]] = []
+        self._ends = math.log(min_step), math.log(max_step)
+        self._before: tuple[float, float] | None = None
 
-    def add(self, step: float, psnr: float) -> None:
-        """Take up a trial: a step and the PSNR in dB that it gave."""
-        self._points.append((math.log(step), psnr))
-
-    def step_for(self, psnr: float) -> float:
-        """Return the step at which a PSNR should be reached; needs at least one trial."""
-        log_step = secant(self._points, psnr, SLOPE)
-        low, high = math.log(self._min_step), math.log(self._max_step)
-        return math.exp(min(max(log_step, low), high))
+    def after(self, step: float, psnr: float, target: float) -> float:
+        """Take up a trial, the PSNR in dB of a step; return the step that should reach `target`."""
+        log_step, slope = math.log(step), SLOPE
+        if self._before is not None and abs(self._before[0] - log_step) > MIN_APART:
+            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
+            slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
+        self._before = log_step, psnr
+        low, high = self._ends
+        return math.exp(min(max(log_step + (psnr - target) / slope, low), high))
 
 
 def step_after_gain(step: float, gain: float) -> float:
@@ -76,9 +62,30 @@ def step_after_gain(step: float, gain: float) -> float:
     return step * math.exp(gain / SLOPE)
 
 
-def arithmetic_mean(low: float, high: float) -> float:
-    """Return the middle of an interval of logarithms."""
-    return (low + high) / 2
+def search(
+    result: Result,
+    following: Callable[[Result, int], State | None],
+    run: Callable[[State], Result],
+    tries: int,
+    prefers: Callable[[Result, Result], bool] = lambda result, best: True,
+) -> Result:
+    """Return the best result of trials, each of which says what is tried next.
+
+    result: of the first trial.
+    following: what is tried after a result, and after the number of trials before it; None to end.
+    run: does a trial.
+    tries: trials after the first one, at most.
+    prefers: whether a result is better than the best one so far; by default the last one is.
+    """
+    best = result
+    for number in range(tries):
+        state = following(result, number)
+        if state is None:
+            break
+        result = run(state)
+        if prefers(result, best):
+            best = result
+    return best
 
 
 def geometric_mean(low: float, high: float) -> float:
@@ -92,7 +99,7 @@ class Bracket:
 
     low: float
     high: float
-    middle: Callable[[float, float], float]
+    middle: Callable[[float, float], float] = lambda low, high: (low + high) / 2
     """Mean of the two ends that a bisection goes on with."""
 
     def narrowed(self, tried: float, *, too_low: bool) -> Bracket:
@@ -127,7 +134,7 @@ class SizeSearch:
             4 times the usual one.
         """
         low, high = (math.log(data_range * share) for share in shares)
-        self._bracket = Bracket(low, high, middle=arithmetic_mean)
+        self._bracket = Bracket(low, high)
         self._target, self._drifts = target, drifts
         self._fall = USUAL_FALL
         self._before: tuple[float, int] | None = None

@@ -44,26 +44,17 @@ EFFORTS = {
         budget=Budget(updates=1300, samples=400_000, rate=3e-2),
         perceptron=Budget(updates=5200, samples=800_000),
     ),
-    6: Effort(
-        candidates=4,
-        budget=Budget(updates=5000, samples=400_000),
-        perceptron=Budget(updates=10000, samples=800_000),
-    ),
-    7: Effort(
-        candidates=4,
-        budget=Budget(updates=8000, samples=400_000),
-        perceptron=Budget(updates=16000, samples=800_000),
-    ),
-    8: Effort(
-        candidates=5,
-        budget=Budget(updates=12000, samples=400_000),
-        perceptron=Budget(updates=24000, samples=800_000),
-    ),
-    9: Effort(
-        candidates=5,
-        budget=Budget(updates=20000, samples=400_000),
-        perceptron=Budget(updates=40000, samples=800_000),
-    ),
+    **{
+        effort: Effort(
+            candidates=candidates,
+            budget=Budget(updates=updates, samples=400_000),
+            perceptron=Budget(updates=2 * updates, samples=800_000),
+        )
+        for effort, candidates, updates in (
+            *((6, 4, 5000), (7, 4, 8000)),
+            *((8, 5, 12000), (9, 5, 20000)),
+        )
+    },
 }
 """Effort spent on heads by the effort of the encoder; below 5 there is no head."""
 TRIAL_HEAD = Shape((8, 8), cross=True)

@@ -40,7 +40,7 @@ from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import estimated_size, estimated_step, usual_transform
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
-from fhash_codec.measure.value_range import Mean, ValueRange
+from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import Parts, Progress, stage
 from fhash_formats.transform.coder import MAX_LABELS, MaskLevels
 from fhash_formats.transform.encoding import OFFSETS
@@ -142,13 +142,6 @@ def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     return values
 
 
-def _filled(values: npt.NDArray[Any], counted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-    """Return values with their mean where none counts; some must count."""
-    mean = Mean()
-    mean.add(values[counted])
-    return np.where(counted, values, mean.value())
-
-
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     """Whether any tile of a sample has few enough different values, or regions of equal ones."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
@@ -181,14 +174,16 @@ def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Lab
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     outcome = sample.run(settings, replace(coding, error=0.0))
     entropy = sum(
-        weight * _entropy(values if counted is None else values[counted])
-        for weight, (values, counted) in zip(sample.weights, sample.tiles, strict=True)
+        weight * _entropy(tile.counted_values)
+        for weight, tile in zip(sample.weights, sample.tiles, strict=True)
     )
     rank = rank_share(
         [
-            values if counted is None else _filled(values, counted)
-            for values, counted in sample.tiles
-            if counted is None or counted.any()
+            tile.values
+            if tile.counted is None
+            else np.where(tile.counted, tile.values, mean_of(tile.counted_values))
+            for tile in sample.tiles
+            if not tile.is_empty
         ]
     )
     clearly = task.goal.lossless and CLEARLY * outcome.size <= sample.run(settings, exact).size

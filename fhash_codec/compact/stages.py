@@ -37,7 +37,7 @@ from fhash_codec.compact.transform import (
     usual_transform,
 )
 from fhash_codec.features.features import Feature, Interval, Isosurface, Segmentation
-from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import skip, stage, tell
 from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
 from fhash_formats.transform.encoding import OFFSETS
@@ -57,14 +57,10 @@ MAX_CENTER = 3e38
 
 def mean_center(sample: Sample, value_range: ValueRange) -> float:
     """Return the mean of a sample as the centre, in data units; without values the middle."""
-    with np.errstate(all="ignore"):
-        means = [
-            float(np.mean(values if counted is None else values[counted], dtype=np.float64))
-            for values, counted in sample.tiles
-        ]
-    mean = float(np.average(means, weights=sample.weights))
-    middle = value_range.low + (value_range.high - value_range.low) / 2
-    return _rounded_center(mean if math.isfinite(mean) else middle)
+    if not sample.counted:
+        return _rounded_center(value_range.low + (value_range.high - value_range.low) / 2)
+    means = [mean_of(tile.counted_values) for tile in sample.tiles]
+    return _rounded_center(float(np.average(means, weights=sample.weights)))
 
 
 def plateau_center(sample: Sample, value_range: ValueRange) -> float | None:
@@ -75,8 +71,8 @@ def plateau_center(sample: Sample, value_range: ValueRange) -> float | None:
     low, high = value_range.low, value_range.high
     if not (low < high and math.isfinite(high - low)):
         return None
-    kept = [values.reshape(-1) if mask is None else values[mask] for values, mask in sample.tiles]
-    numbers = [values[np.isfinite(values)].astype(np.float64) for values in kept]
+    counted = (tile.counted_values for tile in sample.tiles)
+    numbers = [values[np.isfinite(values)].astype(np.float64) for values in counted]
     edges = np.linspace(low, high, BINS + 1)
     counts = np.zeros(BINS)
     for values, weight in zip(numbers, sample.weights, strict=True):

@@ -17,6 +17,7 @@ from fhash_codec.compact.goal import (
     SizeSearch,
     cheapest,
     exchange,
+    search,
     step_after_gain,
 )
 from fhash_codec.compact.sample import Sample
@@ -243,21 +244,24 @@ def _step_for_psnr(
     """Search for the step of the PSNR of a goal; the trial nearest to it."""
     assert goal.psnr is not None
     target = goal.psnr + AIM
-    search = psnr_search(settings)
-    best: tuple[float, TileSettings, Outcome] | None = None
-    for trial in range(tries):
-        if trial:
-            settings = replace(settings, step=search.step_for(target))
-        outcome = sample.run(settings, coding)
-        tried.append(outcome)
-        reached = outcome.psnr(goal.data_range)
-        if best is None or abs(reached - target) < abs(best[0] - target):
-            best = (reached, settings, outcome)
+    secants = psnr_search(settings)
+
+    def run(settings: TileSettings) -> tuple[TileSettings, Outcome]:
+        tried.append(sample.run(settings, coding))
+        return settings, tried[-1]
+
+    def following(trial: tuple[TileSettings, Outcome], _number: int) -> TileSettings | None:
+        reached = trial[1].psnr(goal.data_range)
         if abs(reached - target) < close or math.isinf(reached):
-            break
-        search.add(settings.step, reached)
-    assert best is not None
-    return best[1], best[2]
+            return None
+        return replace(trial[0], step=secants.after(trial[0].step, reached, target))
+
+    def missed(trial: tuple[TileSettings, Outcome]) -> float:
+        return abs(trial[1].psnr(goal.data_range) - target)
+
+    return search(
+        run(settings), following, run, tries - 1, lambda new, best: missed(new) < missed(best)
+    )
 
 
 def _step_for_bound(
@@ -303,13 +307,16 @@ def _step_for_size(
     """Search for the step at which the tiles take a number of bytes."""
     if data_range == 0:
         return settings, sample.run(settings, coding)
-    search = SizeSearch(max(data_range, 1e-300), (2.0**-24, 4.0), size, drifts=True)
-    log_step = math.log(settings.step)
-    for _ in range(2 * tries + 2):
-        log_step = search.inside(log_step)
-        settings = replace(settings, step=math.exp(log_step))
-        outcome = sample.run(settings, coding)
+    steps = SizeSearch(max(data_range, 1e-300), (2.0**-24, 4.0), size, drifts=True)
+
+    def run(log_step: float) -> tuple[float, TileSettings, Outcome]:
+        stepped = replace(settings, step=math.exp(log_step))
+        return log_step, stepped, sample.run(stepped, coding)
+
+    def following(trial: tuple[float, TileSettings, Outcome], _number: int) -> float | None:
+        log_step, _, outcome = trial
         if abs(outcome.size - size) < 0.005 * size:
-            break
-        log_step = search.after(log_step, outcome.size, too_fine=outcome.size > size)
-    return settings, outcome
+            return None
+        return steps.after(log_step, outcome.size, too_fine=outcome.size > size)
+
+    return search(run(steps.inside(math.log(settings.step))), following, run, 2 * tries + 1)[1:]

@@ -54,6 +54,11 @@ class Tile(NamedTuple):
         return int(np.count_nonzero(self.counted))
 
     @property
+    def counted_values(self) -> Values:
+        """Values that count, one-dimensional."""
+        return self.values.reshape(-1) if self.counted is None else self.values[self.counted]
+
+    @property
     def is_empty(self) -> bool:
         """Whether no vertex counts."""
         return self.counted is not None and not self.counted.any()

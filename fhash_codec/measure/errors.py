@@ -56,16 +56,6 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
     return count, low + 0.0, high + 0.0, total
 
 
-def squared_errors(
-    original: Values, decoded: Values, mask: Mask | None, scale: float
-) -> tuple[int, float, float]:
-    """Number, sum of squares and largest magnitude of (original - decoded) * scale, in float64.
-
-    Parameters and results are those of `error_sums` without a bulk.
-    """
-    return error_sums(original, decoded, mask, scale)[:3]
-
-
 def error_sums(
     original: Values,
     decoded: Values,
@@ -281,15 +271,20 @@ class Errors:
         steps: a StepQuality per frame.
     """
 
-    def __init__(self, data_range: float, bulk: ValueRange | None = None) -> None:
-        """Begin without frames; raises InputError for a range below 0 or NaN."""
+    def __init__(
+        self, data_range: float, bulk: ValueRange | None = None, scale: float | None = None
+    ) -> None:
+        """Begin without frames; raises InputError for a range below 0 or NaN.
+
+        scale: power of two by which differences are multiplied, if not that of the range.
+        """
         if not data_range >= 0:
             raise InputError(f"data range is {data_range}; 0 or more is needed")
         self.data_range = data_range
         self.bulk = bulk
         self.count = 0
         self.steps: list[StepQuality] = []
-        self._scale = power_of_two(min(data_range, sys.float_info.max))
+        self._scale = scale or power_of_two(min(data_range, sys.float_info.max))
         self._squares = 0.0
         self._largest = 0.0
         self._bulk_count = 0

@@ -87,6 +87,13 @@ class Mean:
         return exact_number(round(mean)) if self._whole else float(mean)
 
 
+def mean_of(values: npt.NDArray[Any]) -> float:
+    """The `Mean` of the finite values of an array; there must be at least one."""
+    mean = Mean()
+    mean.add(values)
+    return mean.value()
+
+
 @dataclass(frozen=True)
 class ValueRange:
     """The range of a series: finite numbers `low` <= `high` in data units.

@@ -199,11 +199,6 @@ class RankedBits:
         """Number of ones."""
         return int(self.blocks[-1])
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the bitmap and its counts."""
-        return self.words.nbytes + self.blocks.nbytes + self.within.nbytes
-
     def lookup(self, positions: Integers) -> Integers:
         """Return the place of each position among the ones, `count` where its bit is 0.
 
@@ -254,24 +249,14 @@ class SparseFrame:
         """Return a frame of the embeddings (held vertices, E) of a mask (z, y, x)."""
         z, y, x = mask.shape
         rows = np.packbits(mask, axis=2, bitorder="little")
-        return cls._with((z, y, x), RankedBits.of_octets(rows.reshape(-1)), held)
-
-    @classmethod
-    def _with(
-        cls, shape: tuple[int, int, int], bits: RankedBits, held: npt.NDArray[Any]
-    ) -> SparseFrame:
         nothing = np.zeros((1, held.shape[1]), held.dtype)
-        return cls(shape, bits, np.concatenate([held, nothing]))
+        bits = RankedBits.of_octets(rows.reshape(-1))
+        return cls((z, y, x), bits, np.concatenate([held, nothing]))
 
     @property
     def row(self) -> int:
         """Bits of a row along x; vertex (z, y, x) has bit (z * shape[1] + y) * row + x."""
         return row_bits(self.shape[2])
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes in memory."""
-        return self.bits.nbytes + self.values.nbytes
 
     def take(self, z: Integers, y: Integers, x: Integers) -> npt.NDArray[Any]:
         """Return the embeddings (..., E) of vertices, whose indices broadcast to (...)."""
@@ -299,19 +284,6 @@ class SparseFrame:
 def row_bits(vertices: int) -> int:
     """Return the bits of a row of vertices along x, filled up to whole bytes."""
     return -(-vertices // 8) * 8
-
-
-def between(before: SparseFrame, after: SparseFrame, after_weight: np.float32) -> SparseFrame:
-    """Return the frame between two frames of a level, linear in time, float32.
-
-    It holds the vertices that either of them holds. Each embedding is that of dense frames, bit for
-    bit: before * (1 - after_weight) + after * after_weight.
-    """
-    bits = RankedBits.of_words(before.bits.words | after.bits.words)
-    positions = bits.positions()
-    mixed: Floats = before.values[before.bits.lookup(positions)] * np.float32(1 - after_weight)
-    mixed += after.values[after.bits.lookup(positions)] * after_weight
-    return SparseFrame._with(before.shape, bits, mixed)
 
 
 Layer = tuple[Floats, Floats]

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import count, product
 from math import prod
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.goal import Bracket, geometric_mean
+from fhash_codec.compact.goal import Bracket, geometric_mean, search
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, Tile, code
 from fhash_codec.compact.transform import Gram, Result, choose_transform, usual_transform
 from fhash_codec.features.bricks import Coreset
@@ -502,21 +502,27 @@ class _Coding:
             tiles: the tiles on which the error counts.
             width: dB above the least allowed PSNR at which the search ends.
         """
-        search = StepSearch(self._window(width), step, self._min_step)
+        steps = StepSearch(self._window(width), step, self._min_step)
         trials, stage = TRIALS, "trying tables"
         if tiles is self._all:
             trials, stage = TRIALS_OF_ALL, "coding tables"
-        best: CodedTables | None = None
-        for trial in range(trials + MORE_TRIALS):
-            step = search.step
-            self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
-            coded = self._coded([self._tiled(level, step) for level in self._levels], tiles)
-            done = search.add(coded.error)
-            if coded.error <= self._allowed and (best is None or coded.error > best.error):
-                best = coded
-            if done or (best is not None and trial + 1 >= trials):
-                break
-        return best or coded
+        numbers = count()
+
+        def run(step: float) -> CodedTables:
+            self._progress(stage, min(next(numbers), trials), trials, f"step {step:.3g}")
+            return self._coded([self._tiled(level, step) for level in self._levels], tiles)
+
+        def following(coded: CodedTables, number: int) -> float | None:
+            done = steps.add(coded.error)
+            enough = steps.best is not None and number + 1 >= trials
+            return None if done or enough else steps.step
+
+        def prefers(coded: CodedTables, best: CodedTables) -> bool:
+            if coded.error > self._allowed:
+                return best.error > self._allowed
+            return best.error > self._allowed or coded.error > best.error
+
+        return search(run(steps.step), following, run, trials + MORE_TRIALS - 1, prefers)
 
     def _with_larger_step(self, coded: CodedTables, level: int) -> CodedTables:
         """Return coded tables whose error is nearer to the allowed one, by the step of one level.
@@ -524,22 +530,27 @@ class _Coding:
         The error of small tables jumps from step to step of all levels.
         """
         window = self._window(self._width)
-        search = StepSearch(window, coded.tables[level].step, self._min_step)
-        done = search.add(coded.error)
-        if done or not window.has_room(coded.error):
-            return coded
-        best = coded
-        for trial in range(TRIALS_OF_LEVEL):
-            self._progress("refining tables", trial, TRIALS_OF_LEVEL, f"level {level + 1}")
+        steps = StepSearch(window, coded.tables[level].step, self._min_step)
+
+        def run(trial: tuple[int, float]) -> CodedTables:
+            number, step = trial
+            self._progress("refining tables", number, TRIALS_OF_LEVEL, f"level {level + 1}")
             tables = list(coded.tables)
-            tables[level] = self._tiled(level, search.step)
-            refined = self._coded(tables, self._all)
-            done = search.add(refined.error)
-            if best.error < refined.error <= window.allowed:
-                best = refined
-            if done:
-                break
-        return best
+            tables[level] = self._tiled(level, step)
+            return self._coded(tables, self._all)
+
+        def following(refined: CodedTables, number: int) -> tuple[int, float] | None:
+            done = steps.add(refined.error)
+            room = number > 0 or window.has_room(refined.error)
+            return None if done or not room else (number, steps.step)
+
+        return search(
+            coded,
+            following,
+            run,
+            TRIALS_OF_LEVEL,
+            lambda refined, best: best.error < refined.error <= window.allowed,
+        )
 
     @property
     def _levels(self) -> range:

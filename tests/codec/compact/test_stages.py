@@ -23,10 +23,10 @@ from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling
 from fhash_codec.compact.goal import (
     DECIDED,
     FAR_BELOW,
+    SLOPE,
     Bracket,
     Goal,
     PsnrSearch,
-    arithmetic_mean,
     cheapest,
     decided_by_bulk,
     exchange,
@@ -35,7 +35,7 @@ from fhash_codec.compact.goal import (
     missed_promise,
     promise,
     remarks,
-    secant,
+    search,
 )
 from fhash_codec.compact.head import EFFORTS, Budget, Effort
 from fhash_codec.compact.plan import CodingPlan, holds_beside, plan, rank_share
@@ -448,30 +448,50 @@ def test_a_stage_that_is_switched_off_is_never_entered(field: Field, tmp_path: P
     }
 
 
+def found_by(points: Sequence[tuple[float, float]], target: float) -> float:
+    """The log step that a search finds after pairs of a log step and a PSNR."""
+    steps = PsnrSearch(1e-9, 1e9)
+    for log_step, psnr in points:
+        found = steps.after(math.exp(log_step), psnr, target)
+    return math.log(found)
+
+
 def test_two_points_take_their_own_slope_within_reason() -> None:
-    assert secant([(0.0, 50.0), (1.0, 44.0)], 41.0, 5.0) == pytest.approx(1.5)
-    assert secant([(0.0, 44.1), (1.0, 44.0)], 42.0, 5.0) == pytest.approx(1.0 + 2.0 / 2.0)
-    assert secant([(0.0, 90.0), (1.0, 44.0)], 32.0, 5.0) == pytest.approx(2.0)
-    assert secant([(1.0, 44.0), (1.0, 44.0)], 42.0, 5.0) == pytest.approx(1.0 + 2.0 / 5.0)
+    assert found_by([(0.0, 50.0), (1.0, 44.0)], 41.0) == pytest.approx(1.5)
+    assert found_by([(0.0, 44.1), (1.0, 44.0)], 42.0) == pytest.approx(1.0 + 2.0 / 2.0)
+    assert found_by([(0.0, 90.0), (1.0, 44.0)], 32.0) == pytest.approx(2.0)
+    assert found_by([(1.0, 44.0), (1.0, 44.0)], 42.0) == pytest.approx(1.0 + 2.0 / SLOPE)
 
 
 def test_a_psnr_of_uniform_rounding_is_found_in_a_few_steps() -> None:
     """The PSNR of step^2 / 12 falls by 20 / ln 10 dB for each factor of e."""
-    search, step = PsnrSearch(1e-9, 1e9), 1.0
+    steps, step = PsnrSearch(1e-9, 1e9), 1.0
     for _ in range(3):
-        search.add(step, -10 * math.log10(step**2 / 12))
-        step = search.step_for(60.0)
+        step = steps.after(step, -10 * math.log10(step**2 / 12), 60.0)
     assert -10 * math.log10(step**2 / 12) == pytest.approx(60.0, abs=1e-6)
-    search.add(step, -1e9)
-    assert search.step_for(60.0) == pytest.approx(1e-9)
+    assert steps.after(step, -1e9, 60.0) == pytest.approx(1e-9)
 
 
-@pytest.mark.parametrize("mean", [arithmetic_mean, geometric_mean])
+def test_a_search_ends_where_nothing_follows_and_gives_the_best() -> None:
+    tried: list[int] = []
+
+    def run(number: int) -> int:
+        tried.append(number)
+        return number
+
+    def following(number: int, before: int) -> int | None:
+        return None if number == 5 else number + 2
+
+    assert search(1, following, run, 9) == 5
+    assert search(0, following, run, 3) == 6
+    assert search(4, following, run, 3, lambda new, best: new < best) == 4
+    assert tried == [3, 5, 2, 4, 6, 6, 8, 10]
+
+
+@pytest.mark.parametrize("options", [{}, {"middle": geometric_mean}], ids=str)
 @pytest.mark.parametrize("target", [1.5, 40.0, 99.0])
-def test_bisection_in_a_bracket_converges(
-    mean: Callable[[float, float], float], target: float
-) -> None:
-    bracket = Bracket(1.0, 100.0, middle=mean)
+def test_bisection_in_a_bracket_converges(options: dict[str, Any], target: float) -> None:
+    bracket = Bracket(1.0, 100.0, **options)
     for _ in range(60):
         number = bracket.inside(math.inf)
         bracket = bracket.narrowed(number, too_low=number < target)

@@ -40,7 +40,6 @@ from fhash_codec.paper.network import (
     NumberType,
     RankedBits,
     SparseFrame,
-    between,
     ceil_log,
     level_resolutions,
     parameter_count,
@@ -606,20 +605,6 @@ def test_more_ones_than_a_count_holds_are_refused(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(ranked, "MAX_COUNT", 99)
     with pytest.raises(InputError, match="needs 100 vertices at one time; at most 99"):
         bits_of(np.ones(100, np.bool_))
-
-
-@pytest.mark.parametrize("dtype", ["float16", "float32"])
-def test_a_frame_between_two_has_the_bits_of_dense_ones(dtype: str) -> None:
-    (before, dense_before), (after, dense_after) = (
-        frame_of(share, dtype, seed) for share, seed in ((0.2, 3), (0.3, 4))
-    )
-    weight = np.float32(0.3)
-    mixed = between(before, after, weight)
-    dense = dense_before * np.float32(1 - weight) + dense_after * weight
-    whole = tuple(slice(0, n) for n in SHAPE)
-    np.testing.assert_array_equal(mixed.read(whole), dense)
-    assert mixed.values.dtype == np.float32
-    assert mixed.bits.count < before.bits.count + after.bits.count
 
 
 def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(
