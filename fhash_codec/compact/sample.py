@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from functools import partial
 from math import prod
 from typing import NamedTuple, TypeVar
 from weakref import WeakKeyDictionary
@@ -12,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.compact.tiles import (
     Blocks,
     Coding,
@@ -28,9 +32,12 @@ from fhash_codec.compact.tiles import (
     total,
 )
 from fhash_formats.support.threads import map_ahead
+from fhash_formats.transform.coder import array_arguments, checked
 from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import filled
+from fhash_formats.transform.encoding import SHARE, filled
+from fhash_formats.transform.lifting import band_table
 from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.values import all_finite
 
 
 def fill(tile: Tile, settings: TileSettings, density: int) -> Tile:
@@ -285,6 +292,88 @@ class Sample:
         for result in results:
             self.tick()
             yield result
+
+
+MAX_PRICED_EFFORT = 5
+"""Largest effort at which transforms are priced, and only the best of them coded."""
+WIDE = 8.0
+"""Quanta of the residual in a root mean squared error from which on its entropy is that of a normal
+distribution of numbers that are not rounded."""
+
+
+class PricedSample:
+    """A sample whose tiles are priced, and not coded.
+
+    Sizes and errors are those that fhash_codec/native/price.cpp foretells, for all vertices of a
+    tile. Only transforms are compared by them.
+
+    Attributes:
+        sample: the sample, which codes its tiles.
+        tiles, grams, allows_bases, map_all: see `Sample`.
+    """
+
+    def __init__(self, sample: Sample) -> None:
+        self.sample = sample
+        self.tiles, self.grams, self.allows_bases = sample.tiles, sample.grams, sample.allows_bases
+        self.map_all = sample.map_all
+
+    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
+        """Return what is foretold of the series for each pair of settings and coding."""
+        sample = self.sample
+        return [
+            total(sample.map(partial(_price, settings=settings, coding=coding)), sample.weights)
+            for settings, coding in trials
+        ]
+
+
+def priced(sample: Sample, settings: TileSettings, effort: int) -> Sample | PricedSample:
+    """Return a sample on which transforms are compared: a priced one where that can be.
+
+    That is up to MAX_PRICED_EFFORT, where all vertices count and are coded by transform in float32.
+    """
+    plain = not (settings.double or settings.labels or settings.origin)
+    can_be = effort <= MAX_PRICED_EFFORT and plain and sample.blocks.complete
+    return PricedSample(sample) if can_be else sample
+
+
+def _price(tile: Tile, settings: TileSettings, coding: Coding) -> Outcome:
+    """Return the size and error that a tile is likely to have."""
+    values = tile.values.astype(np.float32) - np.float32(settings.center)
+    if not all_finite(values):
+        np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    coefficients = transform_for(settings, values.shape).forward(values)
+    step = settings.step / SHARE if settings.trellis else settings.step
+    results = (ctypes.c_double * 2)()
+    code = native.library().fhash_price(
+        ctypes.c_void_p(coefficients.ctypes.data),
+        (ctypes.c_int64 * 4)(*values.shape),
+        *array_arguments(band_table(settings.transform, values.shape)),
+        1 / step,
+        results,
+    )
+    checked(code)
+    size, squares = results[0], results[1] * step * step
+    if coding.error:
+        size += _residual_bytes(math.sqrt(squares / values.size), settings.quantum) * values.size
+    return Outcome(size=round(size), squares=squares, count=values.size, max_error=0.0)
+
+
+def _residual_bytes(error: float, quantum: float) -> float:
+    """Return the bytes for each vertex of normal errors that are rounded to a quantum.
+
+    error: root of the mean squared error, in the units of the quantum.
+    """
+    sigma = error / quantum
+    if sigma > WIDE:
+        return math.log2(sigma * math.sqrt(2 * math.pi * math.e)) / 8
+    reach = math.ceil(8 * sigma)
+    below = [
+        math.erf((number - 0.5) / (math.sqrt(2) * max(sigma, 1e-9)))
+        for number in range(-reach, reach + 2)
+    ]
+    shares = np.diff(below) / 2
+    shares = shares[shares > 0]
+    return float(-(shares * np.log2(shares)).sum()) / 8
 
 
 def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list[tuple[int, int]]:

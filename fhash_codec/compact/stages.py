@@ -14,7 +14,7 @@ from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling, part_of
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.sample import Sample, priced
 from fhash_codec.compact.step import (
     AIM,
     CLOSE,
@@ -403,8 +403,8 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     parts = task.blocks.retile(part_of(sample.blocks.tile, TRIAL_VERTICES // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, TRIAL_VERTICES)
-    found = choose_transform(small, usual, coding)[0].transform.axes
-    return own_or_found(sample, attempt.settings, found, coding)
+    found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
+    return own_or_found(sample, attempt.settings, found.transform.axes, coding)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
@@ -615,6 +615,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES or sample.is_single:
         settings = _transform_of_large_tile(task, attempt)
     else:
-        settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding))
+        trials = priced(sample, attempt.settings, task.config.effort)
+        settings, _ = choose_transform(trials, attempt.settings, goal.bounded(coding))
     settings, outcome = find_step(sample, settings, coding, goal, tries=4, close=NEAR)
     return replace(attempt, settings=settings, outcome=outcome)

@@ -22,7 +22,7 @@ from fhash_codec.compact.attempt import (
     tiles_to_try,
 )
 from fhash_codec.compact.goal import EXCHANGE, exchange, step_after_gain
-from fhash_codec.compact.sample import Sample, strata
+from fhash_codec.compact.sample import Sample, priced, strata
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
@@ -124,7 +124,7 @@ class Trials:
         """Return settings with a transform, and the outcome of the series if it was coded."""
         sample = self._sample(tile, PICKED_VERTICES)
         settings, tried = rough_transform(
-            sample,
+            priced(sample, self._settings, self._task.config.effort),
             self._settings,
             self._coding,
             self._known_for(tile),

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.compact.attempt import even_tile
-from fhash_codec.compact.sample import spread_order
+from fhash_codec.compact.sample import PricedSample, spread_order
 from fhash_codec.compact.step import plain_step
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome, Tile, code
 from fhash_codec.measure.errors import BULK_SHARE
@@ -175,6 +175,8 @@ LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), (
 """Kinds and depths tried along t and along z."""
 ROUGH_WAVELETS = (("haar", 2), ("9/7", 1), ("9/7", 3))
 """Kinds and depths tried beside the usual ones where tilings are compared."""
+CODED = 2
+"""Transforms that are coded after many were priced."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
 BASIS_TEXT = 1.03
@@ -204,6 +206,8 @@ def choose_transform(
 ) -> tuple[TileSettings, float]:
     """Return settings with the transform of the lowest J on the sample, and that J.
 
+    Of a priced sample, the best trials are coded at last.
+
     quick: tries only the kinds of the settings, the usual ones, and the data's own bases in the
         plane and along z.
     """
@@ -224,6 +228,7 @@ def choose_transform(
         _time_again(shape),
     )
     along_z = axes[1]
+    all_tried: list[tuple[float, Axes]] = []
     for changes in groups:
         if changes is groups[-1] and axes[1] is along_z:
             break  # nothing is new since time was chosen
@@ -233,9 +238,15 @@ def choose_transform(
             *(candidate for candidate in changed if candidate != axes),
         ]
         costs = _costs(sample, settings, trials, coding)
+        all_tried += zip(costs, trials, strict=True)
         if trials and min(costs) < lowest:
             lowest = min(costs)
             axes = trials[costs.index(lowest)]
+    if isinstance(sample, PricedSample):
+        best = [axes for _, axes in sorted(all_tried, key=lambda trial: trial[0])[:CODED]]
+        costs = _costs(sample.sample, settings, best, coding)
+        lowest = min(costs)
+        axes = best[costs.index(lowest)]
     return replace(settings, transform=TransformSpec(axes=axes)), lowest
 
 
@@ -265,7 +276,7 @@ def rough_transform(
 ) -> tuple[TileSettings, Outcome | None]:
     """Return settings with a good transform by very few trials, to compare tilings with.
 
-    Beside them is their outcome on the sample; None where nothing was tried.
+    Beside them is their outcome on the sample; None where nothing was coded.
 
     known: transforms of axes that need no trial, such as those of the same axis elsewhere.
     lines: of each tile, that the data's own bases are fitted on.
@@ -291,7 +302,8 @@ def rough_transform(
             # A basis along time may be good with bases in space alone.
             trials.append((bases.along(0), *own[1:]))
         best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
-    return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
+    outcome = None if isinstance(sample, PricedSample) else best[2]
+    return replace(settings, transform=TransformSpec(axes=best[1])), outcome
 
 
 def own_or_found(

@@ -1,5 +1,5 @@
 """Loader of the codec's native library: the C++ of the ray marcher, of the quality figures,
-of the products of lines and of the training of heads.
+of the products of lines, of the prices of transforms and of the training of heads.
 
 It is a library beside that of `fhash_formats.native`, loaded in the same way.
 """
@@ -13,7 +13,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 5
+ABI_VERSION = 6
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -50,6 +50,8 @@ PROTOTYPES: Prototypes = {
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
     # gram.cpp
     **{f"fhash_gram_{kind}": (*(ARRAY, INTEGER, INTEGER, INTEGER), REAL, ARRAY) for kind in _KINDS},
+    # price.cpp
+    "fhash_price": (*(ARRAY,) * 3, INTEGER, REAL, ARRAY),
     # head_inputs.cpp
     "fhash_head_inputs": (
         *(*(ARRAY,) * 4, INTEGER, ARRAY, ARRAY, INTEGER),

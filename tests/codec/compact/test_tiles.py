@@ -38,7 +38,7 @@ from fhash_codec.compact.attempt import (
     tiles_to_try,
 )
 from fhash_codec.compact.model import CompactModel, PlainArray, head_of
-from fhash_codec.compact.sample import Sample, fill, strata
+from fhash_codec.compact.sample import PricedSample, Sample, fill, priced, strata
 from fhash_codec.compact.tiles import (
     MIN_STEP_SHARE,
     Blocks,
@@ -51,13 +51,14 @@ from fhash_codec.compact.tiles import (
     TileRun,
     code,
 )
-from fhash_codec.compact.transform import usual_transform
+from fhash_codec.compact.transform import CODED, choose_transform, usual_transform
 from fhash_codec.config import ACCESSES
 from fhash_codec.features.selection import select_features
 from fhash_codec.progress import silent
 from fhash_formats.container import Container
 from fhash_formats.series import ArraySeries, StepsSeries
 from fhash_formats.transform.encoding import OFFSETS
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile_format import TileSettings
 
 SHAPE = (5, 6, 7, 8)
@@ -394,6 +395,73 @@ def test_what_was_coded_before_is_not_coded_again(monkeypatch: pytest.MonkeyPatc
 Shape = tuple[int, int, int, int]
 SHAPES = [(12, 25, 125, 125), (600, 12, 14, 16), (2, 128, 160, 160), (40, 3, 160, 200)]
 LONG = [(64, 128, 256, 256), (1, 512, 512, 512), (500, 3, 100, 400)]
+
+
+def waves() -> Blocks:
+    """Two tiles of a sum of waves, with noise."""
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (4, 12, 24, 48)), indexing="ij")
+    values = np.sin(0.3 * t + 0.2 * z) * np.cos(0.25 * y - 0.15 * x)
+    values += np.random.default_rng(0).normal(0, 0.004, values.shape)
+    series = ArraySeries(values.astype(np.float32))
+    extent = select_features(series, EncodeConfig(), silent).extent
+    return Blocks(series, extent, (2, 12, 24, 48))
+
+
+WAVES_SETTINGS = TileSettings(
+    transform=usual_transform((2, 12, 24, 48)),
+    step=0.02,
+    center=0.0,
+    low=-1.1,
+    high=1.1,
+    offsets=OFFSETS,
+)
+
+
+@pytest.mark.parametrize("error", [None, 0.01])
+def test_a_price_is_near_the_bytes_and_the_error_of_a_coding(error: float | None) -> None:
+    settings = replace(WAVES_SETTINGS, quantum=0.0199 if error else 0.0)
+    coding = Coding(error=error)
+    with ThreadPoolExecutor(1) as pool:
+        sample = Sample(waves(), 1 << 20, pool)
+        coded = sample.run(settings, coding)
+        orthonormal = TransformSpec(axes=(AxisTransform(kind="haar", depth=1),) * 4)
+        nothing = replace(settings, transform=orthonormal, step=100.0)
+        foretold, without = PricedSample(sample).run_all([(settings, coding), (nothing, Coding())])
+    assert foretold.size == pytest.approx(coded.size, rel=0.2)
+    assert foretold.count == coded.count
+    if error is None:
+        assert foretold.squares == pytest.approx(coded.squares, rel=0.15)
+    values = np.stack([tile.values for tile in sample.tiles]).astype(np.float64)
+    assert without.size == 0
+    assert without.squares == pytest.approx(np.sum(values * values), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "bits"), [(0.01, 0.0), (0.25, 0.3136), (1.0, 2.1048), (7.9, 5.0290), (8.1, 5.0650)]
+)
+def test_the_residual_of_normal_errors_takes_their_entropy(sigma: float, bits: float) -> None:
+    """The numbers are those of scipy.stats.norm."""
+    assert 8 * sample_module._residual_bytes(3 * sigma, 3.0) == pytest.approx(bits, abs=2e-4)
+
+
+def test_the_best_of_priced_transforms_are_coded() -> None:
+    runs: list[int] = []
+
+    class Counted(Sample):
+        def run_all(self, trials: Any) -> list[Outcome]:
+            runs.append(len(trials))
+            return super().run_all(trials)
+
+    settings = WAVES_SETTINGS
+    with ThreadPoolExecutor(1) as pool:
+        sample = Counted(waves(), 1 << 20, pool)
+        chosen, price = choose_transform(priced(sample, settings, 5), settings, Coding())
+        assert runs == [CODED]
+        _, best = choose_transform(priced(sample, settings, 6), settings, Coding())
+        assert sum(runs) > 10
+    assert chosen.transform != settings.transform
+    assert best <= price < 1.02 * best
+    assert priced(sample, replace(settings, double=True), 5) is sample
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, *LONG, (1, 1, 1, 1), (3, 5, 7, 1)])
