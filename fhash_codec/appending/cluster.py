@@ -79,12 +79,12 @@ def encode_on_cluster(
     check_output(path, force)
     with recording() as clock, open_source(source) as series:
         check_output(path, force, sources=[*series.files, *mask_files(config)])
-        jobs = _jobs_of(client, source, series)
-        known = _scanned(client, jobs, series, config, progress)
+        submit = _submit_to(client, source, series)
+        known = _scanned(client, submit, series, config, progress)
         plan = SeriesPlan.make(series, config, progress, known)
         with _folder_beside(path) as folder:
             with stage("coding", "parts of the series, on the cluster"):
-                parts = _code(client, jobs, plan, folder, progress)
+                parts = _code(client, submit, plan, folder, progress)
             series.check()
             with stage("writing", "the parts become one file"):
                 joined = join_parts(parts, path, force=force, progress=progress)
@@ -150,49 +150,34 @@ def code_part(series: Series, plan: bytes, number: int, of: int) -> bytes:
         return file.read_bytes()
 
 
-class _FileJobs:
-    """Tasks that read a file, which has the same path on all workers."""
+Submit = Callable[..., Any]
+"""Function (work, steps, *arguments, whole=False) that begins a task and returns its future.
 
-    def __init__(self, client: Any, place: str) -> None:
-        self._client, self._place = client, place
-
-    def submit(
-        self, work: Callable[..., Any], steps: range, *arguments: Any, whole: bool = False
-    ) -> Any:
-        """Begin a task, which needs some steps; its future."""
-        return self._client.submit(run_on_worker, work, self._place, 0, None, *arguments)
+steps: that the task needs. whole: whether it needs all that belongs to the series.
+"""
 
 
-class _ArrayJobs:
-    """Tasks that get the frames of a dask array from tasks that compute them on the workers."""
-
-    def __init__(self, client: Any, series: Series, lazy: LazyFrames) -> None:
-        self._client, self._lazy = client, lazy
-        self._labels = {whole: HeldSteps(series, whole=whole) for whole in (False, True)}
-
-    def submit(
-        self, work: Callable[..., Any], steps: range, *arguments: Any, whole: bool = False
-    ) -> Any:
-        """Begin a task; its future.
-
-        steps: that it needs. whole: whether it needs all that belongs to the series.
-        """
-        frames = self._client.compute(self._lazy.array[steps.start : steps.stop])
-        labels = self._labels[whole]
-        return self._client.submit(run_on_worker, work, labels, steps.start, frames, *arguments)
-
-
-_Jobs = _FileJobs | _ArrayJobs
-
-
-def _jobs_of(client: Any, source: Source, series: Series) -> _Jobs:
-    """The tasks for a source; raises InputError for one that other machines cannot read."""
+def _submit_to(client: Any, source: Source, series: Series) -> Submit:
+    """The way to begin tasks on a source; raises InputError where others cannot read it."""
     if isinstance(source, str | Path):
         local = local_path(source)
-        return _FileJobs(client, str(source) if local is None else os.path.abspath(local))
+        path = str(source) if local is None else os.path.abspath(local)
+
+        def read_file(work: Any, steps: range, *arguments: Any, whole: bool = False) -> Any:
+            return client.submit(run_on_worker, work, path, 0, None, *arguments)
+
+        return read_file
     lazy = getattr(series, "lazy", None)
     if isinstance(lazy, LazyFrames):
-        return _ArrayJobs(client, series, lazy)
+        array = lazy.array
+        labels = {whole: HeldSteps(series, whole=whole) for whole in (False, True)}
+
+        def take_frames(work: Any, steps: range, *arguments: Any, whole: bool = False) -> Any:
+            frames = client.compute(array[steps.start : steps.stop])
+            first = steps.start
+            return client.submit(run_on_worker, work, labels[whole], first, frames, *arguments)
+
+        return take_frames
     raise InputError(
         f"{series.source}: client= codes on other machines, which read a file by its path, or an "
         "array of dask (xarray.open_dataset(..., chunks={})); leave client out for other sources"
@@ -200,7 +185,7 @@ def _jobs_of(client: Any, source: Source, series: Series) -> _Jobs:
 
 
 def _scanned(
-    client: Any, jobs: _Jobs, series: Series, config: EncodeConfig, progress: Progress
+    client: Any, submit: Submit, series: Series, config: EncodeConfig, progress: Progress
 ) -> tuple[Scan, Ranks] | None:
     """The scan of a long series of which everything is kept, and the ranks of its values.
 
@@ -211,10 +196,10 @@ def _scanned(
     total, frame = series.shape[0], series.dtype.itemsize * math.prod(series.shape[1:])
     length = max(1, PART_BYTES // frame)
     spans = [range(first, min(first + length, total)) for first in range(0, total, length)]
-    begin = [lambda span=span: jobs.submit(SpanScan, span, span) for span in spans]
+    begin = [lambda span=span: submit(SpanScan, span, span) for span in spans]
     names = [f"the scan of steps {span.start} to {span.stop - 1}" for span in spans]
 
-    def told(results: Iterator[Any]) -> Iterator[Any]:
+    def reported(results: Iterator[Any]) -> Iterator[Any]:
         for span, result in zip(spans, results, strict=True):
             progress("scanning", span.stop, total, "")
             yield result
@@ -223,15 +208,15 @@ def _scanned(
         stage("scan", "range of all values, on the cluster"),
         closing(_results(begin, names, _threads(client))) as results,
     ):
-        return SpanScan.joined(series, told(results))
+        return SpanScan.joined(series, reported(results))
 
 
 def _code(
-    client: Any, jobs: _Jobs, plan: SeriesPlan, folder: Path, progress: Progress
+    client: Any, submit: Submit, plan: SeriesPlan, folder: Path, progress: Progress
 ) -> list[Path]:
     """Code all parts on the cluster; their files, in a folder."""
     threads, packed, files = _threads(client), plan.to_bytes(), list[Path]()
-    parts = _parts(plan, threads)
+    parts = _split(plan, threads)
     # A feature of what happens in time looks at the steps beside each step.
     beside = any(isinstance(parse_feature(text), InTime) for text in plan.features)
 
@@ -239,7 +224,7 @@ def _code(
         own = plan.steps(part.layers(plan.layers))
         steps = range(max(own.start - beside, 0), min(own.stop + beside, plan.shape[0]))
         whole = part.number == 1
-        return jobs.submit(code_part, steps, packed, part.number, part.of, whole=whole)
+        return submit(code_part, steps, packed, part.number, part.of, whole=whole)
 
     begins = [lambda part=part: begin(part) for part in parts]
     names = [f"part {part.number}/{part.of}" for part in parts]
@@ -300,7 +285,7 @@ def _threads(client: Any) -> int:
     return (sum(told.values()) if isinstance(told, Mapping) else 0) or UNKNOWN_THREADS
 
 
-def _parts(plan: SeriesPlan, threads: int) -> list[Part]:
+def _split(plan: SeriesPlan, threads: int) -> list[Part]:
     """The parts of a series, for a cluster of some threads."""
     item = np.dtype(plan.labels["dtype"]).itemsize
     by_size = -(-math.prod(plan.shape) * item // PART_BYTES)

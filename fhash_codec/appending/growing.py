@@ -20,8 +20,8 @@ from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.tiles import Coding, Outcome, Tile, Worked, code, code_tiles, padded_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_quality, full_header, write_coordinates
-from fhash_codec.measure.errors import Errors, ErrorSums, Values, error_sums
-from fhash_codec.measure.value_range import ValueRange, power_of_two
+from fhash_codec.measure.errors import Errors, ErrorSums, error_sums
+from fhash_codec.measure.value_range import ValueRange, Values, power_of_two
 from fhash_formats.container import (
     SOURCE,
     Container,
@@ -303,7 +303,7 @@ class GrowingFile:
         Raises InputError for a file that takes no more steps, OutputError where it cannot be
         written; it then stays as it was.
         """
-        self.keep(layer.streams, times, layer.nonzero, layer.value_range)
+        self.write_layer(layer.streams, times, layer.nonzero, layer.value_range)
         self.figures.steps.extend(layer.errors)
         if publish:
             self.publish()
@@ -317,7 +317,7 @@ class GrowingFile:
             attributes=array.attributes,
         )
 
-    def keep(
+    def write_layer(
         self, streams: Sequence[bytes], times: Sequence[float], nonzero: int, values: ValueRange
     ) -> None:
         """Write a layer without making the file complete, nor telling its errors."""
@@ -413,7 +413,7 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
             raise InputError(f"{path} has several variables; only a file of one can grow")
         header = full_header(container.header, container.arrays)
         settings = _settings(container, header)
-        kept = _kept_steps(container, steps)
+        kept = _steps_to_keep(container, steps)
         value_range = ValueRange(*header["value_range"])
         growing = GrowingFile(
             path,
@@ -424,7 +424,7 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
             continues=state,
         )
         with growing:
-            _keep(growing, container, kept, value_range)
+            _copy_layers(growing, container, kept, value_range)
             yield growing
 
 
@@ -465,7 +465,7 @@ def _settings(container: Container, header: Mapping[str, Any]) -> TileSettings:
     return settings
 
 
-def _kept_steps(container: Container, steps: int | None) -> int:
+def _steps_to_keep(container: Container, steps: int | None) -> int:
     """The number of steps to keep; raises InputError unless they are whole layers."""
     path, table = container.path, container.arrays[TABLE]
     there, layer = table.shape[0], table.chunk_shape[0]
@@ -537,7 +537,9 @@ def _figures(path: Path, header: Mapping[str, Any], value_range: ValueRange, kep
     return figures
 
 
-def _keep(growing: GrowingFile, container: Container, kept: int, value_range: ValueRange) -> None:
+def _copy_layers(
+    growing: GrowingFile, container: Container, kept: int, value_range: ValueRange
+) -> None:
     """Write what is kept of a file: arrays that do not depend on time, and layers of tiles."""
     for name, array in container.arrays.items():
         if name in (TABLE, STEPS) or name.startswith("coords/"):
@@ -568,7 +570,7 @@ def _keep(growing: GrowingFile, container: Container, kept: int, value_range: Va
         # Where steps are dropped this is a share: the file has one number for all of them.
         before, after = (max(0, told - weights) * k // table.grid[0] for k in (number, number + 1))
         span = [float(time) for time in times[first : first + layer]]
-        growing.keep(streams, span, after - before, value_range)
+        growing.write_layer(streams, span, after - before, value_range)
 
 
 def _follows_time(array: StoredArray, container: Container) -> bool:

@@ -490,7 +490,7 @@ class _Streams(Sequence[bytes]):
 
     parts: Sequence[_Piece]
 
-    def places(self) -> Iterator[tuple[_Piece, tuple[int, ...]]]:
+    def tiles(self) -> Iterator[tuple[_Piece, tuple[int, ...]]]:
         """Part and index of each tile, in C order of the whole."""
         for part in self.parts:
             for index in product(*map(range, part.table.grid)):
@@ -503,7 +503,7 @@ class _Streams(Sequence[bytes]):
             with damage_named(part.path):
                 return part.table.coded_bytes(place)
 
-        return np.fromiter((size(*place) for place in self.places()), np.int64, len(self))
+        return np.fromiter((size(*place) for place in self.tiles()), np.int64, len(self))
 
     def __len__(self) -> int:
         return sum(prod(part.table.grid) for part in self.parts)
@@ -515,10 +515,10 @@ class _Streams(Sequence[bytes]):
     def __getitem__(self, index: int | slice) -> bytes | Sequence[bytes]:
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
-        return _read(*next(islice(self.places(), index, None)))
+        return _read(*next(islice(self.tiles(), index, None)))
 
     def __iter__(self) -> Iterator[bytes]:
-        return (_read(part, place) for part, place in self.places())
+        return (_read(part, place) for part, place in self.tiles())
 
 
 def _read(part: _Piece, place: tuple[int, ...]) -> bytes:

@@ -21,7 +21,6 @@ from fhash_codec.compact.tiles import (
     Blocks,
     CodedTiles,
     Coding,
-    Outcome,
     Tile,
     Worked,
     code,
@@ -60,14 +59,6 @@ MAX_COUNT = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class Filling:
-    """The way in which a search has filled the vertices that do not count; see `fill`."""
-
-    settings: TileSettings
-    density: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class Recipe:
     """The coding of every tile of a series.
 
@@ -75,27 +66,24 @@ class Recipe:
         tile: shape (t, z, y, x) of a tile.
         settings: that all tiles share.
         coding: options of the encoder, the bound among them.
-        filling: fill values that tiles get before they are coded; None where the encoder finds its
-            own, or none are needed.
+        filling: settings and density by which tiles are filled before they are coded (`fill`); None
+            where the encoder finds fill values of its own, or none are needed.
     """
 
     tile: Shape
     settings: TileSettings
     coding: Coding
-    filling: Filling | None = None
+    filling: tuple[TileSettings, int] | None = None
 
     @classmethod
     def of(cls, plan: CodingPlan) -> Recipe:
         """The recipe of a plan under a bound of the error."""
-        filling = None
-        if plan.sample is not None and plan.coding.filled and plan.sample.filling is not None:
-            settings, density = plan.sample.filling
-            filling = Filling(settings=settings, density=density)
+        sample = plan.sample if plan.coding.filled else None
         return cls(
             tile=plan.blocks.tile,
             settings=plan.settings,
             coding=replace(plan.coding, bulk=None),  # it is measured by, and changes no byte
-            filling=filling,
+            filling=None if sample is None else sample.filling,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -103,8 +91,8 @@ class Recipe:
         coding = {name: value for name, value in vars(self.coding).items() if name != "bulk"}
         values = {"tile": list(self.tile), "settings": self.settings.to_text(), "coding": coding}
         if self.filling is not None:
-            settings, density = self.filling.settings.to_text(), self.filling.density
-            values["filling"] = {"settings": settings, "density": density}
+            settings, density = self.filling
+            values["filling"] = {"settings": settings.to_text(), "density": density}
         return values
 
     @classmethod
@@ -116,7 +104,7 @@ class Recipe:
             told = record.record("filling")
             density = told.integer("density", 0, max(RATIOS))
             told.need(density in (0, *RATIOS), "density", f"0 or one of {list(RATIOS)}")
-            filling = Filling(settings=_settings(told, (t, z, y, x)), density=density)
+            filling = _settings(told, (t, z, y, x)), density
         return cls(
             tile=(t, z, y, x),
             settings=_settings(record, (t, z, y, x)),
@@ -164,7 +152,7 @@ def code_layers(
 
     def work(tile: Tile) -> Worked:
         if recipe.filling is not None:
-            tile = fill(tile, recipe.filling.settings, recipe.filling.density)
+            tile = fill(tile, *recipe.filling)
         coded, outcome = code(tile, recipe.settings, recipe.coding)
         return coded.data, outcome, None
 
@@ -180,8 +168,6 @@ FORMAT = "fhash plan"
 """Name of the format, the first thing that a reader looks at."""
 MAX_BYTES = strict_json.MAX_BYTES
 """Bytes of a plan, at most."""
-_NOTHING = Outcome(size=0, squares=0.0, count=0, max_error=0.0)
-"""Outcome of no tile."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +230,7 @@ class SeriesPlan:
         )
         with thread_pool() as workers:
             plan, _, bulk = plan_series(series, selection, config, workers, progress)
-        table = CodedTable(plan=plan, streams=[], outcome=_NOTHING, bulk=bulk)
+        table = CodedTable(plan=plan, bulk=bulk)
         return cls(
             config=config,
             labels=_labels(series),

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from importlib.metadata import version
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from types import TracebackType
@@ -16,15 +15,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, continued
+from fhash_codec.appending.growing import MAX_STEPS, Figures, GrowingFile, LayerCoder, continued
 from fhash_codec.compact.attempt import parse_tile
-from fhash_codec.compact.encode import training_header
+from fhash_codec.compact.encode import CodedTable, table_header
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import OVERHEAD_BYTES, plan
 from fhash_codec.compact.tiles import Blocks
 from fhash_codec.config import EncodeConfig
-from fhash_codec.features.selection import FeatureSelection, Source, open_source, select_features
-from fhash_codec.header import HEAD_POINTS, brief_history, check_name
+from fhash_codec.features.selection import Source, open_source, select_features
+from fhash_codec.header import check_name
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
@@ -42,19 +41,6 @@ from fhash_formats.series import (
 from fhash_formats.support.files import check_output
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.support.values import exact_number, json_attributes
-
-
-@dataclass(frozen=True, kw_only=True)
-class GrowingPlan:
-    """The decisions that are made on the first steps of a file.
-
-    Attributes:
-        coder: of the layers.
-        header: of the file as far as it stays the same while the file grows.
-    """
-
-    coder: LayerCoder
-    header: dict[str, Any]
 
 
 def bound_of(config: EncodeConfig, value_range: ValueRange | None) -> float:
@@ -95,8 +81,8 @@ def plan_layers(
     config: EncodeConfig,
     bound: float,
     value_range: ValueRange | None,
-) -> GrowingPlan:
-    """Choose tiles and settings on the first steps.
+) -> tuple[LayerCoder, dict[str, Any]]:
+    """The coder of all layers, chosen on the first steps, and what stays the same of the header.
 
     frames: finite values (z, y, x) of each step. bound: of the error, in data units.
     value_range: that is expected of the whole run; that of the frames if None.
@@ -129,10 +115,11 @@ def plan_layers(
         coding=found.coding,
         dtype=found.blocks.source_dtype,
     )
-    header = _header(selection, promised, coder)
-    header["training"] = training_header(found.history, timings=False)
-    header["history"] = brief_history(found.history, timings=False, most=HEAD_POINTS)
-    return GrowingPlan(coder=coder, header=header)
+    header = table_header(selection, CodedTable(plan=found), promised, None)
+    del header["quality"]
+    header["model"] = {**header["model"], "gains": []}
+    header["model"].pop("tiling", None)
+    return coder, {**header, "dilation": promised.dilation}
 
 
 def _joined(first: ValueRange, second: ValueRange | None) -> ValueRange:
@@ -141,45 +128,10 @@ def _joined(first: ValueRange, second: ValueRange | None) -> ValueRange:
     return ValueRange(min(first.low, second.low), max(first.high, second.high))
 
 
-def _header(selection: FeatureSelection, config: EncodeConfig, coder: LayerCoder) -> dict[str, Any]:
-    """The header's entries that the first steps decide."""
-    head, extent = coder.settings.head, selection.extent
-    return {
-        "encoder": {"version": version("fhash"), "seed": config.seed},
-        "background": extent.background,
-        "feature_bounding_box": [list(span) for span in extent.box],
-        "features": [str(feature) for feature in selection.features],
-        "dilation": config.dilation,
-        "coreset_fraction": 1.0,
-        "model": {
-            "profile": "compact",
-            "embedding_size": 1,
-            "tables": coder.dtype.name,
-            "head": None if head is None else {"hidden": list(head.hidden), "cross": head.cross},
-            "gains": [],
-        },
-        "config": config.to_dict(),
-    }
-
-
 WINDOW_STEPS = 8
 """Steps on which tiles and settings are chosen where the tile does not say how many."""
 WINDOW_BYTES = 512 << 20
 """Bytes of these steps together, at most; a single larger frame is allowed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Source:
-    """The labels and settings of a new file."""
-
-    path: Path
-    shape: tuple[int, int, int]
-    config: EncodeConfig
-    bound: float
-    value_range: ValueRange | None
-    variable: Mapping[str, Any]
-    coords: Mapping[str, Coordinate]
-    force: bool
 
 
 class Writer:
@@ -241,20 +193,30 @@ class Writer:
         frame = _frame_shape(shape)
         settings = _settings(config, max_error, max_error_rel)
         known = None if value_range is None else ValueRange(*map(_number, value_range))
-        self._source: _Source | None = _Source(
-            path=path,
-            shape=frame,
-            config=settings,
-            bound=bound_of(settings, known),
-            value_range=known,
-            variable={
-                "name": str(name),
-                "units": str(units),
-                "attributes": json_attributes(dict(attributes or {}), without=frozenset()),
-            },
-            coords=_positions(coords or {}, frame, time_units),
-            force=force,
-        )
+        bound = bound_of(settings, known)
+        variable = {
+            "name": str(name),
+            "units": str(units),
+            "attributes": json_attributes(dict(attributes or {}), without=frozenset()),
+        }
+        positions = _positions(coords or {}, frame, time_units)
+
+        def new_file(frames: Sequence[npt.NDArray[Any]]) -> GrowingFile:
+            """The file without steps, its tiles and settings chosen on some frames."""
+            coder, header = plan_layers(frames, settings, bound, known)
+            low, high = coder.settings.low, coder.settings.high
+            return GrowingFile(
+                path,
+                coder,
+                {**header, "variable": {**variable, "dtype": coder.dtype.name}},
+                positions,
+                Figures(Figures.scale_of(ValueRange(low, high))),
+                force=force,
+            )
+
+        self._new_file = new_file
+        tile = parse_tile(settings.tile, (MAX_STEPS, *frame))
+        self._tile_steps = None if tile is None or tile[0] == MAX_STEPS else tile[0]
         self._begin(path, frame)
 
     @classmethod
@@ -268,7 +230,6 @@ class Writer:
         cannot grow, MissingInputError and DamagedFileError as `open`.
         """
         self = cls.__new__(cls)
-        self._source = None
         stack = ExitStack()
         growing = stack.enter_context(continued(Path(path), steps))
         z, y, x = growing.shape
@@ -386,28 +347,12 @@ class Writer:
 
     def _window(self, frame: npt.NDArray[Any]) -> int:
         """Number of steps on which tiles and settings are chosen."""
-        assert self._source is not None
         room = max(1, WINDOW_BYTES // frame.nbytes)
-        most = 1 << 20
-        tile = parse_tile(self._source.config.tile, (most, *self.shape))
-        return min(WINDOW_STEPS, room) if tile is None or tile[0] == most else tile[0]
+        return min(WINDOW_STEPS, room) if self._tile_steps is None else self._tile_steps
 
     def _plan(self) -> None:
         """Choose tiles and settings on the steps that wait, and begin the file."""
-        source = self._source
-        assert source is not None
-        found = plan_layers(self._frames, source.config, source.bound, source.value_range)
-        low, high = found.coder.settings.low, found.coder.settings.high
-        variable = {**source.variable, "dtype": found.coder.dtype.name}
-        growing = GrowingFile(
-            source.path,
-            found.coder,
-            {**found.header, "variable": variable},
-            source.coords,
-            Figures(Figures.scale_of(ValueRange(low, high))),
-            force=source.force,
-        )
-        self._file = self._stack.enter_context(growing)
+        self._file = self._stack.enter_context(self._new_file(self._frames))
 
     def _write(self, growing: GrowingFile, count: int) -> None:
         """Code and write the layer of the first steps that wait."""
@@ -566,18 +511,14 @@ def _times(series: Series, growing: GrowingFile) -> npt.NDArray[np.float64]:
     times, before = series.coords["t"].values, growing.times
     if _is_index(times) and _is_index(np.array(before)):
         return times + len(before)
-    _require_ascending(series.source, [*before[-1:], *times.tolist()], bool(before))
-    return times
-
-
-def _require_ascending(what: str, times: list[float], follows: bool) -> None:
-    if follows and not times[1] > times[0]:
+    if before and not times[0] > before[-1]:
         raise InputError(
-            f"{what} begins at time {times[1]:.9g}, and the file ends at {times[0]:.9g}; keep "
-            "fewer steps of the file, or select later ones of the data"
+            f"{series.source} begins at time {times[0]:.9g}, and the file ends at "
+            f"{before[-1]:.9g}; keep fewer steps of the file, or select later ones of the data"
         )
     if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-        raise InputError(f"{what}: its times must be finite and ascend")
+        raise InputError(f"{series.source}: its times must be finite and ascend")
+    return times
 
 
 def _is_index(positions: npt.NDArray[np.float64]) -> bool:

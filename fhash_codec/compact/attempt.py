@@ -171,15 +171,6 @@ BYTES_OF_TILE = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class TilingTrial:
-    """A tiling that was tried, or the one that was taken without."""
-
-    tile: Shape
-    size: float
-    """Bytes that the tiles take, at the quality of the first trial."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Tiling:
     """The chosen tiles, and what was tried."""
 
@@ -187,23 +178,24 @@ class Tiling:
     price: float | None
     """Bytes as a multiple of those of the best tiling; foretold where none was tried, and None for
     tiles that were asked for."""
-    trials: list[TilingTrial] = field(default_factory=list)
+    trials: dict[Shape, float] = field(default_factory=dict)
+    """Bytes of the tilings that were tried, at the quality of the first."""
     parts: list[Shape] = field(default_factory=list)
     """Shapes of the parts that the tilings were tried on; none for the whole series."""
 
     @property
     def best(self) -> Shape | None:
         """Tile of the fewest bytes of those tried."""
-        return min(self.trials, key=lambda trial: trial.size).tile if self.trials else None
+        return min(self.trials, key=self.trials.__getitem__) if self.trials else None
 
     def describe(self) -> str:
         """Return the tilings that were tried, with their prices, as one line."""
         if not self.trials:
             return f"foretold: {self.price:.2f} times the bytes of one tile"
-        least = min(trial.size for trial in self.trials)
+        least = min(self.trials.values())
         told = ", ".join(
-            f"{' x '.join(map(str, trial.tile))} at {trial.size / least:.2f}"
-            for trial in self.trials
+            f"{' x '.join(map(str, tile))} at {size / least:.2f}"
+            for tile, size in self.trials.items()
         )
         parts = " and ".join(" x ".join(map(str, part)) for part in self.parts)
         return f"tried {told}{f', on parts of {parts} vertices' if parts else ''}"
@@ -241,9 +233,9 @@ def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> lis
     slabs: whether there are also tiles with cuts across the longest axes in space alone: where all
         of space is too much, these have the fewest cuts.
     """
-    lengths = {_part(shape[0], length, even=False) for length in (shape[0], *LENGTHS)}
+    lengths = {_even_length(shape[0], length, even=False) for length in (shape[0], *LENGTHS)}
     spaces = {
-        (_part(z, edge), _part(y, edge), _part(x, edge))
+        (_even_length(z, edge), _even_length(y, edge), _even_length(x, edge))
         for z, y, x in [shape[1:]]
         for edge in (max(shape[1:]), *EDGES)
     }
@@ -279,12 +271,12 @@ def _largest_slabs(shape: Shape, steps: int, max_vertices: int) -> list[Shape]:
         return []
     tile = [steps, *shape[1:]]
     parts = -(-shape[across] // (most - most % 2))
-    tile[across] = _part(shape[across], -(-shape[across] // parts))
+    tile[across] = _even_length(shape[across], -(-shape[across] // parts))
     t, z, y, x = tile
     return [(t, z, y, x)]
 
 
-def part_of(tile: Shape, vertices: int) -> Shape:
+def sub_tile(tile: Shape, vertices: int) -> Shape:
     """Return the lengths of a part of a tile: x and y are shortened first, to 8 at least."""
     lengths = list(tile)
     for axis in (3, 2, 1, 0):
@@ -297,7 +289,7 @@ def part_of(tile: Shape, vertices: int) -> Shape:
     return t, z, y, x
 
 
-def _part(length: int, edge: int, *, even: bool = True) -> int:
+def _even_length(length: int, edge: int, *, even: bool = True) -> int:
     """Return the length of equal parts of about `edge`; even, where there are several."""
     parts = max(1, math.floor(length / edge + 0.5)) if even else -(-length // edge)
     part = -(-length // parts)

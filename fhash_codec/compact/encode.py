@@ -49,6 +49,7 @@ from fhash_codec.compact.tiles import (
     fits_memory,
     measured,
     recoded,
+    total,
 )
 from fhash_codec.compact.transform import refit, usual_transform
 from fhash_codec.config import EncodeConfig
@@ -75,9 +76,9 @@ class CodedTable:
 
     plan: CodingPlan
     """Tiles and settings."""
-    streams: list[bytes]
+    streams: list[bytes] = field(default_factory=list)
     """Stream of each tile, in C order."""
-    outcome: Outcome
+    outcome: Outcome = field(default_factory=lambda: total([]))
     """Size and error of all tiles."""
     decoded: DecodedTiles = field(default_factory=dict)
     """All tiles as they decode, less the origin, where the plan keeps them."""
@@ -663,7 +664,7 @@ def table_header(
         "model": model_header(table, config) | ({} if tiling is None else {"tiling": tiling}),
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
-        "quality": {"bulk": _described(table.bulk)},
+        "quality": {"bulk": None if table.bulk is None else {"range": list(table.bulk.ends)}},
         "training": training_header(trained, timings=config.timings),
         "history": brief_history(trained, timings=config.timings, most=HEAD_POINTS),
     }
@@ -687,8 +688,3 @@ def training_header(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
         "epochs": max(1, round(steps * BATCH_VOXELS / samples)),
         "device": "cpu",
     }
-
-
-def _described(bulk: ValueRange | None) -> dict[str, Any] | None:
-    """Return what a header says of a bulk that nothing was measured in yet."""
-    return None if bulk is None else {"range": [bulk.low, bulk.high]}

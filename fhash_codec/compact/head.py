@@ -94,36 +94,19 @@ def likely_heads(size: float, gain: float, octave: float, effort: int) -> list[S
     gain: expected gain in dB of a head of the widths of the trial head.
     octave: dB that an octave of bytes buys.
     """
-    widths = best_widths(size, gain, octave, effort)
-    if widths is None:
-        return [PERCEPTRON] if most_saved(size, gain, octave) > 0 else []
-    with_cross = Shape(widths, cross=True)
-    saved = _saved(with_cross, size, GAIN_BY_WIDTHS[widths] * gain, octave)
-    least, most = (_saved(PERCEPTRON, size, ratio * gain, octave) for ratio in LIKELY_OF_TRIAL)
-    if least >= saved:
-        return [PERCEPTRON]
-    return [with_cross] if most <= saved else [with_cross, PERCEPTRON]
-
-
-def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
-    """Return the widths of the head with a cross that should save most; None if none should.
-
-    The parameters are those of `likely_heads`.
-    """
 
     def saved(widths: tuple[int, int]) -> float:
         return _saved(Shape(widths, cross=True), size, GAIN_BY_WIDTHS[widths] * gain, octave)
 
-    best = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
-    return best if saved(best) > 0 else None
-
-
-def most_saved(size: float, gain: float, octave: float) -> float:
-    """Return the bytes that a perceptron saves at most, less those that it takes.
-
-    The parameters are those of `likely_heads`.
-    """
-    return _saved(PERCEPTRON, size, MAX_OF_TRIAL * gain, octave)
+    widths = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
+    if saved(widths) <= 0:
+        most = _saved(PERCEPTRON, size, MAX_OF_TRIAL * gain, octave)
+        return [PERCEPTRON] if most > 0 else []
+    with_cross = Shape(widths, cross=True)
+    least, most = (_saved(PERCEPTRON, size, ratio * gain, octave) for ratio in LIKELY_OF_TRIAL)
+    if least >= saved(widths):
+        return [PERCEPTRON]
+    return [with_cross] if most <= saved(widths) else [with_cross, PERCEPTRON]
 
 
 def _saved(shape: Shape, size: float, gain: float, octave: float) -> float:
@@ -186,9 +169,14 @@ def choose_head(
         skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
         return settings, outcome, []
     tell = partial(task.parts.report, "training")
+
+    def train(shape: Shape, budget: Budget, tell: Callable[[float], None]) -> TrainedHead | None:
+        low, high, seed = settings.low, settings.high, task.config.seed
+        return train_head(pairs, low, high, shape, budget, seed=seed, progress=tell)
+
     with stage("head trial", "gain of a quick training, by which heads are chosen"):
         pairs = training_pairs(sample, settings, attempt.coding)
-        trial = _trained(task, pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
+        trial = train(TRIAL_HEAD, TRIAL_BUDGET, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
         skip("head", "its trial gains nothing")
         return settings, outcome, []
@@ -208,10 +196,11 @@ def choose_head(
         if trial.gain_db > NEAR_GAIN or not sample.complete:
             pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
 
-        def train(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
-            return _trained(task, pairs, coarser, shape, EFFORTS[effort].budget_of(shape), tell)
+        def train_fully(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
+            return train(shape, EFFORTS[effort].budget_of(shape), tell)
 
-        heads = [head for head in _side_by_side(shapes, train, task.parts) if head is not None]
+        trained = _side_by_side(shapes, train_fully, task.parts)
+        heads = [head for head in trained if head is not None]
         without = _Compared(outcome, octave, aim, data_range)
         best = _searched(without, [(head, coarser) for head in heads], find_step, look)
     if best is None:
@@ -348,16 +337,3 @@ def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> li
         Pair(values, tile.values, tile.counted)
         for values, tile in zip(decoded, sample.tiles, strict=True)
     ]
-
-
-def _trained(
-    task: PlanTask,
-    pairs: Sequence[Pair],
-    settings: TileSettings,
-    shape: Shape,
-    budget: Budget,
-    progress: Callable[[float], None],
-) -> TrainedHead | None:
-    """Train a head for settings; arguments and result are those of `train_head`."""
-    low, high, seed = settings.low, settings.high, task.config.seed
-    return train_head(pairs, low, high, shape, budget, seed=seed, progress=progress)

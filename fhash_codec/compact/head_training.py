@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.measure.errors import pointer
+from fhash_codec.measure.value_range import Doubles, Floats
 from fhash_formats.transform.coder import checked
 from fhash_formats.transform.head import (
     CROSS,
@@ -26,9 +28,6 @@ from fhash_formats.transform.head import (
     Scaled,
     layer_inputs,
 )
-
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int32]
 
 BATCH_VOXELS = 4096
 """Voxels of a training batch."""
@@ -78,11 +77,11 @@ class Batches:
 
     inputs: npt.NDArray[np.int16]
     """Inputs of the network (batches, blocks, INPUTS, voxels looked at, BLOCK_VOXELS)."""
-    targets: Integers
+    targets: npt.NDArray[np.int32]
     """Original minus decoded values (batches, n), in units of sigma / ERROR_UNIT."""
-    lowest: Integers
+    lowest: npt.NDArray[np.int32]
     """Lowest useful output (batches, n), in the same unit: a lower one is clipped."""
-    highest: Integers
+    highest: npt.NDArray[np.int32]
     """Highest useful output (batches, n), in the same unit."""
 
     def __len__(self) -> int:
@@ -149,7 +148,7 @@ def batches(
         _fill_slots(inputs, slots, pair.decoded, voxels.places, offsets, value_range)
         first += len(slots)
 
-    def batched(unordered: npt.NDArray[np.float64]) -> Integers:
+    def batched(unordered: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
         shuffled = np.empty_like(unordered)
         shuffled[order] = unordered
         steps = np.rint(shuffled * (ERROR_UNIT / np.float64(sigma)))
@@ -189,12 +188,12 @@ def _fill_slots(
         np.array(OFFSETS, np.int64),
         np.array(offsets, np.int64),
     )
-    tile, shape, at, to, neighbours, seen = (ctypes.c_void_p(each.ctypes.data) for each in arrays)
+    tile, shape, at, to, neighbours, seen = map(pointer, arrays)
     code = checked(
         native.library().fhash_head_inputs(
             *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
             *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
-            ctypes.c_void_p(inputs.ctypes.data),
+            pointer(inputs),
         )
     )
     assert code == 0, "offsets within the reach of a head"
@@ -206,8 +205,6 @@ def _scales(value_range: ErrorRange) -> tuple[np.float32, np.float32]:
     unit = np.float32(1024) / span if span > 0 else np.float32(0)
     return np.float32(0.5) / value_range.sigma, unit
 
-
-Doubles = npt.NDArray[np.float64]
 
 BETA1 = 0.9
 """Decay of Adam's mean of gradients per update."""
@@ -275,7 +272,7 @@ class Network:
         _check(
             native.library().fhash_head_learn(
                 *self._arguments(voxels),
-                *map(_address, (self.parameters, self.means, self.squares, *factors)),
+                *map(pointer, (self.parameters, self.means, self.squares, *factors)),
                 first,
                 len(rates),
                 as_in_file,
@@ -287,7 +284,7 @@ class Network:
         sums = np.empty(len(voxels), dtype=np.int64)
         _check(
             native.library().fhash_head_errors(
-                *self._arguments(voxels), _address(self.parameters), as_in_file, _address(sums)
+                *self._arguments(voxels), pointer(self.parameters), as_in_file, pointer(sums)
             )
         )
         return sums.tolist()
@@ -311,7 +308,7 @@ class Network:
         sizes = (ctypes.c_int64 * 6)(batches, blocks, block, looked_at, *self.widths)
         arrays = voxels.inputs, voxels.targets, voxels.lowest, voxels.highest
         assert all(array.flags.c_contiguous for array in arrays)
-        addresses = [_address(array) for array in arrays]
+        addresses = [pointer(array) for array in arrays]
         return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
 
 
@@ -322,11 +319,6 @@ def _as_in_file(values: Doubles, most: int) -> Scaled:
     """
     scale = float(np.float16(max(float(np.abs(values).max()) / most, MIN_SCALE)))
     return np.clip(np.rint(values / scale), -most, most).astype(np.int8), scale
-
-
-def _address(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:
-    """Return the address of an array's first number."""
-    return ctypes.c_void_p(array.ctypes.data)
 
 
 def _check(code: int) -> None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
 from fhash_codec.features.occupancy import read_occupancy
+from fhash_codec.measure.value_range import Doubles
 from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
@@ -224,7 +225,9 @@ class PlainArray:
         self.shape = self._table.shape[:4]
         self.chunk_shape = tuple(model["tile"])
         self.dtype = np.dtype(model["values"])
-        self._tile = lru_cache(maxsize=CACHED_TILES)(self._decode_tile)
+        self._tile = lru_cache(maxsize=CACHED_TILES)(
+            lambda index: self._decode(chunk_region(index, self.chunk_shape, self.shape))
+        )
 
     @property
     def levels(self) -> int:
@@ -248,10 +251,6 @@ class PlainArray:
             result[target] = self._tile(index)[source]
         return result
 
-    def _decode_tile(self, index: tuple[int, ...]) -> npt.NDArray[Any]:
-        """The values of a tile, as far as the array reaches."""
-        return self._decode(chunk_region(index, self.chunk_shape, self.shape))
-
     def _decode(self, region: Region) -> npt.NDArray[Any]:
         """The values of a region that is one tile, or any region where there is no head."""
         base = predicted(self._table.read((*region, slice(0, 1)))[..., 0], self.head, self.dtype)
@@ -263,10 +262,6 @@ class PlainArray:
         if not sound.all():
             raise DamagedFileError("array corrections has numbers beyond the type of the values")
         return corrected(base, corrections)
-
-
-Positions = npt.NDArray[np.float64]
-"""Coordinates of some points along one axis."""
 
 
 class CompactModel:
@@ -371,16 +366,14 @@ class CompactModel:
             raise InputError(f"level of detail {lod}; a plain file has 0 to {len(self.tables) - 1}")
         return cast(self.tables[lod][step, *region.slices(), 0], self._array.dtype)
 
-    def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, steps: Doubles, space: list[Doubles]) -> Doubles:
         """Return the values at points, quadrilinear.
 
         steps, space: steps and (z, y, x) of the points, in vertices of the box, all inside.
         """
         return self._interpolated(steps, space)[0]
 
-    def sample_with_gradient(
-        self, steps: Positions, space: list[Positions]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def sample_with_gradient(self, steps: Doubles, space: list[Doubles]) -> tuple[Doubles, Doubles]:
         """Return the values at points, and their derivatives (points, 4) by step, z, y and x.
 
         On the border of two cells the derivatives are those of the cell after it.
@@ -404,8 +397,8 @@ class CompactModel:
         return values, slopes
 
     def _interpolated(
-        self, steps: Positions, space: list[Positions]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], list[Positions]]:
+        self, steps: Doubles, space: list[Doubles]
+    ) -> tuple[Doubles, Doubles, list[Doubles]]:
         """Return the values at points, and what they are interpolated from.
 
         That is the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the

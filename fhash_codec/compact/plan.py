@@ -212,8 +212,9 @@ def tiled_labels(task: PlanTask, trial: LabelTrial) -> Attempt:
     if task.fixed_tile is None:
         tiling = _tiling(task, settings, attempt.coding, outcome.size)
         sample = Sample(task.blocks.retile(tiling.tile), LOOK_VERTICES, task.workers)
-        sizes = {trial.tile: trial.size for trial in tiling.trials if not tiling.parts}
-        outcome = replace(outcome, size=round(sizes.get(tiling.tile, outcome.size)))
+        if not tiling.parts:
+            size = tiling.trials.get(tiling.tile, outcome.size)
+            outcome = replace(outcome, size=round(size))
     settings = replace(settings, transform=usual_transform(sample.blocks.tile))
     return replace(attempt, sample=sample, settings=settings, outcome=outcome, tiling=tiling)
 
@@ -360,11 +361,16 @@ def _planned(task: PlanTask, tiled: Blocks) -> CodingPlan:
     parts.begin("first guess")
     with stage("first guess", "mean and approximate bytes, by which tiles are chosen"):
         settings = first_settings(task, tiled)
-    trial = _label_trial(task, tiled, settings)
+    trial = None
+    if task.goal.size is None:
+        with stage("labels", "values of which few may differ"):
+            trial = look_at_labels(task, tiled, settings) if has_labels(task, tiled) else None
     if trial is not None and trial.clearly:
         parts.end()
         return _label_plan(task, tiled_labels(task, trial))
-    if _can_estimate(task, tiled, settings) and not _beats_estimate(trial, task, tiled, settings):
+    if _can_estimate(task, tiled, settings) and (
+        trial is None or trial.attempt.outcome.size >= _estimated_bytes(task, tiled, settings)
+    ):
         with stage("estimate", "effort 1: step and tiles from coefficients, without trials"):
             estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
@@ -372,23 +378,6 @@ def _planned(task: PlanTask, tiled: Blocks) -> CodingPlan:
     found = _by_trial(task, tiled, settings, trial)
     parts.end()
     return found
-
-
-def _label_trial(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial | None:
-    """Return the trial of coding as labels; None where values are no labels, and for a ratio."""
-    if task.goal.size is not None:
-        return None
-    with stage("labels", "values of which few may differ"):
-        return look_at_labels(task, tiled, settings) if has_labels(task, tiled) else None
-
-
-def _beats_estimate(
-    trial: LabelTrial | None, task: PlanTask, tiled: Blocks, settings: TileSettings
-) -> bool:
-    """Whether labels take fewer bytes than effort 1 estimates for a transform."""
-    if trial is None:
-        return False
-    return trial.attempt.outcome.size < _estimated_bytes(task, tiled, settings)
 
 
 def _by_trial(

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.tiles import Mask, Tile
+from fhash_codec.compact.tiles import Tile
 from fhash_codec.compact.transform import gram_of, usual_transform
+from fhash_codec.measure.value_range import Mask
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.coder import encode_block
 from fhash_formats.transform.predict import (
@@ -47,7 +48,6 @@ RIDGE = 1e-3
 MAX_INTEGER_BOUND = 2.0**40
 """Bound on integer data from which on the data are treated as real numbers."""
 
-Integers = npt.NDArray[np.int32]
 Axes = tuple[int, int, int, int]
 """A number per axis (t, z, y, x)."""
 
@@ -55,7 +55,7 @@ Axes = tuple[int, int, int, int]
 class IntegerTile(NamedTuple):
     """A tile of quantised values (t, z, y, x)."""
 
-    integers: Integers
+    integers: npt.NDArray[np.int32]
     counted: Mask | None
     """Mask of the vertices that count; None if all count."""
 

@@ -25,12 +25,12 @@ from fhash_codec.compact.tiles import (
     Run,
     Tile,
     TileRun,
-    Values,
     code,
     measured,
     recoded,
     total,
 )
+from fhash_codec.measure.value_range import Values
 from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.coder import array_arguments, checked
 from fhash_formats.transform.decoding import transform_for

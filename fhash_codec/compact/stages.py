@@ -10,7 +10,7 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling, part_of
+from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling, sub_tile
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
@@ -29,9 +29,9 @@ from fhash_codec.compact.step import (
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile
 from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
+    adapted_transform,
     basis_bytes,
     choose_transform,
-    own_or_found,
     refit,
     tile_costs,
     usual_transform,
@@ -400,11 +400,11 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    parts = task.blocks.retile(part_of(sample.blocks.tile, TRIAL_VERTICES // PARTS))
+    parts = task.blocks.retile(sub_tile(sample.blocks.tile, TRIAL_VERTICES // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, TRIAL_VERTICES)
     found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
-    return own_or_found(sample, attempt.settings, found.transform.axes, coding)
+    return adapted_transform(sample, attempt.settings, found.transform.axes, coding)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:

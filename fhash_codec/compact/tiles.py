@@ -13,11 +13,10 @@ from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
-from fhash_codec.measure.value_range import power_of_two
+from fhash_codec.measure.value_range import Mask, Values, power_of_two
 from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
@@ -26,8 +25,6 @@ from fhash_formats.transform.encoding import WEIGHT, CodedTile, encode_tile, exa
 from fhash_formats.transform.tile_format import Shape, TileSettings
 from fhash_formats.transform.values import about_origin, cast
 
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
 Index = tuple[int, int, int, int]
 """Position (t, z, y, x) of a tile in the grid of tiles."""
 

@@ -15,7 +15,6 @@ from fhash_codec.compact.attempt import (
     PRICES,
     PlanTask,
     Tiling,
-    TilingTrial,
     burden,
     cheap_tiling,
     region_vertices,
@@ -127,7 +126,7 @@ class Trials:
             priced(sample, self._settings, self._task.config.effort),
             self._settings,
             self._coding,
-            self._known_for(tile),
+            self._known_transforms(tile),
             max(FITTED_LINES // prod(sample.blocks.grid), MIN_LINES),
         )
         for axis in (0, 1):
@@ -140,7 +139,7 @@ class Trials:
         sample = Sample(blocks, vertices, self._task.workers, tick=self._task.parts.tick)
         return sample.filled(settings, 1)
 
-    def _known_for(self, tile: Shape) -> dict[int, AxisTransform]:
+    def _known_transforms(self, tile: Shape) -> dict[int, AxisTransform]:
         """Return the transforms that need no trial: those of axes as long, and wavelets along z."""
         known: dict[int, AxisTransform] = {}
         for (axis, length), transform in self._known.items():
@@ -228,8 +227,7 @@ def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access
         return Tiling(tile=shape, price=1.0)
     prices = _Prices(task, settings, coding, candidates)
     tile = _search(prices, access, shape)
-    tried = [TilingTrial(tile=tile, size=size) for tile, size in prices.sizes.items()]
-    return Tiling(tile=tile, price=prices.price(tile), trials=tried, parts=prices.parts)
+    return Tiling(tile=tile, price=prices.price(tile), trials=prices.sizes, parts=prices.parts)
 
 
 class _Prices:

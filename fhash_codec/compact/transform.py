@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from fhash_codec.compact.attempt import even_tile
 from fhash_codec.compact.sample import PricedSample, spread_order
 from fhash_codec.compact.step import plain_step
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Blocks, Coding, Index, Outcome, Tile, code
-from fhash_codec.measure.errors import BULK_SHARE
+from fhash_codec.measure.errors import BULK_SHARE, pointer
 from fhash_codec.progress import stage
 from fhash_formats.transform.coder import checked
 from fhash_formats.transform.decoding import transform_for
@@ -40,8 +41,7 @@ def gram_of(planes: npt.NDArray[Any], center: float) -> Gram:
     before, length, after = planes.shape
     sums: Gram = np.empty((length, length))
     function = getattr(native.library(), f"fhash_gram_f{planes.itemsize * 8}")
-    places = ctypes.c_void_p(planes.ctypes.data), ctypes.c_void_p(sums.ctypes.data)
-    checked(function(places[0], before, length, after, center, places[1]))
+    checked(function(pointer(planes), before, length, after, center, pointer(sums)))
     return sums
 
 
@@ -84,12 +84,12 @@ class Bases:
     ) -> None:
         """Begin without any. lines: of each tile, that a basis is fitted on; None for all."""
         self._sample, self._settings, self._lines = sample, settings, lines
+        self._allowed = sample.allows_bases
         self._cache: dict[int, AxisTransform] = {}
 
     def possible(self, *lengths: int) -> bool:
         """Whether axes of these lengths can have a basis; only a series in memory can."""
-        allowed = self._sample.allows_bases
-        return allowed and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
+        return self._allowed and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
 
     def along(self, axis: int) -> AxisTransform:
         """Return the basis along an axis, as precise as the step of the settings needs."""
@@ -147,11 +147,7 @@ class CountedBases(Bases):
 
     def __init__(self, in_memory: bool) -> None:
         self.fitted: set[int] = set()
-        self._in_memory = in_memory
-
-    def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have a basis."""
-        return self._in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
+        self._allowed = in_memory
 
     def along(self, axis: int) -> AxisTransform:
         """Return what stands for a basis along an axis, other than the usual one, and count it."""
@@ -215,10 +211,8 @@ def choose_transform(
     bases = Bases(sample, settings)
     if quick:
         trials = _quick_trials(shape, settings.transform.axes, bases)
-        costs = _costs(sample, settings, trials, coding)
-        lowest = min(costs)
-        axes = trials[costs.index(lowest)]
-        return replace(settings, transform=TransformSpec(axes=axes)), lowest
+        lowest, axes = _cheapest(sample, settings, trials, coding)
+        return _along(settings, axes), lowest
     axes = settings.transform.axes
     lowest = math.inf
     groups = (
@@ -237,17 +231,14 @@ def choose_transform(
             *([axes] if math.isinf(lowest) else []),
             *(candidate for candidate in changed if candidate != axes),
         ]
-        costs = _costs(sample, settings, trials, coding)
-        all_tried += zip(costs, trials, strict=True)
-        if trials and min(costs) < lowest:
-            lowest = min(costs)
-            axes = trials[costs.index(lowest)]
+        tried = _tried(sample, settings, trials, coding)
+        all_tried += [(cost, axes) for cost, axes, _ in tried]
+        # min takes the first of several that are alike
+        lowest, axes = min([(lowest, axes), *all_tried], key=itemgetter(0))
     if isinstance(sample, PricedSample):
-        best = [axes for _, axes in sorted(all_tried, key=lambda trial: trial[0])[:CODED]]
-        costs = _costs(sample.sample, settings, best, coding)
-        lowest = min(costs)
-        axes = best[costs.index(lowest)]
-    return replace(settings, transform=TransformSpec(axes=axes)), lowest
+        best = [axes for _, axes in sorted(all_tried, key=itemgetter(0))[:CODED]]
+        lowest, axes = _cheapest(sample.sample, settings, best, coding)
+    return _along(settings, axes), lowest
 
 
 def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding) -> TileSettings:
@@ -263,8 +254,7 @@ def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding)
         trials.append((usual[0], bases.along(1), bases.along(2), bases.along(3)))
     if in_time:
         trials += [(bases.along(0), *axes[1:]) for axes in trials[:]]
-    costs = _costs(sample, settings, trials, coding)
-    return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
+    return _along(settings, _cheapest(sample, settings, trials, coding)[1])
 
 
 def rough_transform(
@@ -294,19 +284,19 @@ def rough_transform(
             kinds.append(bases.along(0))
         trials = [_changed(best[1], {axis: kind}) for kind in kinds]
         fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
-        best = min([best, *_tried(sample, settings, fresh, coding)], key=lambda trial: trial[0])
+        best = min([best, *_tried(sample, settings, fresh, coding)], key=itemgetter(0))
     if bases.possible(*shape[1:]):
         own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
         trials = [own] if best[2] is not None else [axes, own]
         if 0 not in known and best[1][0].basis is None and bases.possible(shape[0]):
             # A basis along time may be good with bases in space alone.
             trials.append((bases.along(0), *own[1:]))
-        best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
+        best = min([best, *_tried(sample, settings, trials, coding)], key=itemgetter(0))
     outcome = None if isinstance(sample, PricedSample) else best[2]
-    return replace(settings, transform=TransformSpec(axes=best[1])), outcome
+    return _along(settings, best[1]), outcome
 
 
-def own_or_found(
+def adapted_transform(
     sample: TileSample, settings: TileSettings, found: Axes, coding: Coding
 ) -> TileSettings:
     """Return settings with transforms that were found on a part, or with own bases in space.
@@ -332,8 +322,9 @@ def own_or_found(
         trials.append((*axes[:2], *usual[2:]))
     elif bases.possible(*shape[1:]):
         trials.append((axes[0], bases.along(1), bases.along(2), bases.along(3)))
-    costs = _costs(sample, settings, trials, coding) if len(trials) > 1 else [0.0]
-    return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
+    if len(trials) > 1:
+        axes = _cheapest(sample, settings, trials, coding)[1]
+    return _along(settings, axes)
 
 
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
@@ -376,7 +367,7 @@ def refit(sample: TileSample, settings: TileSettings, coarser: float = 1.0) -> T
     fresh = {
         number: bases.along(number) for number, axis in enumerate(axes) if axis.basis is not None
     }
-    return replace(settings, transform=TransformSpec(axes=_changed(axes, fresh)))
+    return _along(settings, _changed(axes, fresh))
 
 
 def _changed(axes: Axes, change: dict[int, AxisTransform]) -> Axes:
@@ -402,11 +393,16 @@ def _fitted(axis: AxisTransform, length: int) -> AxisTransform:
     return wavelet(axis.kind, axis.depth, length) if axis.wavelet else axis
 
 
-def _costs(
+def _along(settings: TileSettings, axes: Axes) -> TileSettings:
+    """Return settings with transforms along (t, z, y, x)."""
+    return replace(settings, transform=TransformSpec(axes=axes))
+
+
+def _cheapest(
     sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
-) -> list[float]:
-    """Return J of each trial."""
-    return [cost for cost, _, _ in _tried(sample, settings, trials, coding)]
+) -> tuple[float, Axes]:
+    """Return the lowest J of some trials, and the first trial that has it."""
+    return min(_tried(sample, settings, trials, coding), key=itemgetter(0))[:2]
 
 
 def _tried(
@@ -422,9 +418,7 @@ def _tried(
             error = outcome.squares / (ERROR_PRICE * settings.step**2)
         return outcome.size + bases + error
 
-    outcomes = sample.run_all(
-        [(replace(settings, transform=TransformSpec(axes=axes)), coding) for axes in trials]
-    )
+    outcomes = sample.run_all([(_along(settings, axes), coding) for axes in trials])
     return [
         (cost(axes, outcome), axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)
     ]
@@ -543,11 +537,11 @@ def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
     histogram = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
     native.library().fhash_magnitudes(
-        ctypes.c_void_p(flat.ctypes.data),
+        pointer(flat),
         ctypes.c_int64(flat.size),
         ctypes.c_int64(SHIFT),
-        ctypes.c_void_p(histogram.counts.ctypes.data),
-        ctypes.c_void_p(histogram.squares.ctypes.data),
+        pointer(histogram.counts),
+        pointer(histogram.squares),
     )
     return histogram
 

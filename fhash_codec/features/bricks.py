@@ -76,7 +76,7 @@ class Coreset:
         ends = np.concatenate([[0], np.cumsum(~self.fringe, dtype=np.int64)])
         return np.asarray(np.diff(ends[self.offsets]))
 
-    def places(self, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def sample_indices(self, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Places (n,) in `values` of the samples of some bricks, in their order."""
         first = self.offsets[chosen]
         counts = self.offsets[chosen + 1] - first

@@ -31,9 +31,6 @@ Frame = npt.NDArray[Any]
 FrameMask = npt.NDArray[np.bool_]
 """Booleans (z, y, x) of one step."""
 
-OpenMask = Callable[[str, tuple[int, int, int, int]], Callable[[int], FrameMask]]
-"""(path, shape of the series) -> (step -> FrameMask), as fhash_formats.readers.open_mask."""
-
 KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], change:D, onset:V, mask:FILE, all"
 """Forms of a feature, for error messages."""
 
@@ -227,6 +224,16 @@ class Onset(InTime):
         return f"onset:{_text(self.threshold)}"
 
 
+FORMS: dict[str, tuple[Callable[..., Feature], str]] = {
+    "interval": (Interval, "interval:LO:HI with LO <= HI"),
+    "isosurface": (Isosurface, "isosurface:V with a finite number V"),
+    "segmentation": (Segmentation, "segmentation or segmentation:T with a finite number T"),
+    "change": (Change, "change:D with a finite number D >= 0"),
+    "onset": (Onset, "onset:V with a finite number V"),
+}
+"""Features of numbers by their kind, and how they are written."""
+
+
 def parse_feature(text: str) -> Feature:
     """The feature that a text such as "interval:0.2:1" names.
 
@@ -236,26 +243,14 @@ def parse_feature(text: str) -> Feature:
     values = rest[0] if rest else None
     if kind == "all" and values is None:
         return Everything()
-    if kind == "interval":
-        low, high = _numbers(text, values, 2, "interval:LO:HI with LO <= HI")
-        return Interval(low, high)
-    if kind == "isosurface":
-        return Isosurface(
-            *_numbers(text, values, 1, "isosurface:V with a finite number V", finite=True)
-        )
-    if kind == "segmentation":
-        if values is None:
-            return Segmentation()
-        form = "segmentation or segmentation:T with a finite number T"
-        return Segmentation(*_numbers(text, values, 1, form, finite=True))
-    if kind == "change":
-        (least,) = _numbers(text, values, 1, "change:D with a finite number D >= 0", finite=True)
-        if least >= 0:
-            return Change(least)
+    if kind == "segmentation" and values is None:
+        return Segmentation()
+    if kind in FORMS:
+        make, form = FORMS[kind]
+        numbers = _numbers(text, values, form, finite=kind != "interval")
+        if kind != "change" or numbers[0] >= 0:
+            return make(*numbers)
         raise InputError(f"feature '{text}' is malformed; write change:D with D >= 0")
-    if kind == "onset":
-        (value,) = _numbers(text, values, 1, "onset:V with a finite number V", finite=True)
-        return Onset(value)
     if kind == "mask" and values:
         return Mask(values)
     raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")
@@ -267,13 +262,11 @@ def resolve_features(
     key_frames: Sequence[int],
     value_range: ValueRange,
     progress: Progress,
-    open_mask: OpenMask | None = None,
 ) -> tuple[Feature, ...]:
     """Features that are ready to select: parsed, with Otsu's threshold filled in and masks open.
 
     texts: what `parse_feature` reads.
     value_range: of the whole series; the histogram for Otsu's threshold spans it.
-    open_mask: opens a mask file; fhash_formats.readers.open_mask if None.
 
     Otsu's threshold comes from one histogram of the finite values of all key frames. They are read
     only if a feature needs the threshold. Progress stage: "thresholding".
@@ -286,22 +279,18 @@ def resolve_features(
         threshold = otsu_threshold(histogram, edges)
         by_otsu = Segmentation(math.floor(threshold) + origin if origin else threshold)
         features = [by_otsu if feature == Segmentation() else feature for feature in features]
-    features = [
-        dataclasses.replace(feature, around=_frames_around(series, key_frames))
-        if isinstance(feature, InTime)
-        else feature
-        for feature in features
-    ]
-    if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
-        from fhash_formats.readers.registry import open_mask as open_mask_file
+    return tuple(_resolved(feature, series, key_frames) for feature in features)
 
-        open_mask = open_mask_file
-    return tuple(
-        dataclasses.replace(feature, read=open_mask(feature.path, series.shape))
-        if isinstance(feature, Mask) and open_mask
-        else feature
-        for feature in features
-    )
+
+def _resolved(feature: Feature, series: Series, key_frames: Sequence[int]) -> Feature:
+    """The feature with the frames or the file that it looks at."""
+    if isinstance(feature, InTime):
+        return dataclasses.replace(feature, around=_frames_around(series, key_frames))
+    if isinstance(feature, Mask):
+        from fhash_formats.readers.registry import open_mask
+
+        return dataclasses.replace(feature, read=open_mask(feature.path, series.shape))
+    return feature
 
 
 def _frames_around(series: Series, key_frames: Sequence[int]) -> FramesAround:
@@ -385,10 +374,9 @@ def _histogram(
     return counts
 
 
-def _numbers(
-    text: str, values: str | None, count: int, form: str, *, finite: bool = False
-) -> list[float]:
+def _numbers(text: str, values: str | None, form: str, *, finite: bool) -> list[float]:
     """The numbers of a feature's text; raises InputError, with the form that is allowed."""
+    count = 1 if finite else 2
     parts = [] if values is None else values.split(":")
     try:
         numbers = [_number(part) for part in parts]

@@ -73,14 +73,7 @@ class KeyTimes:
         between two steps. Steps before the first key frame or after the last one take its index; a
         single key frame gives 0. Raises RegionError for a step outside the series.
         """
-        last = self.times.size - 1
-        if not 0 <= step <= last:
-            raise RegionError(f"step {step:g} is outside 0..{last}")
-        before = int(step)
-        indices = self._key_indices_of_steps
-        low, high = indices.item(before), indices.item(min(before + 1, last))
-        between = low + (high - low) * (step - before)
-        return float(min(max(between, 0.0), len(self.key_frames) - 1))
+        return float(self.key_indices(step))
 
     def key_indices(self, steps: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """`key_index` of an array of steps of any shape."""

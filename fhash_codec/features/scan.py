@@ -13,7 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.measure.errors import range_and_sum
-from fhash_codec.measure.value_range import Mean, Ranks, RanksSpan, ValueRange, pieces, power_of_two
+from fhash_codec.measure.value_range import (
+    Mean,
+    Ranks,
+    RanksSpan,
+    ValueRange,
+    Values,
+    pieces,
+    power_of_two,
+)
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, warn_defaults
@@ -157,11 +165,11 @@ class Extremes:
         """The ends that look like fill values; none, one or both."""
         low, high = self._low, self._high
         for ends in ([low], [high], [low, high]):
-            if all(end.count > 1 for end in ends) and self._apart(ends):
+            if all(end.count > 1 for end in ends) and self._is_far_off(ends):
                 return [end.value for end in ends if end.value is not None]
         return []
 
-    def _apart(self, ends: list[_End]) -> bool:
+    def _is_far_off(self, ends: list[_End]) -> bool:
         """Whether the range without some ends is so small that they must be fill values."""
         rest = self._rest(ends)
         if rest is None or self._low.value is None or self._high.value is None:
@@ -189,13 +197,13 @@ class Extremes:
             return
         counts = {self._low.value: self._low.count, self._high.value: self._high.count}
         stands = " and ".join(
-            f"{_shown(value, series.dtype)} at {_percent(counts[value] / self._count)}"
+            f"{_value_text(value, series.dtype)} at {_percent(counts[value] / self._count)}"
             for value in suspects
         )
         rest = self._rest([end for end in (self._low, self._high) if end.value in suspects])
         assert rest is not None
-        others = " to ".join(_shown(value, series.dtype) for value in dict.fromkeys(rest))
-        numbers = [_shown(value, series.dtype) for value in suspects]
+        others = " to ".join(_value_text(value, series.dtype) for value in dict.fromkeys(rest))
+        numbers = [_value_text(value, series.dtype) for value in suspects]
         mark, keep = " ".join(f"--missing {number}" for number in numbers), "--keep-extremes"
         if isinstance(series, ArraySeries):
             mark, keep = f"ArraySeries(missing=[{', '.join(numbers)}])", "keep_extremes=True"
@@ -214,7 +222,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-def _shown(value: float, dtype: np.dtype[Any]) -> str:
+def _value_text(value: float, dtype: np.dtype[Any]) -> str:
     """The shortest text that stands for a value of a type."""
     if dtype.kind != "f":
         return str(int(value))
@@ -265,31 +273,59 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     Raises InputError if no value at all is finite, if an extreme value looks like a fill value that
     nobody declared (extremes.py), or if the series changed. Progress stage: "scanning".
     """
-    low, high, mean = np.inf, -np.inf, Mean()
-    extremes = Extremes(series.dtype, series.unlikely)
+    figures = _Figures(series)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
     last_bits: npt.NDArray[np.uint8] | None = None
     steps = series.shape[0]
     for step, frame in enumerate(series.frames()):
-        count = 0
-        for piece in pieces(frame):
-            piece_count, piece_low, piece_high = scan_piece(piece, mean)
-            extremes.add(piece, piece_count, piece_low, piece_high)
-            if ranks is not None:
-                ranks.add(piece)
-            count, low, high = count + piece_count, min(low, piece_low), max(high, piece_high)
-        if count < frame.size:
+        if figures.add(frame) < frame.size:
             missing[step] = last_bits = _missing_bits(frame, last_bits)
+        if ranks is not None:
+            ranks.add(frame)
         progress("scanning", step + 1, steps, "")
     series.check()
-    if mean.count == 0:
+    if figures.mean.count == 0:
         raise InputError(
             f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; "
             "there is nothing to encode"
         )
-    extremes.refuse(series)
+    found = figures.scan(series, missing)
     warn_defaults(series)
-    return _scan_of(low, high, mean, missing)
+    return found
+
+
+class _Figures:
+    """Range, mean and extremes of the finite values of frames that are added one by one."""
+
+    def __init__(self, series: Series) -> None:
+        self.low, self.high, self.mean = np.inf, -np.inf, Mean()
+        self.extremes = Extremes(series.dtype, series.unlikely)
+
+    def add(self, frame: Values) -> int:
+        """Add a frame, and return the number of its finite values."""
+        finite = 0
+        for piece in pieces(frame):
+            count, low, high = scan_piece(piece, self.mean)
+            self.extremes.add(piece, count, low, high)
+            self.low, self.high = min(self.low, low), max(self.high, high)
+            finite += count
+        return finite
+
+    def join(self, other: _Figures) -> None:
+        """Add the frames of other figures."""
+        self.low, self.high = min(self.low, other.low), max(self.high, other.high)
+        self.mean.join(other.mean)
+        self.extremes.join(other.extremes)
+
+    def scan(self, series: Series, missing: Mapping[int, npt.NDArray[np.uint8]]) -> Scan:
+        """The scan; raises InputError for an extreme that looks like a fill value."""
+        self.extremes.refuse(series)
+        return Scan(
+            value_range=ValueRange(self.low, self.high),
+            mean=min(max(self.mean.value(), self.low), self.high),
+            finite_count=self.mean.count,
+            missing=missing,
+        )
 
 
 class SpanScan:
@@ -302,20 +338,14 @@ class SpanScan:
 
     def __init__(self, series: Series, steps: range) -> None:
         """Scan some steps."""
-        self._low, self._high, self._mean = np.inf, -np.inf, Mean()
-        self._extremes = Extremes(series.dtype, series.unlikely)
+        self._figures = _Figures(series)
         self.ranks = RanksSpan(steps.start * prod(series.shape[1:]))
         self.has_missing = False
         for step in steps:
             frame = series.read(step)
-            for piece in pieces(frame):
-                count, low, high = scan_piece(piece, self._mean)
-                self.has_missing |= count < piece.size
-                if self.has_missing:
-                    self.ranks = RanksSpan(0)
-                    return
-                self._extremes.add(piece, count, low, high)
-                self._low, self._high = min(self._low, low), max(self._high, high)
+            if self._figures.add(frame) < frame.size:
+                self.has_missing, self.ranks = True, RanksSpan(0)
+                return
             self.ranks.add(frame)
 
     @staticmethod
@@ -324,28 +354,13 @@ class SpanScan:
 
         None where a value is missing. Raises InputError as `scan` does.
         """
-        low, high, mean, ranks = np.inf, -np.inf, Mean(), Ranks()
-        extremes = Extremes(series.dtype, series.unlikely)
+        figures, ranks = _Figures(series), Ranks()
         for span in spans:
             if span.has_missing:
                 return None
-            low, high = min(low, span._low), max(high, span._high)
-            mean.join(span._mean)
-            extremes.join(span._extremes)
+            figures.join(span._figures)
             ranks.extend(span.ranks)
-        extremes.refuse(series)
-        return _scan_of(low, high, mean, {}), ranks
-
-
-def _scan_of(
-    low: float, high: float, mean: Mean, missing: Mapping[int, npt.NDArray[np.uint8]]
-) -> Scan:
-    return Scan(
-        value_range=ValueRange(low, high),
-        mean=min(max(mean.value(), low), high),
-        finite_count=mean.count,
-        missing=missing,
-    )
+        return figures.scan(series, {}), ranks
 
 
 def scan_steps(

@@ -14,13 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.measure.value_range import Ranks, ValueRange, pieces, power_of_two
+from fhash_codec.measure.value_range import (
+    Doubles,
+    Mask,
+    Ranks,
+    ValueRange,
+    Values,
+    pieces,
+    power_of_two,
+)
 from fhash_formats.errors import InputError
 from fhash_formats.support.values import exact_number, is_wide_integer
-
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-Doubles = npt.NDArray[np.float64]
 
 LANES = 256
 """Sums that run side by side."""
@@ -110,7 +114,7 @@ def histogram(
         function = getattr(native.library(), f"fhash_histogram_f{wide.dtype.itemsize * 8}")
         numbers = (ctypes.c_double(number) for number in (scale, low, factor))
         size, bins = ctypes.c_int64(wide.size), ctypes.c_int64(counts.size)
-        function(_pointer(wide), size, *numbers, bins, _pointer(counts))
+        function(pointer(wide), size, *numbers, bins, pointer(counts))
 
 
 def _native_sums(
@@ -124,7 +128,7 @@ def _native_sums(
     original, decoded = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
     mask = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
     size = ctypes.c_int64(original.size)
-    arguments = (original, _pointer(decoded), _pointer(mask), size, float(scale))
+    arguments = (original, pointer(decoded), pointer(mask), size, float(scale))
     if bulk is None:
         return ErrorSums(*_call("errors", *arguments, results=2))
     low, high = map(float, bulk)
@@ -155,10 +159,11 @@ def _call(name: str, values: Values, *arguments: Any, results: int) -> tuple[Any
     function = getattr(native.library(), f"fhash_{name}_f{values.dtype.itemsize * 8}")
     output = (ctypes.c_double * results)()
     numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
-    return function(_pointer(values), *numbers, output), *output
+    return function(pointer(values), *numbers, output), *output
 
 
-def _pointer(array: Values | None) -> ctypes.c_void_p:
+def pointer(array: Values | None) -> ctypes.c_void_p:
+    """The address of an array's first number, as native functions take it; null for None."""
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
@@ -267,7 +272,6 @@ class Errors:
     Attributes:
         data_range: of the original series, in data units; inf is allowed and makes PSNR None.
         bulk: of the original series, in data units; None without one.
-        count: vertices compared so far.
         steps: a StepQuality per frame.
     """
 
@@ -282,20 +286,12 @@ class Errors:
             raise InputError(f"data range is {data_range}; 0 or more is needed")
         self.data_range = data_range
         self.bulk = bulk
-        self.count = 0
         self.steps: list[StepQuality] = []
         self._scale = scale or power_of_two(min(data_range, sys.float_info.max))
-        self._squares = 0.0
-        self._largest = 0.0
-        self._bulk_count = 0
-        self._bulk_squares = 0.0
+        self._sums = ErrorSums(0, 0.0, 0.0)
 
     def add(
-        self,
-        step: int,
-        original: Values,
-        decoded: Values,
-        mask: npt.NDArray[np.bool_] | None = None,
+        self, step: int, original: Values, decoded: Values, mask: Mask | None = None
     ) -> StepQuality:
         """Compare a frame, and return the figures of its step.
 
@@ -306,11 +302,7 @@ class Errors:
         return self.take(step, self.compare(step, original, decoded, mask))
 
     def compare(
-        self,
-        step: int,
-        original: Values,
-        decoded: Values,
-        mask: npt.NDArray[np.bool_] | None = None,
+        self, step: int, original: Values, decoded: Values, mask: Mask | None = None
     ) -> ErrorSums:
         """The scaled differences of a frame, for `take`; parameters and errors as in `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
@@ -327,11 +319,7 @@ class Errors:
     def take(self, step: int, errors: ErrorSums) -> StepQuality:
         """Add the differences of a step, and return its figures."""
         count, squares, largest = errors[:3]
-        self.count += count
-        self._squares += squares
-        self._bulk_count += errors.bulk_count
-        self._bulk_squares += errors.bulk_squares
-        self._largest = max(self._largest, largest)
+        self._sums = _joined(self._sums, errors)
         figures = StepQuality(
             step=step,
             psnr=self._psnr(squares, count),
@@ -342,25 +330,30 @@ class Errors:
         return figures
 
     @property
+    def count(self) -> int:
+        """Vertices compared so far."""
+        return self._sums.number
+
+    @property
     def rmse(self) -> float | None:
         """Root of the mean squared difference over all frames, in data units."""
-        return self._rmse(self._squares, self.count)
+        return self._rmse(self._sums.squares, self.count)
 
     @property
     def psnr(self) -> float | None:
         """PSNR over all frames, in dB."""
-        return self._psnr(self._squares, self.count)
+        return self._psnr(self._sums.squares, self.count)
 
     @property
     def max_abs_error(self) -> float | None:
         """The largest difference over all frames, in data units."""
-        return self._unscaled(self._largest, self.count)
+        return self._unscaled(self._sums.largest, self.count)
 
     def bulk_quality(self) -> BulkQuality | None:
         """The figures of the bulk over all frames; None without a bulk."""
         if self.bulk is None:
             return None
-        squares, count = self._bulk_squares, self._bulk_count
+        squares, count = self._sums.bulk_squares, self._sums.bulk_count
         width = (self.bulk.high - self.bulk.low) * self._scale
         return BulkQuality(
             psnr=psnr(width, math.sqrt(squares / count) if count else None),

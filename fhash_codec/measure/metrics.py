@@ -22,10 +22,10 @@ from fhash_codec.measure.errors import (
     Errors,
     ErrorSums,
     StepQuality,
-    Values,
+    pointer,
     range_and_sum,
 )
-from fhash_codec.measure.value_range import ValueRange, pieces, power_of_two
+from fhash_codec.measure.value_range import Doubles, Mask, ValueRange, Values, pieces, power_of_two
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import share_out, usable_threads
@@ -53,8 +53,6 @@ BUDGET = 2**25
 
 _NOT_FINITE = "SSIM: decoded values are not finite where they are compared"
 
-Doubles = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Tile = tuple[tuple[int, int], ...]
 """Half-open spans of vertices along z, y and x."""
 
@@ -158,10 +156,7 @@ class _Frames:
         total = ctypes.c_double()
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(
-            *(
-                ctypes.c_void_p(None if array is None else array.ctypes.data)
-                for array in (self.original, self.decoded, self.mask)
-            ),
+            *map(pointer, (self.original, self.decoded, self.mask)),
             (ctypes.c_int64 * 3)(*self.original.shape),
             (ctypes.c_int64 * 6)(*(end for span in tile for end in span)),
             (ctypes.c_double * len(numbers))(*numbers),
@@ -231,9 +226,8 @@ class Neighbours(NamedTuple):
             return self.before.astype(np.float64)
         # Values near the ends of float64 overflow in no product, since both weights are below 1.
         with np.errstate(invalid="ignore"):
-            return (1 - weight) * self.before.astype(np.float64) + weight * self.after.astype(
-                np.float64
-            )
+            before, after = self.before.astype(np.float64), self.after.astype(np.float64)
+            return (1 - weight) * before + weight * after
 
 
 NeighboursOf = Callable[[int], Neighbours | None]

@@ -15,6 +15,12 @@ from fhash_formats.errors import InputError
 from fhash_formats.support.values import exact_number, integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
 
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
 PIECE = 2**20
 """Values that are converted to float64 at a time; they take 8 MiB."""
 
@@ -300,13 +306,13 @@ class Ranks:
         )
         order = np.argsort(values, kind="stable")
         values, weights = values[order], weights[order]
-        first, last = self._place(weights, beyond), self._place(weights[::-1], beyond)
+        first, last = self._end_index(weights, beyond), self._end_index(weights[::-1], beyond)
         return (
             -math.inf if first is None else exact_number(values[first].item()),
             math.inf if last is None else exact_number(values[::-1][last].item()),
         )
 
-    def _place(self, weights: npt.NDArray[np.int64], beyond: int) -> int | None:
+    def _end_index(self, weights: npt.NDArray[np.int64], beyond: int) -> int | None:
         """The place of an end among the sorted values, seen from that side; None if unknown."""
         so_far = np.cumsum(weights)
         if self.error == 0:

@@ -209,6 +209,7 @@ def _header(
     `vertices` is the number of vertices of all tables in the file.
     """
     architecture, coreset = selection.architecture, selection.coreset
+    kept = CORESET if coreset.fringe is None else FRINGE
     seconds = trained.history[-1]["seconds"] if trained.history else 0.0
     restarts = (
         {"restarts": trained.restarts, "learning_rate": trained.learning_rate}
@@ -230,7 +231,7 @@ def _header(
             "tables": number_type(config),
             "levels": [list(level) for level in architecture.levels],
             "parameters": architecture.parameters_of(vertices),
-            **_sparse_entry(coreset, config),
+            **({SPARSE: kept} if sparse_tables(coreset, config) else {}),
         },
         "config": config.to_dict(),
         "training": {
@@ -243,10 +244,3 @@ def _header(
         },
         "history": brief_history(trained.history, timings=config.timings),
     }
-
-
-def _sparse_entry(coreset: Coreset, config: EncodeConfig) -> dict[str, Any]:
-    """Return the header's entry that says whose needed vertices the tables have, if not all."""
-    if not sparse_tables(coreset, config):
-        return {}
-    return {SPARSE: CORESET if coreset.fringe is None else FRINGE}

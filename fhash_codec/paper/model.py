@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import CORNERS, Box, Mlp, Spans, Table
 from fhash_codec.features.occupancy import read_occupancy
-from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.measure.value_range import Doubles, Floats, ValueRange
 from fhash_codec.native import network as native
-from fhash_codec.paper.network import Floats, Network, RankedBits, Resolution, SparseFrame, row_bits
+from fhash_codec.paper.network import Network, RankedBits, Resolution, SparseFrame, row_bits
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
@@ -144,7 +144,7 @@ class PointTables:
         sizes = (network.key_frames, *network.box_size)
         patches = []
         for level, resolution in enumerate(network.levels):
-            region = _part_between(sizes, resolution, low, high)
+            region = _region_between(sizes, resolution, low, high)
             first = [axis.start for axis in region]
             patches.append(Patch.of(network.read(level, region), first))
         return cls(network, sizes, network.levels, tuple(patches))
@@ -175,7 +175,7 @@ class PointTables:
         low, high = ([key_index, *(span[end] - end for span in region)] for end in (0, 1))
         patches: list[Patch] = []
         for level, resolution in enumerate(network.levels):
-            part = _part_between(sizes, resolution, low, high)[1:]
+            part = _region_between(sizes, resolution, low, high)[1:]
             at = key_index * (resolution[0] - 1) / max(sizes[0] - 1, 1)
             # On a time node this one is enough.
             node = min(int(at), resolution[0] - 1)
@@ -252,7 +252,7 @@ def corners_before(
     ]
 
 
-def _part_between(
+def _region_between(
     sizes: Sequence[int], resolution: Sequence[int], low: Sequence[float], high: Sequence[float]
 ) -> tuple[slice, ...]:
     """Return the part (t, z, y, x) of a level that surrounds all points between two positions."""
@@ -454,7 +454,7 @@ class PointSampler:
 
     def sample(
         self,
-        columns: Sequence[npt.NDArray[np.float64]],
+        columns: Sequence[Doubles],
         values: Floats,
         slopes: Floats | None,
         threads: int,
@@ -478,7 +478,7 @@ class PointSampler:
 
     def evaluate(
         self,
-        columns: Sequence[npt.NDArray[np.float64]],
+        columns: Sequence[Doubles],
         values: Floats,
         slopes: Floats | None = None,
         input_slopes: Floats | None = None,
@@ -511,7 +511,7 @@ class PointSampler:
         _check_status(status)
 
 
-def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
+def input_slopes(network: Network, points: Doubles) -> Floats:
     """Return the derivatives float32 (inputs, n) of the value by each input of the network.
 
     The inputs are the interpolated embeddings, in the order of `Network`. The value is normalised.
@@ -535,7 +535,7 @@ def _check_status(status: int) -> None:
         raise MemoryError("not enough memory to evaluate points")
 
 
-def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float64]], int]:
+def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[Doubles], int]:
     """Return coordinates as arrays (n,), or (1,) where one stands for all points, and n."""
     columns = [np.atleast_1d(np.asarray(array, dtype=np.float64)) for array in arrays]
     lengths = {len(column) for column in columns if np.ndim(column) == 1} - {1}
@@ -547,7 +547,7 @@ def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[npt.NDArray[np.float
     return columns, lengths.pop() if lengths else 1
 
 
-def _check(network: Network, columns: Sequence[npt.NDArray[np.float64]]) -> None:
+def _check(network: Network, columns: Sequence[Doubles]) -> None:
     """Raise RegionError for the first point that is outside the box."""
     for axis, column, size in zip(
         AXES, columns, (network.key_frames, *network.box_size), strict=True
@@ -560,21 +560,17 @@ def _check(network: Network, columns: Sequence[npt.NDArray[np.float64]]) -> None
             )
 
 
-def _chosen(
-    column: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
-) -> npt.NDArray[np.float64]:
+def _chosen(column: Doubles, chosen: npt.NDArray[np.intp]) -> Doubles:
     """Return a coordinate of chosen points, in ascending order; one number stands for all."""
     return column if len(column) in (1, len(chosen)) else column[chosen]
 
 
-def _extremes(columns: Sequence[npt.NDArray[np.float64]]) -> tuple[list[float], list[float]]:
+def _extremes(columns: Sequence[Doubles]) -> tuple[list[float], list[float]]:
     """Return the smallest and the largest of each coordinate."""
     return [float(c.min()) for c in columns], [float(c.max()) for c in columns]
 
 
-def _one_time(
-    tables: PointTables, columns: Sequence[npt.NDArray[np.float64]], count: int
-) -> float | None:
+def _one_time(tables: PointTables, columns: Sequence[Doubles], count: int) -> float | None:
     """Return the time that all points share, if interpolating the tables there once pays."""
     times = columns[0]
     if tables.vertices > READ_PER_POINT * count or times.min() != times.max():
@@ -583,7 +579,7 @@ def _one_time(
 
 
 def _groups(
-    columns: Sequence[npt.NDArray[np.float64]], chosen: npt.NDArray[np.intp]
+    columns: Sequence[Doubles], chosen: npt.NDArray[np.intp]
 ) -> Iterator[npt.NDArray[np.intp]]:
     """Split chosen points into groups that each span a part of the finest table fit to be read.
 
@@ -600,9 +596,6 @@ def _groups(
     below = columns[axis][chosen] < np.floor((low[axis] + high[axis] + 1) / 2)
     yield from _groups(columns, chosen[below])
     yield from _groups(columns, chosen[~below])
-
-
-Positions = npt.NDArray[np.float64]
 
 
 class PaperModel:
@@ -653,9 +646,7 @@ class PaperModel:
         """
         return self._occupancy(first, last, features)[region.slices()]
 
-    def read(
-        self, key: float, region: Box, requested: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.float64]:
+    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> Doubles:
         """Return the values (z, y, x) of a region.
 
         Vertices that are not requested are NaN and cost nothing.
@@ -669,13 +660,11 @@ class PaperModel:
             "decode it whole"
         )
 
-    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, keys: Doubles, space: list[Doubles]) -> Doubles:
         """Return the values (n,) at points inside the box."""
         return self._range.from_unit(sample_points(self.network, keys, *space))
 
-    def sample_with_gradient(
-        self, keys: Positions, space: list[Positions]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def sample_with_gradient(self, keys: Doubles, space: list[Doubles]) -> tuple[Doubles, Doubles]:
         """Return the values (n,) and analytic derivatives (n, 4) by key index, z, y and x."""
         unit, slopes = sample_points(self.network, keys, *space, gradient=True)
         return self._range.from_unit(unit), slopes.astype(np.float64) * (

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import TableSource
+from fhash_codec.measure.value_range import Floats, Integers, Mask
 from fhash_formats.errors import DamagedFileError, InputError
 
 Resolution = tuple[int, int, int, int]
@@ -135,6 +136,11 @@ class Architecture:
         return [(outputs, inputs) for inputs, outputs in itertools.pairwise(widths)]
 
     @property
+    def coarse_numbers(self) -> int:
+        """Number of trained numbers in the tables of all levels but the finest."""
+        return parameter_count(self.levels[1:], self.embedding_size)
+
+    @property
     def parameters(self) -> int:
         """Number of all trained numbers, in the tables and the MLP."""
         return self.parameters_of(parameter_count(self.levels, 1))
@@ -145,10 +151,6 @@ class Architecture:
             outputs * (inputs + 1) for outputs, inputs in self.layer_shapes
         )
 
-
-Floats = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
 
 BLOCK_WORDS = 4
 """Words of a block: ones before a word in its block fit in one byte."""

@@ -4,32 +4,123 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import accumulate
 from math import prod
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.boxes import TABLE_AXES, Box, TableSource
+from fhash_codec.boxes import TABLE_AXES, Box, Sizes, TableSource
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import Bits, read_bits, write_bits
-from fhash_codec.paper.network import (
-    Architecture,
-    Floats,
-    Network,
-    NumberType,
-    Resolution,
-    SparseFrame,
-)
+from fhash_codec.measure.value_range import Floats, Integers, Mask
+from fhash_codec.paper.network import Architecture, Network, NumberType, Resolution, SparseFrame
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE
 from fhash_formats.errors import DamagedFileError, InputError
 
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The part of the brick grid that a region touches.
+
+    Attributes:
+        first: place (z, y, x) in the grid at which the window begins.
+        stored: places (z, y, x) of the window at which the coreset has a brick.
+        numbers: numbers of these bricks in the coreset.
+    """
+
+    first: Sizes
+    stored: Mask
+    numbers: npt.NDArray[np.intp]
+
+
+class Bricks:
+    """The bricks of a coreset, looked up by their place.
+
+    Regions are in vertices of the feature bounding box. Vertices in no brick are 0 or False.
+    """
+
+    def __init__(self, coreset: Coreset) -> None:
+        self._coreset = coreset
+        key, z, y, x = coreset.bricks.T.astype(np.int64)
+        # The coreset has its bricks in ascending order, so that bisection finds a place.
+        self._places = self._brick_index(key, z, y, x)
+
+    def mask(self, key: int, box: Box) -> Mask:
+        """Return which vertices (z, y, x) of a region are samples at a key frame."""
+        window = self._window(key, box)
+        return self._region(self._in_coreset(window.numbers), window, box)
+
+    def samples(self, key: int, box: Box) -> Floats:
+        """Return the normalised values (z, y, x) of a region at a key frame."""
+        return self.embeddings(self._coreset.values[None], key, box)[..., 0]
+
+    def embeddings(self, fine: Floats, key: int, box: Box) -> Floats:
+        """Return the finest embeddings (z, y, x, E) of a region at a key frame.
+
+        Args:
+            fine: embeddings of all samples (E, samples), in the order of `Coreset.values`.
+            key: index of the key frame.
+            box: the region.
+        """
+        window = self._window(key, box)
+        in_coreset = self._in_coreset(window.numbers)
+        places = self._coreset.sample_indices(window.numbers)
+        regions = []
+        for numbers in fine:
+            contents = np.zeros(in_coreset.shape, np.float32)
+            contents[in_coreset] = numbers[places]
+            regions.append(self._region(contents, window, box))
+        return np.stack(regions, axis=-1)
+
+    def _brick_index(self, key: Integers, z: Integers, y: Integers, x: Integers) -> Integers:
+        """Return the place of bricks in the grids of all key frames, in C order."""
+        grid = self._coreset.brick_grid
+        return ((key * grid[0] + z) * grid[1] + y) * grid[2] + x
+
+    def _window(self, key: int, box: Box) -> _Window:
+        """Return the part of the brick grid of a key frame that a region touches."""
+        z, y, x = (
+            np.arange(low // n, -(-high // n))
+            for (low, high), n in zip(box, self._coreset.brick_shape, strict=True)
+        )
+        places = self._brick_index(np.array(key), z[:, None, None], y[:, None], x)
+        numbers = np.searchsorted(self._places, places)
+        stored = np.zeros(places.shape, bool)
+        inside = numbers < len(self._places)
+        stored[inside] = self._places[numbers[inside]] == places[inside]
+        return _Window((int(z[0]), int(y[0]), int(x[0])), stored, numbers[stored])
+
+    def _in_coreset(self, numbers: npt.NDArray[np.intp]) -> Mask:
+        """Return which vertices (bricks, vertices of a brick) of some bricks are samples."""
+        bits = np.unpackbits(
+            self._coreset.mask_bits[numbers], axis=1, count=prod(self._coreset.brick_shape)
+        )
+        return bits.view(np.bool_)
+
+    def _region(
+        self, contents: npt.NDArray[Scalar], window: _Window, box: Box
+    ) -> npt.NDArray[Scalar]:
+        """Return a region out of the contents (bricks, vertices of a brick) of a window."""
+        shape = self._coreset.brick_shape
+        blocks = np.zeros((*window.stored.shape, *shape), contents.dtype)
+        blocks[window.stored] = contents.reshape(-1, *shape)
+        joined = blocks.transpose(0, 3, 1, 4, 2, 5).reshape(
+            [count * n for count, n in zip(window.stored.shape, shape, strict=True)]
+        )
+        return joined[
+            tuple(
+                slice(low - first * n, high - first * n)
+                for (low, high), first, n in zip(box, window.first, shape, strict=True)
+            )
+        ]
 
 
 class Needed:
@@ -335,12 +426,13 @@ def write_tables(
         InputError: the numbers do not fit in `kind`.
     """
     size = architecture.embedding_size
+    bricks, box = Bricks(coreset), Box.of_shape(coreset.box.shape)
     step = fringe_step(
-        coreset, architecture.key_frames, lambda key: finest_frame(coreset, fine, key)
+        coreset, architecture.key_frames, lambda key: bricks.embeddings(fine, key, box)
     )
 
     def finest(key: int) -> Floats:
-        return round_fringe(coreset, key, finest_frame(coreset, fine, key), step)
+        return round_fringe(coreset, key, bricks.embeddings(fine, key, box), step)
 
     nodes: list[Callable[[int], Floats]] = [
         finest,
@@ -365,27 +457,6 @@ def write_tables(
             _write_dense(writer, name, (*level, size), number_type, stored)
             vertices += prod(level)
     return vertices
-
-
-def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
-    """Return the finest table (z, y, x, E) of one key frame, 0 at vertices that are no samples.
-
-    `fine` has the embeddings (E, samples) of all key frames.
-    """
-    size = len(fine)
-    grid, shape = coreset.brick_grid, coreset.brick_shape
-    blocks = np.zeros((*grid, *shape, size), dtype=np.float32)
-    # The coreset has its bricks in ascending order, the key frame first.
-    first, end = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
-    z, y, x = coreset.bricks[first:end, 1:].T
-    bits = np.unpackbits(coreset.mask_bits[first:end], axis=1, count=prod(shape))
-    embeddings = np.zeros((*bits.shape, size), dtype=np.float32)
-    embeddings[bits != 0] = fine[:, coreset.offsets[first] : coreset.offsets[end]].T
-    blocks[z, y, x] = embeddings.reshape(-1, *shape, size)
-    padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(
-        *(g * s for g, s in zip(grid, shape, strict=True)), size
-    )
-    return np.ascontiguousarray(padded[tuple(slice(length) for length in coreset.box.shape)])
 
 
 def load_network(container: Container) -> Network:

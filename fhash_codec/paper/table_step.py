@@ -16,12 +16,12 @@ from fhash_codec.compact.goal import Bracket, geometric_mean, search
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, Tile, code
 from fhash_codec.compact.transform import Gram, Result, choose_transform, usual_transform
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.measure.value_range import Floats
 from fhash_codec.paper.fit import TrainedModel
-from fhash_codec.paper.network import Architecture, Floats, Layer, Network
-from fhash_codec.paper.storage import component_name
+from fhash_codec.paper.network import Architecture, Layer, Network
+from fhash_codec.paper.storage import Bricks, component_name
 from fhash_codec.paper.tables import (
     ROUNDS,
-    Bricks,
     Index,
     LevelCoding,
     Region,

@@ -8,20 +8,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from math import fsum, prod
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.boxes import Box, Sizes
+from fhash_codec.boxes import Box
 from fhash_codec.compact.attempt import even_tile
 from fhash_codec.compact.sample import spread_order
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import unpack
+from fhash_codec.measure.value_range import Floats, Mask
 from fhash_codec.paper.model import decode_region, input_slopes
-from fhash_codec.paper.network import Architecture, Floats, Layer, Network
-from fhash_codec.paper.storage import mix_components, needed_by, write_occupancy
+from fhash_codec.paper.network import Architecture, Layer, Network
+from fhash_codec.paper.storage import Bricks, mix_components, needed_by, write_occupancy
 from fhash_formats.container import ContainerWriter, shard_shape
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.header import MASK_ARRAY, MASK_FEATURES
@@ -31,108 +32,6 @@ from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import WEIGHT, Coding, encode_tile
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile_format import Shape, TileSettings
-
-Scalar = TypeVar("Scalar", bound=np.generic)
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Window:
-    """The part of the brick grid that a region touches.
-
-    Attributes:
-        first: place (z, y, x) in the grid at which the window begins.
-        stored: places (z, y, x) of the window at which the coreset has a brick.
-        numbers: numbers of these bricks in the coreset.
-    """
-
-    first: Sizes
-    stored: Mask
-    numbers: npt.NDArray[np.intp]
-
-
-class Bricks:
-    """The bricks of a coreset, looked up by their place.
-
-    Regions are in vertices of the feature bounding box. Vertices in no brick are 0 or False.
-    """
-
-    def __init__(self, coreset: Coreset) -> None:
-        self._coreset = coreset
-        key, z, y, x = coreset.bricks.T.astype(np.int64)
-        # The coreset has its bricks in ascending order, so that bisection finds a place.
-        self._places = self._place(key, z, y, x)
-
-    def mask(self, key: int, box: Box) -> Mask:
-        """Return which vertices (z, y, x) of a region are samples at a key frame."""
-        window = self._window(key, box)
-        return self._region(self._in_coreset(window.numbers), window, box)
-
-    def samples(self, key: int, box: Box) -> Floats:
-        """Return the normalised values (z, y, x) of a region at a key frame."""
-        return self.embeddings(self._coreset.values[None], key, box)[..., 0]
-
-    def embeddings(self, fine: Floats, key: int, box: Box) -> Floats:
-        """Return the finest embeddings (z, y, x, E) of a region at a key frame.
-
-        Args:
-            fine: embeddings of all samples (E, samples), in the order of `Coreset.values`.
-            key: index of the key frame.
-            box: the region.
-        """
-        window = self._window(key, box)
-        in_coreset = self._in_coreset(window.numbers)
-        places = self._coreset.places(window.numbers)
-        regions = []
-        for numbers in fine:
-            contents = np.zeros(in_coreset.shape, np.float32)
-            contents[in_coreset] = numbers[places]
-            regions.append(self._region(contents, window, box))
-        return np.stack(regions, axis=-1)
-
-    def _place(self, key: Integers, z: Integers, y: Integers, x: Integers) -> Integers:
-        """Return the place of bricks in the grids of all key frames, in C order."""
-        grid = self._coreset.brick_grid
-        return ((key * grid[0] + z) * grid[1] + y) * grid[2] + x
-
-    def _window(self, key: int, box: Box) -> _Window:
-        """Return the part of the brick grid of a key frame that a region touches."""
-        z, y, x = (
-            np.arange(low // n, -(-high // n))
-            for (low, high), n in zip(box, self._coreset.brick_shape, strict=True)
-        )
-        places = self._place(np.array(key), z[:, None, None], y[:, None], x)
-        numbers = np.searchsorted(self._places, places)
-        stored = np.zeros(places.shape, bool)
-        inside = numbers < len(self._places)
-        stored[inside] = self._places[numbers[inside]] == places[inside]
-        return _Window((int(z[0]), int(y[0]), int(x[0])), stored, numbers[stored])
-
-    def _in_coreset(self, numbers: npt.NDArray[np.intp]) -> Mask:
-        """Return which vertices (bricks, vertices of a brick) of some bricks are samples."""
-        bits = np.unpackbits(
-            self._coreset.mask_bits[numbers], axis=1, count=prod(self._coreset.brick_shape)
-        )
-        return bits.view(np.bool_)
-
-    def _region(
-        self, contents: npt.NDArray[Scalar], window: _Window, box: Box
-    ) -> npt.NDArray[Scalar]:
-        """Return a region out of the contents (bricks, vertices of a brick) of a window."""
-        shape = self._coreset.brick_shape
-        blocks = np.zeros((*window.stored.shape, *shape), contents.dtype)
-        blocks[window.stored] = contents.reshape(-1, *shape)
-        joined = blocks.transpose(0, 3, 1, 4, 2, 5).reshape(
-            [count * n for count, n in zip(window.stored.shape, shape, strict=True)]
-        )
-        return joined[
-            tuple(
-                slice(low - first * n, high - first * n)
-                for (low, high), first, n in zip(box, window.first, shape, strict=True)
-            )
-        ]
-
 
 Region = tuple[slice, ...]
 

@@ -57,7 +57,7 @@ class Probe:
         """
         error = 0.0
         for chosen in np.array_split(self.bricks, -(-len(self.bricks) // AT_ONCE)):
-            places, counted = self._places(chosen)
+            places, counted = self._sample_indices(chosen)
             values = self._coreset.values[places[counted]]
             inferred = engine.infer(chosen).double().cpu().numpy()[counted]
             # A reader clips values to their range. Clipping must not hide an infinite one.
@@ -71,16 +71,16 @@ class Probe:
 
     def error_of_constant(self) -> float:
         """Return the mean squared error of the best constant for all samples of the bricks."""
-        places, counted = self._places(self.bricks)
+        places, counted = self._sample_indices(self.bricks)
         trained = self._coreset.values[places]
         constant = float(trained.mean(dtype=np.float64))
         return float(np.square(trained[counted].astype(np.float64) - constant).mean())
 
-    def _places(
+    def _sample_indices(
         self, chosen: npt.NDArray[np.int64]
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         """Return the places (n,) of the samples of bricks in `Coreset.values`, and which count."""
-        places, fringe = self._coreset.places(chosen), self._coreset.fringe
+        places, fringe = self._coreset.sample_indices(chosen), self._coreset.fringe
         return places, np.ones(len(places), np.bool_) if fringe is None else ~fringe[places]
 
 

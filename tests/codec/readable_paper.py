@@ -206,7 +206,7 @@ class NaiveEngine:
     def _samples(self, chosen: Chosen) -> tuple[Tensor, Tensor]:
         """Return points (n, 4) and normalised values (n,) of the coreset vertices of bricks."""
         points = _vertices(self.coreset, chosen)[self.in_coreset[chosen]]
-        values = self.coreset.values[self.coreset.places(chosen)]
+        values = self.coreset.values[self.coreset.sample_indices(chosen)]
         return torch.from_numpy(points).double(), torch.from_numpy(values).double()
 
 

@@ -42,7 +42,7 @@ def of_key_frame(coreset: Coreset, key: int) -> Coreset:
         key_frames=(coreset.key_frames[key],),
         bricks=bricks,
         mask_bits=coreset.mask_bits[rows],
-        values=coreset.values[coreset.places(rows)] if len(rows) else coreset.values[:0],
+        values=coreset.values[coreset.sample_indices(rows)] if len(rows) else coreset.values[:0],
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         occupancy=(coreset.occupancy[key],),
         apart=(),
@@ -381,7 +381,7 @@ class GatherModel:
     def train(self, chosen: npt.NDArray[np.int64]) -> None:
         """Do one training step of Adam on the mean squared error of some bricks."""
         self.step += 1
-        gradients = self.gradients(self.coreset.places(chosen))
+        gradients = self.gradients(self.coreset.sample_indices(chosen))
         rate = float(self.rates[self.step])
         with torch.no_grad():
             for number, gradient, (mean, square) in zip(

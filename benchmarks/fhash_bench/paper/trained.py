@@ -132,7 +132,7 @@ class TcnnModel:
     def train(self, chosen: npt.NDArray[np.int64]) -> None:
         """Do one step of Adam on the mean squared error of some bricks."""
         self.step += 1
-        samples = torch.from_numpy(self.coreset.places(chosen)).to(self.device)
+        samples = torch.from_numpy(self.coreset.sample_indices(chosen)).to(self.device)
         error = (self._network(self._points[samples]) - self._values[samples]).square().mean()
         (gradient,) = torch.autograd.grad(error, self.parameters)
         with torch.no_grad():

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.measure.value_range import Floats
 from fhash_codec.native.network import PATHS, library, machine_paths
 from fhash_codec.paper.engines.parameters import (
     BETA1,
@@ -29,9 +30,9 @@ from fhash_codec.paper.engines.parameters import (
     Chosen,
     Parameters,
     Upsampling,
-    axis_matrices,
     check_state,
     initial_parameters,
+    level_matrices,
 )
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
@@ -164,17 +165,13 @@ class LevelTables:
         numbers: int,
     ) -> None:
         """Fill the structure of a level, whose table begins behind some numbers."""
-        lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
         stride = [prod(resolution[axis + 1 :]) * architecture.embedding_size for axis in range(4)]
         weights = []
-        for axis, along in enumerate(
-            zip(architecture.sizes, resolution, lengths, counts, strict=True)
-        ):
-            start, weight = axis_matrices(*along)
+        for axis, (start, weight) in enumerate(level_matrices(architecture, coreset, resolution)):
             weights.append(weight)
             level.corners[axis], level.stride[axis] = weight.shape[2], stride[axis]
             level.start[axis] = self._address(start * stride[axis] + (numbers if axis == 0 else 0))
-        of_time = np.zeros((counts[0], 2), np.float32)
+        of_time = np.zeros((architecture.key_frames, 2), np.float32)
         of_time[:, : weights[0].shape[2]] = weights[0][:, 0]
         level.time = self._address(of_time)
         for number, weight in enumerate(weights[1:3]):
@@ -247,8 +244,6 @@ PAD = 64
 CPU = torch.device("cpu")
 """The device of the engine."""
 
-Floats = npt.NDArray[np.float32]
-
 
 def refusal(architecture: Architecture, device: torch.device) -> str | None:
     """Return why a model cannot be trained by the native engine here; None if it can."""
@@ -291,11 +286,6 @@ class NativeEngine:
         """Start from fresh parameters; arguments as in `make_engine`.
 
         Args:
-            architecture: the sizes of the model.
-            coreset: the training samples.
-            rates: learning rate of every training step, counted from 1.
-            seed: seed of the initial parameters.
-            device: the CPU.
             path: a name in `PATHS`, or auto for the fastest that there is.
 
         Raises:
@@ -396,10 +386,7 @@ class NativeEngine:
         flat, mean, square = self._settled_flat()
         moved = (mean != 0) | (square != 0)
         used = (np.where(moved, flat, np.float32(0)) if self.step else flat)[: self.coarse]
-        levels = self.architecture.levels[1:]
-        coarse = np.zeros(
-            sum(prod(level) for level in levels) * self.architecture.embedding_size, np.float32
-        )
+        coarse = np.zeros(self.architecture.coarse_numbers, np.float32)
         coarse[self._used] = used
         return Parameters(
             fine=torch.from_numpy(self.fine),

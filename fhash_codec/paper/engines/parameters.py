@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.measure.value_range import Doubles, Floats, Integers
 from fhash_codec.paper.network import Architecture
 
 BETA1 = 0.9
@@ -27,8 +28,7 @@ WINDOW = 200
 (BETA1 / sqrt(BETA2))**200 is 8e-10.
 """
 
-Column = npt.NDArray[np.float32]
-Chosen = npt.NDArray[np.int64]
+Chosen = Integers
 """Numbers (n,) of some bricks of the coreset, without repetition."""
 
 
@@ -39,10 +39,10 @@ class CatchUp(NamedTuple):
     -factor * m / (sqrt(v) + epsilon). Then m decays by `mean_decay` and v by `square_decay`.
     """
 
-    factor: Column
-    epsilon: Column
-    mean_decay: Column
-    square_decay: Column
+    factor: Floats
+    epsilon: Floats
+    mean_decay: Floats
+    square_decay: Floats
 
 
 def corrections(step: int, rate: float) -> tuple[float, float]:
@@ -106,7 +106,7 @@ def _average(gradient: Tensor, mean: Tensor, square: Tensor) -> None:
     square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
 
 
-def catch_up(visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.float64]) -> CatchUp:
+def catch_up(visited: Integers, step: int, rates: Doubles) -> CatchUp:
     """Return the effect of the steps visited + 1 .. step, all with a gradient of zero.
 
     At step j = visited + i Adam moves a parameter by
@@ -224,10 +224,7 @@ def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) 
     """
     random = torch.Generator().manual_seed(seed)
     fine = _initial_fine(architecture.embedding_size, coreset, random)
-    coarse_numbers = (
-        sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
-    )
-    coarse = torch.empty(coarse_numbers).uniform_(-SPREAD, SPREAD, generator=random)
+    coarse = torch.empty(architecture.coarse_numbers).uniform_(-SPREAD, SPREAD, generator=random)
     layers = []
     for outputs, inputs in architecture.layer_shapes:
         bound = inputs**-0.5
@@ -285,10 +282,10 @@ class LevelAxes:
             (corners t z x y, E), int64.
     """
 
-    starts: tuple[npt.NDArray[np.int64], ...]
-    matrices: tuple[npt.NDArray[np.float64], ...]
+    starts: tuple[Integers, ...]
+    matrices: tuple[Doubles, ...]
     shapes: tuple[tuple[int, ...], ...]
-    offsets: npt.NDArray[np.int64]
+    offsets: Integers
 
 
 class Upsampling:
@@ -426,9 +423,7 @@ class Lattices:
             flat_gradient.index_add_(0, self.index.reshape(-1), torch.cat(levels, dim=1).view(-1))
 
 
-def axis_matrices(
-    size: int, corners: int, length: int, count: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Integers, Doubles]:
     """Return the sub-lattice and the weights of each run of vertices along an axis.
 
     The first and the last vertex of the axis are the first and the last corner
@@ -458,19 +453,22 @@ def axis_matrices(
     return start, weights
 
 
-def _level_axes(
-    architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...], numbers: int
-) -> LevelAxes:
-    """Return the sub-lattices of one coarse level; `numbers` precede its table in the flat vector.
-
-    Each key frame counts as a run of one vertex along time.
-    """
+def level_matrices(
+    architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...]
+) -> list[tuple[Integers, Doubles]]:
+    """Return `axis_matrices` of a level along t, z, y and x; a key frame is a run along time."""
     lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
-    size = architecture.embedding_size
-    axes = [
+    return [
         axis_matrices(*along_axis)
         for along_axis in zip(architecture.sizes, resolution, lengths, counts, strict=True)
     ]
+
+
+def _level_axes(
+    architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...], numbers: int
+) -> LevelAxes:
+    """Return the sub-lattices of one coarse level; `numbers` precede its flat table."""
+    size, axes = architecture.embedding_size, level_matrices(architecture, coreset, resolution)
     stride = [prod(resolution[axis + 1 :]) * size for axis in range(4)]
     (start_t, wt), (start_z, wz), (start_y, wy), (start_x, wx) = axes
     start_tz = (start_t[:, None] * stride[0] + start_z * stride[1]).reshape(-1) + numbers

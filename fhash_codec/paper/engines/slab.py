@@ -227,7 +227,7 @@ def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> 
     bricks, vertices = len(coreset.bricks), prod(coreset.brick_shape)
     samples = len(coreset.values) + 1
     size = architecture.embedding_size
-    coarse = size * sum(prod(level) for level in architecture.levels[1:])
+    coarse = architecture.coarse_numbers
     network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
     # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
     held = 12 * size * samples + 4 * samples + coreset.mask_bits.nbytes
@@ -370,7 +370,7 @@ class SlabEngine:
         fine, mean, square = numbers
         self._move((fine, input_gradient[:size], mean, square), sent)
         vectors = (self.flat, self.gradient, self.flat_mean, self.flat_square)
-        for part in self._parts(len(self.flat), ADAM_PART):
+        for part in self._chunks(len(self.flat), ADAM_PART):
             self._move(tuple(vector[part] for vector in vectors), sent)
         self._numbers.index_copy_(2, columns.ranks, numbers)
         return error
@@ -410,17 +410,10 @@ class SlabEngine:
         On a CPU the finest embeddings are the engine's own memory, not a copy.
         """
         self.settle()
-        coarse = torch.zeros(
-            sum(prod(level) for level in self.architecture.levels[1:])
-            * self.architecture.embedding_size
-        )
+        coarse = torch.zeros(self.architecture.coarse_numbers)
         moved = (self.flat_mean != 0) | (self.flat_square != 0)
-        used = (
-            torch.where(moved, self.flat, 0.0)[: self.coarse]
-            if self.step
-            else self.flat[: self.coarse]
-        )
-        coarse[self.upsampling.used.cpu()] = used.cpu()
+        used = torch.where(moved, self.flat, 0.0) if self.step else self.flat
+        coarse[self.upsampling.used.cpu()] = used[: self.coarse].cpu()
         return Parameters(
             fine=self.fine.cpu(), coarse=coarse, network=self.flat[self.coarse :].cpu().clone()
         )
@@ -506,11 +499,11 @@ class SlabEngine:
     def _value(self, inputs: Tensor) -> Tensor:
         """Return the output of the MLP (samples,)."""
         result = torch.empty(inputs.shape[1], device=self.device)
-        for part in self._parts(len(result), CHUNK):
+        for part in self._chunks(len(result), CHUNK):
             result[part] = self._forward(inputs[:, part])[-1][0]
         return result
 
-    def _parts(self, count: int, most: int) -> list[slice]:
+    def _chunks(self, count: int, most: int) -> list[slice]:
         """Return slices of `count` numbers, each of at most `most` on a CPU; one of all on CUDA."""
         size = most if self.on_cpu else max(count, 1)
         return [slice(first, first + size) for first in range(0, count, size)]
@@ -557,7 +550,7 @@ class SlabEngine:
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
         target = self.values[columns.ranks]
-        for part in self._parts(inputs.shape[1], CHUNK):
+        for part in self._chunks(inputs.shape[1], CHUNK):
             activations = self._forward(inputs[:, part])
             residual = activations[-1][0] - target[part]
             if columns.in_coreset is not None:

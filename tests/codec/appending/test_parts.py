@@ -28,7 +28,6 @@ from fhash_codec.appending import series_plan
 from fhash_codec.appending.cluster import HeldSteps
 from fhash_codec.appending.parts import Part, encode_part, merge
 from fhash_codec.appending.series_plan import (
-    Filling,
     Recipe,
     SeriesPlan,
     bounded,
@@ -57,9 +56,9 @@ SHAPE = (7, 4, 6, 8)
 TILE = "2x4x6x4"
 
 
-def values(seed: int = 0) -> np.ndarray:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE), indexing="ij")
-    noise = np.random.default_rng(seed).random(SHAPE)
+def values(seed: int = 0, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    noise = np.random.default_rng(seed).random(shape)
     return (np.sin(6 * x + 2 * t) * np.cos(5 * y) + z + 0.05 * noise).astype(np.float32)
 
 
@@ -447,7 +446,7 @@ SETTINGS = TileSettings(
 RECIPE = Recipe(
     tile=TILE_SERIES_PLAN, settings=SETTINGS, coding=Coding(error=0.05, rounds=2, density=4)
 )
-FILLED = replace(RECIPE, filling=Filling(settings=replace(SETTINGS, step=0.2), density=2))
+FILLED = replace(RECIPE, filling=(replace(SETTINGS, step=0.2), 2))
 
 
 def read(values) -> Recipe:
@@ -484,14 +483,11 @@ SHAPE_CLUSTER = (9, 6, 8, 10)
 
 
 def values_cluster() -> np.ndarray:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in SHAPE_CLUSTER), indexing="ij")
-    noise = np.random.default_rng(0).random(SHAPE_CLUSTER)
-    return (np.sin(6 * x + 2 * t) * np.cos(5 * y) + z + 0.05 * noise).astype(np.float32)
+    return values(shape=SHAPE_CLUSTER)
 
 
 def settings_cluster(**options) -> EncodeConfig:
-    given = {"max_error": 0.02, "effort": 1, "tile": "2x6x8x5", **options}
-    return EncodeConfig(**given, timings=False)
+    return settings(**{"tile": "2x6x8x5", **options})
 
 
 class Threads:

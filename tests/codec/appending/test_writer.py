@@ -25,8 +25,8 @@ from fhash_codec import (
     Writer,
 )
 from fhash_codec.appending import growing
-from fhash_codec.appending.growing import Figures, GrowingFile, LayerCoder, bound_of_file, continued
-from fhash_codec.appending.writer import append, bound_of, plan_layers
+from fhash_codec.appending.growing import Figures, GrowingFile, bound_of_file, continued
+from fhash_codec.appending.writer import append, plan_layers
 from fhash_codec.header import full_header
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter
@@ -129,37 +129,19 @@ def test_a_failure_while_steps_are_coded_changes_nothing(run) -> None:
     assert os.listdir(run.parent) == ["run.fhz"]
 
 
-RANGE = ValueRange(-1.0, 3.0)
-
-
-def test_the_bound_is_absolute_or_of_a_known_range() -> None:
-    assert bound_of(EncodeConfig(max_error=0.5), None) == 0.5
-    assert bound_of(EncodeConfig(max_error_rel=0.01), RANGE) == 0.04
-    with pytest.raises(InputError, match="give value_range"):
-        bound_of(EncodeConfig(max_error_rel=0.01), None)
-    for other in ({}, {"psnr": 50}, {"ratio": 5}):
-        with pytest.raises(InputError, match="promises a bound"):
-            bound_of(EncodeConfig(**other), RANGE)
-
-
-CONFIG_WRITER = EncodeConfig(max_error=BOUND_WRITER, effort=1, tile=TILE)
 LAYER = 3
 
 
 def written(path: Path, steps: int, **options) -> Path:
-    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER, **options) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG, **options) as writer:
         for step in range(steps):
             writer.append(frame(step))
     return path
 
 
-def frames_writer(steps: int) -> np.ndarray:
-    return np.stack([frame(step) for step in range(steps)])
-
-
 def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
     path = tmp_path / "run.fhz"
-    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG) as writer:
         for step in range(10):
             writer.append(frame(step))
             assert (writer.steps, writer.steps_written) == (step + 1, (step + 1) // LAYER * LAYER)
@@ -172,7 +154,7 @@ def test_the_file_is_readable_after_every_layer(tmp_path) -> None:
     assert os.listdir(tmp_path) == ["run.fhz"]
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames_writer(10)).max() <= BOUND_WRITER
+        assert np.abs(volume[:] - frames(0, 10)).max() <= BOUND_WRITER
         assert volume.chunks == (LAYER, *SHAPE_WRITER)
         np.testing.assert_array_equal(volume.coords["t"].values, np.arange(10))
 
@@ -181,7 +163,7 @@ def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
     path = written(tmp_path / "run.fhz", 7)
     with fhash_codec.open(path) as volume:
         told = volume.info
-    found = fhash_codec.diff(frames_writer(7), path)
+    found = fhash_codec.diff(frames(0, 7), path)
     quality = told["quality"]
     assert quality["psnr"] == pytest.approx(found["psnr"], rel=1e-5)
     assert quality["psnr"] <= found["psnr"]
@@ -191,7 +173,7 @@ def test_its_figures_are_those_of_a_comparison(tmp_path) -> None:
     for step, other in zip(quality["per_step"], found["quality"]["per_step"], strict=True):
         assert step["rmse"] == pytest.approx(other["rmse"], rel=2e-3)
         assert step["rmse"] >= other["rmse"]
-    values = frames_writer(7)
+    values = frames(0, 7)
     assert told["value_range"] == [values.min(), values.max()]
     assert told["config"]["max_error"] == BOUND_WRITER
     assert quality["max_abs_error"] <= BOUND_WRITER
@@ -223,30 +205,30 @@ def test_a_short_last_layer_is_not_extended_but_may_be_dropped(tmp_path) -> None
         for step in range(3, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND_WRITER
+        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND_WRITER
         assert len(volume.info["quality"]["per_step"]) == 9
 
 
 def test_files_of_encode_go_on_where_they_promise_a_bound(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     fhash_codec.encode(
-        frames_writer(6), path, EncodeConfig(max_error=BOUND_WRITER, effort=5, tile=TILE)
+        frames(0, 6), path, EncodeConfig(max_error=BOUND_WRITER, effort=5, tile=TILE)
     )
     with Writer.resume(path) as writer:
         for step in range(6, 9):
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
         assert volume.verify()
-        assert np.abs(volume[:] - frames_writer(9)).max() <= BOUND_WRITER
+        assert np.abs(volume[:] - frames(0, 9)).max() <= BOUND_WRITER
     fhash_codec.encode(
-        frames_writer(6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE)
+        frames(0, 6), tmp_path / "psnr.fhz", EncodeConfig(psnr=40, effort=1, tile=TILE)
     )
     with pytest.raises(InputError, match="does not promise a bound"):
         Writer.resume(tmp_path / "psnr.fhz")
     feature = EncodeConfig(
         max_error=BOUND_WRITER, effort=1, tile=TILE, features=("interval:0.5:1",)
     )
-    fhash_codec.encode(frames_writer(6), tmp_path / "feature.fhz", feature)
+    fhash_codec.encode(frames(0, 6), tmp_path / "feature.fhz", feature)
     with pytest.raises(InputError, match="keeps features"):
         Writer.resume(tmp_path / "feature.fhz")
 
@@ -255,9 +237,7 @@ def test_coordinates_and_labels(tmp_path) -> None:
     path = tmp_path / "run.fhz"
     coords = {"z": Coordinate(name="lev", values=np.array([1.0, 2, 4, 8])), "x": np.arange(12) / 3}
     options = {"coords": coords, "name": "u", "units": "m s-1", "time_units": "hours"}
-    with Writer(
-        path, shape=SHAPE_WRITER, config=CONFIG_WRITER, attributes={"a": 1}, **options
-    ) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG, attributes={"a": 1}, **options) as writer:
         for step, now in enumerate((0.0, 0.1, 0.7, 2.0)):
             writer.append(frame(step), time=now)
     with fhash_codec.open(path) as volume:
@@ -268,20 +248,16 @@ def test_coordinates_and_labels(tmp_path) -> None:
         np.testing.assert_array_equal(volume.coords["z"].values, [1, 2, 4, 8])
         np.testing.assert_array_equal(volume.coords["x"].values, np.arange(12) / 3)
     with pytest.raises(InputError, match="the coordinate of x has shape"):
-        Writer(
-            tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG_WRITER, coords={"x": np.arange(3)}
-        )
+        Writer(tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG, coords={"x": np.arange(3)})
     with pytest.raises(InputError, match="coords names 'w'"):
-        Writer(
-            tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG_WRITER, coords={"w": np.arange(3)}
-        )
+        Writer(tmp_path / "b.fhz", shape=SHAPE_WRITER, config=CONFIG, coords={"w": np.arange(3)})
 
 
 def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> None:
     path, good = tmp_path / "run.fhz", frame(0)
     bad = good.copy()
     bad[0, 0, :2] = np.nan
-    with Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER) as writer:
+    with Writer(path, shape=SHAPE_WRITER, config=CONFIG) as writer:
         writer.append(good)
         for wrong, time_of_step, message in (
             (good[:, :-1], None, r"step 1: the frame has shape \(4, 9, 12\)"),
@@ -300,7 +276,7 @@ def test_frames_that_do_not_fit_are_left_out_and_nothing_is_lost(tmp_path) -> No
     with pytest.raises(InputError, match="the writer is closed"):
         writer.append(good)
     with fhash_codec.open(path) as volume:
-        assert np.abs(volume[:] - frames_writer(4)).max() <= BOUND_WRITER
+        assert np.abs(volume[:] - frames(0, 4)).max() <= BOUND_WRITER
 
 
 @pytest.mark.parametrize(
@@ -329,14 +305,14 @@ def test_a_bound_relative_to_the_expected_range(tmp_path) -> None:
             writer.append(frame(step))
     with fhash_codec.open(path) as volume:
         assert volume.info["config"]["max_error"] == 0.004
-        assert np.abs(volume[:] - frames_writer(4)).max() <= 0.004
+        assert np.abs(volume[:] - frames(0, 4)).max() <= 0.004
 
 
 def test_a_layer_that_cannot_be_written_ends_it_with_the_layers_before(
     tmp_path, monkeypatch
 ) -> None:
     path = tmp_path / "run.fhz"
-    writer = Writer(path, shape=SHAPE_WRITER, config=CONFIG_WRITER)
+    writer = Writer(path, shape=SHAPE_WRITER, config=CONFIG)
     for step in range(LAYER):
         writer.append(frame(step))
 
@@ -382,7 +358,7 @@ def test_killed_it_loses_no_layer_that_was_written(tmp_path) -> None:
         with fhash_codec.open(path) as volume:
             assert volume.verify()
             steps = volume.shape[0]
-            assert np.abs(volume[:] - frames_writer(steps)).max() <= BOUND_WRITER
+            assert np.abs(volume[:] - frames(0, steps)).max() <= BOUND_WRITER
         assert told <= steps <= told + LAYER
         before = steps
     with Writer.resume(path):
@@ -453,12 +429,12 @@ def begun(tmp_path):
     frames = np.random.default_rng(0).random((6, *SHAPE)).astype(np.float32)
     frames[3:] += 2
     config = EncodeConfig(max_error=0.05, effort=1, tile="2x3x4x5")
-    plan = plan_layers(list(frames[:2]), config, 0.05, None)
+    coder, header = plan_layers(list(frames[:2]), config, 0.05, None)
     variable = {"name": "u", "units": "", "dtype": "float32", "attributes": {}}
     lengths = zip(("t", "z", "y", "x"), (1, *SHAPE), strict=True)
     coords = {axis: index_coordinate(axis, n) for axis, n in lengths}
-    header = {**plan.header, "variable": variable}
-    return GrowingFile(tmp_path / "a.fhz", plan.coder, header, coords, Figures(1.0)), frames
+    header |= {"variable": variable}
+    return GrowingFile(tmp_path / "a.fhz", coder, header, coords, Figures(1.0)), frames
 
 
 def add(file: GrowingFile, frames: np.ndarray, first: int, **options) -> None:
@@ -478,31 +454,11 @@ def test_there_is_a_limit_of_steps(begun, monkeypatch) -> None:
         assert volume.shape[0] == 2
 
 
-BOUND = 0.01
-
-
-@pytest.fixture(scope="module")
-def frames_layers() -> np.ndarray:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (4, 5, 9, 12)), indexing="ij")
-    return (np.sin(5 * x + t) * np.cos(4 * y) + z).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def coder(frames_layers) -> LayerCoder:
-    config = EncodeConfig(max_error=BOUND, effort=1, tile="4x5x6x6")
-    return plan_layers(list(frames_layers), config, BOUND, None).coder
-
-
-def coded(coder: LayerCoder, frames_layers: np.ndarray):
-    figures = Figures(1.0)
-    with ThreadPoolExecutor(2) as workers:
-        return coder.code(list(frames_layers), figures, workers)
-
-
-def test_a_tile_that_decodes_otherwise_is_told(frames_layers, coder, monkeypatch) -> None:
-    monkeypatch.setattr("fhash_codec.appending.growing.decode_tile", lambda *_: frames_layers[0])
-    with pytest.raises(RuntimeError, match="decodes to other values"):
-        coded(coder, frames_layers)
+def test_a_tile_that_decodes_otherwise_is_told(begun, monkeypatch) -> None:
+    file, frames = begun
+    monkeypatch.setattr("fhash_codec.appending.growing.decode_tile", lambda *_: frames[0])
+    with file, pytest.raises(RuntimeError, match="decodes to other values"):
+        add(file, frames, 0)
 
 
 BOUND_RESUMING = 0.02

@@ -20,10 +20,12 @@ from fhash_codec.boxes import Box
 from fhash_codec.features.bricks import Coreset, build_coreset
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
+from fhash_codec.measure.value_range import Floats
 from fhash_codec.paper.encode import Selection, select
 from fhash_codec.paper.engines import make_engine
-from fhash_codec.paper.network import Architecture, ArrayTable, Floats, Network, level_resolutions
-from fhash_codec.paper.tables import Bricks, TrainedTable, trained_tables
+from fhash_codec.paper.network import Architecture, ArrayTable, Network, level_resolutions
+from fhash_codec.paper.storage import Bricks
+from fhash_codec.paper.tables import TrainedTable, trained_tables
 from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
@@ -132,12 +134,6 @@ class Networks:
             hidden = np.maximum(hidden, 0) if number else hidden
             hidden = weight.astype(np.float64) @ hidden + bias[:, None]
         return hidden[0]
-
-    @staticmethod
-    def vertices(network: Network, key_index: float) -> Points:
-        """Every vertex of the box at a key index, as points."""
-        grid = np.meshgrid(*(np.arange(n, dtype=float) for n in network.box_size), indexing="ij")
-        return [np.full(grid[0].size, key_index), *(axis.ravel() for axis in grid)]
 
     @staticmethod
     def points(network: Network, count: int, seed: int = 1) -> Points:

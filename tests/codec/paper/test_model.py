@@ -144,8 +144,11 @@ def test_points_may_be_none_or_share_a_coordinate(networks) -> None:
 
 @pytest.mark.parametrize("key_index", [-0.1, 3.1, float("nan"), float("inf")])
 def test_a_key_index_outside_is_refused(networks, key_index) -> None:
+    net = networks.random((4, 5, 6), 4, 2, 1, 0)
     with pytest.raises(RegionError, match="key_index"):
-        sample_points(networks.random((4, 5, 6), 4, 2, 1, 0), key_index, 0, 0, 0)
+        sample_points(net, key_index, 0, 0, 0)
+    with pytest.raises(RegionError, match="key index"):
+        decode_region(net, key_index, networks.box(net))
 
 
 def test_wrong_arguments_are_refused(networks) -> None:
@@ -424,16 +427,6 @@ def test_going_on_after_a_restart_gives_the_same_bytes(field, tmp_path) -> None:
     assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
 
 
-@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
-def test_a_training_that_diverges_at_every_rate_writes_nothing(
-    field, tmp_path, monkeypatch
-) -> None:
-    monkeypatch.setattr("fhash_codec.paper.train.DIVERGED", 0.0)
-    with pytest.raises(TrainingError, match="diverged"):
-        fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
-    assert not list(tmp_path.iterdir())
-
-
 def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypatch) -> None:
     class Spoilt(SlabEngine):
         def parameters(self):
@@ -626,13 +619,6 @@ def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(
             np.testing.assert_array_equal(cut, frame[tuple(slice(*r) for r in region)])
 
 
-def test_regions_match_the_sixteen_corner_formula(networks, network) -> None:
-    for key_index in networks.key_indices(network):
-        frame = decode_region(network, key_index, networks.box(network))
-        expected = networks.reference(network, networks.vertices(network, key_index))
-        np.testing.assert_allclose(frame.ravel(), expected, rtol=1e-5, atol=1e-5)
-
-
 def test_vertices_are_points_and_those_that_nobody_requested_are_nan(networks) -> None:
     """A ball, a plate, a column and random vertices, on a key frame and between two."""
     net = networks.random((25, 40, 64), 3, 2, 2, 2, width=64)
@@ -673,13 +659,6 @@ def test_a_region_reads_just_its_surroundings_once_per_level(networks) -> None:
     net = networks.recording(net)
     decode_region(net, 3.2, ((20, 36),) * 3, requested=np.zeros((16, 16, 16), bool))
     assert not net.tables[0].regions
-
-
-@pytest.mark.parametrize("key_index", [-0.1, 3.1, float("nan"), float("inf")])
-def test_a_key_index_outside_is_refused_regions(networks, key_index) -> None:
-    net = networks.random((4, 5, 6), 4, 2, 1, 0)
-    with pytest.raises(RegionError, match="key index"):
-        decode_region(net, key_index, networks.box(net))
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from fhash_codec.paper.storage import (
     Needed,
     SparseTable,
     StoredTable,
-    finest_frame,
     fringe_step,
     mix_components,
     needed_by,
@@ -67,13 +66,15 @@ def test_regions_are_those_of_the_frame(random_model, key) -> None:
     to_unit = random_model.selection.scanned.value_range.to_unit
     frame = random_model.field[(key, *(slice(low, high) for low, high in coreset.box))]
     np.testing.assert_array_equal(values[mask], to_unit(frame[mask]))
+    embeddings = bricks.embeddings(random_model.fine, key, box)
+    assert not embeddings[~mask].any()
     for region in (((1, 4), (0, 3), (7, 11)), ((3, 4), (5, 6), (2, 3))):
         inner = tuple(slice(*span) for span in region)
         np.testing.assert_array_equal(bricks.mask(key, region), mask[inner])
         np.testing.assert_array_equal(bricks.samples(key, region), values[inner])
         np.testing.assert_array_equal(
             bricks.embeddings(random_model.fine, key, region),
-            finest_frame(coreset, random_model.fine, key)[inner],
+            embeddings[inner],
         )
 
 

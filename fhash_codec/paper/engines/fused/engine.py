@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.engines.fused import program
 from fhash_codec.paper.engines.fused.program import (
     DeviceLimits,
     Sizes,
@@ -37,37 +38,6 @@ TRIAL_ERROR = 1e-3
 """Relative difference of the squared errors of a trial that is no more than rounding."""
 TRIAL_VALUE = 1e-4
 """Median difference of the values after a trial that is no more than rounding."""
-
-
-class Program(Protocol):
-    """Compiled kernels on a device.
-
-    Attributes:
-        new: whether the kernels were compiled just now, and never ran here before.
-    """
-
-    new: bool
-
-    def launch(
-        self, kernel: str, blocks: int, shared_bytes: int, arguments: Sequence[ctypes._CDataType]
-    ) -> None:
-        """Launch a kernel after the work that torch has queued; Unavailable where that fails."""
-
-    def forget(self) -> None:
-        """Remove the kernels from the cache."""
-
-
-class Device(Protocol):
-    """A device that runs the kernels.
-
-    Attributes:
-        limits: its limits.
-    """
-
-    limits: DeviceLimits
-
-    def load(self, sizes: Sizes) -> Program:
-        """Compile the kernels for some sizes, or find them compiled; Unavailable if neither."""
 
 
 class ModelRecord(ctypes.Structure):
@@ -104,7 +74,7 @@ class FusedEngine(SlabEngine):
         *,
         seed: int,
         device: torch.device,
-        kernels: Device,
+        kernels: program.CudaDevice,
     ) -> None:
         """Start from fresh parameters; arguments as in `make_engine`.
 
@@ -367,13 +337,13 @@ class PointSizes(Sizes):
 class PointKernels:
     """A device with the kernels that were loaded there, for many networks."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: program.CudaDevice) -> None:
         """Take over a device."""
         self.limits = device.limits
         self._device = device
-        self._programs: dict[str, Program] = {}
+        self._programs: dict[str, program.CudaProgram] = {}
 
-    def load(self, sizes: PointSizes) -> Program:
+    def load(self, sizes: PointSizes) -> program.CudaProgram:
         """Return the kernels for some sizes; Unavailable where they cannot be had."""
         text = sizes.text()
         if text not in self._programs:
@@ -612,11 +582,14 @@ def start_fused(
                 " or torch is not built for CUDA; use --engine auto"
             )
         return None
-    from fhash_codec.paper.engines.fused.program import CudaDevice
-
     try:
         return FusedEngine(
-            architecture, coreset, rates, seed=seed, device=device, kernels=CudaDevice(device)
+            architecture,
+            coreset,
+            rates,
+            seed=seed,
+            device=device,
+            kernels=program.CudaDevice(device),
         )
     except Unavailable as error:
         if required:
@@ -638,10 +611,8 @@ def start_points(network: Network, key: float, device: torch.device) -> FusedPoi
     """
     if device.type != "cuda" or torch.version.cuda is None:
         return None
-    from fhash_codec.paper.engines.fused.program import CudaDevice
-
     try:
-        kernels = _point_kernels(CudaDevice, device)
+        kernels = _point_kernels(program.CudaDevice, device)
         return FusedPoints(network, key, device=device, kernels=kernels)
     except Unavailable as error:
         _warn_once(
@@ -651,7 +622,9 @@ def start_points(network: Network, key: float, device: torch.device) -> FusedPoi
 
 
 @cache
-def _point_kernels(make: Callable[[torch.device], Device], device: torch.device) -> PointKernels:
+def _point_kernels(
+    make: Callable[[torch.device], program.CudaDevice], device: torch.device
+) -> PointKernels:
     """Return the kernels of points on a device, for all networks and key indices."""
     return PointKernels(make(device))
 

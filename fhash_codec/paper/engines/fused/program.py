@@ -181,7 +181,7 @@ class Sizes(ABC):
         return self.layer_arrays
 
     @cached_property
-    def places(self) -> dict[str, int]:
+    def offsets(self) -> dict[str, int]:
         """Places in shared memory, in numbers of 4 bytes, and their END."""
         places, end = {}, 0
         for name, size in self.arrays.items():
@@ -192,7 +192,7 @@ class Sizes(ABC):
     @property
     def shared_bytes(self) -> int:
         """Bytes of shared memory that a block needs."""
-        return 4 * self.places["END"]
+        return 4 * self.offsets["END"]
 
     def slots(self, limits: DeviceLimits, most: int) -> int:
         """Return the blocks that are on a device at once, on a multiprocessor 1 to `most`."""
@@ -212,7 +212,7 @@ class Sizes(ABC):
             "PITCH": self.columns + 4,
             "STRIDE": self.stride,
             "MATRICES": self.matrices,
-        } | {f"AT_{name}": place for name, place in self.places.items()}
+        } | {f"AT_{name}": place for name, place in self.offsets.items()}
         yield from (f"constexpr int {name} = {number};" for name, number in numbers.items())
 
     @abstractmethod
@@ -559,10 +559,10 @@ class Driver:
 
 
 class CudaProgram:
-    """Kernels on a CUDA device, a `Program` of engine.py.
+    """Kernels on a CUDA device.
 
     Attributes:
-        new: whether the kernels were compiled just now.
+        new: whether the kernels were compiled just now, and never ran here before.
     """
 
     def __init__(
@@ -618,7 +618,7 @@ class CudaProgram:
 
 
 class CudaDevice:
-    """A CUDA device of torch, a `Device` of engine.py.
+    """A CUDA device of torch.
 
     Attributes:
         limits: its limits.

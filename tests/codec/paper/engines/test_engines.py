@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
-import re
-import sys
-import types
-from collections.abc import Callable
 from itertools import product
 from math import prod
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from pretended_cuda import CUDA, MixedDevices, pretended_cuda
-from readable_paper import NaiveEngine, bucket_index, interpolate, locate
+from pretended_cuda import CUDA, pretended_cuda
+from readable_paper import NaiveEngine, bucket_index, interpolate
 
-from fhash_codec.features.bricks import Coreset
 from fhash_codec.native.network import machine_paths
 from fhash_codec.paper.engines import describe_engine, make_engine
 from fhash_codec.paper.engines.parameters import (
@@ -71,122 +63,6 @@ def test_the_fused_engine_needs_a_cuda_device(noise_coreset) -> None:
         make_engine(
             "fused", architecture, noise_coreset((1, 2, 2, 2)), np.zeros(1), seed=0, device=CPU
         )
-
-
-@pytest.mark.parametrize("name", ["auto", "slab"])
-def test_restoring_a_state_goes_on_bit_for_bit(noise_coreset, name) -> None:
-    coreset = noise_coreset((3, 9, 10, 20))
-    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
-    rates = np.linspace(0.01, 0.001, 21)
-    batches = np.random.default_rng(0).integers(0, len(coreset.bricks), (20, 1))
-
-    def run(first, last, state=None):
-        engine = make_engine(name, architecture, coreset, rates, seed=1, device=CPU)
-        if state:
-            engine.restore(state)
-        for batch in batches[first:last]:
-            engine.train(batch)
-        return engine
-
-    uninterrupted, half = run(0, 20), run(0, 9)
-    state = {name: np.array(array) for name, array in half.state().items()}
-    resumed = run(9, 20, state)
-    for name_of_array, array in uninterrupted.state().items():
-        np.testing.assert_array_equal(array, resumed.state()[name_of_array], err_msg=name_of_array)
-
-
-DEVICE = re.compile(
-    r"\.to\((?:self\.)?device(?:, self\.dtype)?\)|device=device, "
-    r"|, device=(?:(?:self|mask|bricks)\.)?_?device\b"
-)
-"""Every place of an engine's source that puts a tensor on the device."""
-ON_THE_CPU = "self._scratch_memory[name] = torch.empty"
-"""A line that no other device comes to."""
-SHAPE = (2, 6, 10, 20)
-"""Shape of the series."""
-LOW = 0.8
-"""Smallest value of the feature: few vertices are samples."""
-FILES = (
-    "fhash_codec.paper.engines.slab",
-    "fhash_codec.paper.engines.parameters",
-    "fhash_codec.paper.engines.parameters",
-)
-"""Modules of the slab engine, the one with its class first."""
-
-
-def text_of(name: str) -> str:
-    """The source of a module."""
-    return Path(str(importlib.import_module(name).__file__)).read_text(encoding="utf-8")
-
-
-def faulty(module: str, source: str) -> type[Any]:
-    """The class of the engine with one module compiled from another source."""
-    compiled: dict[str, types.ModuleType] = {}
-    for name in reversed(FILES):
-        text = source if name == module else text_of(name)
-        made = types.ModuleType(name)
-        sys.modules[name], before = made, sys.modules[name]
-        try:
-            exec(compile(text, name, "exec"), made.__dict__)
-        finally:
-            sys.modules[name] = before
-        for earlier in compiled.values():
-            for attribute in set(vars(earlier)) & set(vars(made)):
-                value = vars(earlier)[attribute]
-                if getattr(value, "__module__", None) == earlier.__name__:
-                    setattr(made, attribute, value)
-        compiled[name] = made
-    return compiled[FILES[0]].SlabEngine  # type: ignore[no-any-return]
-
-
-def faults() -> list[Any]:
-    """Parameters (module, source), one for each place that may forget the device."""
-    found = []
-    for name in FILES:
-        text = text_of(name)
-        for match in DEVICE.finditer(text):
-            line = text[: match.start()].count("\n") + 1
-            if ON_THE_CPU in text.splitlines()[line - 1]:
-                continue
-            source = text[: match.start()] + text[match.end() :]
-            found.append(pytest.param(name, source, id=f"{name.split('.')[-1]}:{line}"))
-    return found
-
-
-def traffic(trained: Callable[..., Any], coreset: Coreset) -> dict[str, int]:
-    """Waits for the device and copies to it of a training, a continuation and an evaluation."""
-    with pretended_cuda() as pretended:
-        trained(coreset, {"width": 8}, "slab", "cuda")
-    return {name: pretended.counts[name] for name in ("waits", "copies", "pageable")}
-
-
-@pytest.fixture(scope="module")
-def rightly(noise_coreset: Callable[..., Coreset], trained: Callable[..., Any]) -> dict[str, int]:
-    """The traffic of the engine without a fault."""
-    return traffic(trained, noise_coreset(SHAPE, LOW))
-
-
-@pytest.mark.parametrize(("module", "source"), faults())
-def test_a_forgotten_device_is_seen(
-    noise_coreset: Callable[..., Coreset],
-    trained: Callable[..., Any],
-    rightly: dict[str, int],
-    monkeypatch: pytest.MonkeyPatch,
-    module: str,
-    source: str,
-) -> None:
-    monkeypatch.setattr(sys.modules[FILES[0]], "SlabEngine", faulty(module, source))
-    try:
-        found = traffic(trained, noise_coreset(SHAPE, LOW))
-    except (MixedDevices, TypeError, AssertionError):
-        return
-    # What CUDA allows, but by a wait or a copy in each step.
-    assert found != rightly
-
-
-def test_there_are_faults_of_every_module() -> None:
-    assert {parameter.values[0] for parameter in faults()} == set(FILES)
-    assert len(faults()) >= 8
 
 
 def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
@@ -371,22 +247,6 @@ def test_bucket_index_is_the_papers_linearisation() -> None:
     )
 
 
-def test_vertices_of_the_finest_level_are_corners_exactly() -> None:
-    sizes = (7, 11, 25, 125)
-    vertices = torch.tensor(list(product(*(range(n) for n in (7, 11, 3, 3)))), dtype=DOUBLE)
-    before, after_weight = locate(vertices, sizes, sizes)
-    # A vertex is the corner before it, or at the end of an axis the corner after it.
-    assert torch.equal(before + after_weight, vertices)
-    assert set(after_weight.unique().tolist()) <= {0.0, 1.0}
-
-
-def test_corners_align_at_every_level() -> None:
-    sizes, resolution = (4, 9, 10, 33), (2, 5, 3, 17)
-    ends = torch.tensor([[0, 0, 0, 0], [3, 8, 9, 32]], dtype=DOUBLE)
-    before, after_weight = locate(ends, sizes, resolution)
-    assert (before + after_weight).tolist() == [[0, 0, 0, 0], [1, 4, 2, 16]]
-
-
 def test_interpolation_reproduces_a_multilinear_function() -> None:
     sizes = resolution = (3, 4, 5, 6)
     corners = torch.tensor(list(product(*(range(n) for n in resolution))), dtype=DOUBLE)
@@ -399,15 +259,6 @@ def test_interpolation_reproduces_a_multilinear_function() -> None:
     torch.testing.assert_close(
         interpolate(function(corners), points, sizes, resolution), function(points)
     )
-
-
-def test_an_axis_of_one_vertex_does_not_matter() -> None:
-    table = torch.rand(6, 2, dtype=DOUBLE, generator=torch.Generator().manual_seed(0))
-    points = torch.tensor([[0.0, 0.0, 0.3, 1.7], [5.0, -1.0, 0.3, 1.7]], dtype=DOUBLE)
-    value, other = interpolate(table, points, (1, 1, 2, 3), (1, 1, 2, 3))
-    torch.testing.assert_close(value, other)
-    (a, b), (c, d) = table.reshape(2, 3, 2)[:, 1:]
-    torch.testing.assert_close(value, 0.7 * (0.3 * a + 0.7 * b) + 0.3 * (0.3 * c + 0.7 * d))
 
 
 def test_errors_are_those_of_the_values_at_the_samples(noise_coreset) -> None:

@@ -69,7 +69,7 @@ CASES = {
 def path(request: pytest.FixtureRequest) -> str:
     """Each path of the kernels; those that the machine lacks are skipped."""
     name: str = request.param
-    if name not in machine_paths():
+    if name not in (*machine_paths(), "slab"):
         pytest.skip(f"this machine has no {name}")
     return name
 
@@ -117,10 +117,15 @@ def threads():
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("path", [*PATHS, "slab"], indirect=True)
 def test_it_trains_like_a_dense_adam_in_float64(model_of, oracle_of, path, case) -> None:
+    """Though it visits few bricks a step."""
     coreset, architecture = model_of(case)
     first, batches, errors, expected = oracle_of(case)
-    engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
+    if path == "slab":
+        engine = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
+    else:
+        engine = NativeEngine(architecture, coreset, RATES, seed=7, path=path)
     values = engine.infer(np.arange(len(coreset.bricks))).numpy()
     assert values.shape == coreset.values.shape
     np.testing.assert_allclose(values, first, atol=3e-7)
@@ -233,66 +238,20 @@ def test_constants_are_those_of_the_header(name) -> None:
     assert int(value.group(1)) == getattr(native, name)
 
 
-CASES_SLAB = [
-    pytest.param((4, 7, 16, 30), {"embedding_size": 2, "hidden_layers": 1}, id="plain"),
-    pytest.param(
-        (1, 17, 16, 16),
-        {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
-        id="one key frame, linear readout",
-    ),
-    pytest.param(
-        (3, 1, 33, 2), {"embedding_size": 3, "hidden_layers": 2}, id="thin axes, two hidden layers"
-    ),
-    pytest.param((2, 5, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="a column"),
-    pytest.param((2, 1, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="one voxel"),
-    pytest.param(
-        (3, 30, 40, 50),
-        {"embedding_size": 2, "hidden_layers": 1, "low": 0.9999},
-        id="a few vertices far apart",
-    ),
-]
-
-
 @pytest.fixture
-def engines_of(noise_coreset):
-    """A function of a shape and settings: coreset, slab engine, and the oracle in float64."""
+def engines_of(model_of):
+    """A function of a case: coreset, slab engine, and the oracle in float64."""
 
-    def make(shape, settings):
-        coreset = noise_coreset(shape, settings.get("low", 0.3))
-        settings = {name: value for name, value in settings.items() if name != "low"}
-        architecture = Architecture.for_box(coreset.box.shape, shape[0], width=16, **settings)
-        rates = np.full(201, 0.01)
-        slab = SlabEngine(architecture, coreset, rates, seed=7, device=CPU)
-        oracle = NaiveEngine(architecture, coreset, rates, seed=7)
-        return coreset, slab, oracle
+    def make(case):
+        coreset, architecture = model_of(case)
+        slab = SlabEngine(architecture, coreset, RATES, seed=7, device=CPU)
+        return coreset, slab, NaiveEngine(architecture, coreset, RATES, seed=7)
 
     return make
 
 
-@pytest.mark.parametrize(("shape", "settings"), CASES_SLAB)
-def test_slab_equals_the_oracle_before_training(engines_of, shape, settings) -> None:
-    coreset, slab, oracle = engines_of(shape, settings)
-    bricks = np.arange(len(coreset.bricks))
-    values = slab.infer(bricks).numpy()
-    assert values.shape == coreset.values.shape
-    np.testing.assert_allclose(values, oracle.infer(bricks).numpy(), atol=2e-7)
-
-
-@pytest.mark.parametrize(("shape", "settings"), CASES_SLAB)
-def test_slab_trains_like_a_dense_adam_though_it_visits_few_bricks_a_step(
-    engines_of, shape, settings
-) -> None:
-    coreset, slab, oracle = engines_of(shape, settings)
-    bricks, random = len(coreset.bricks), np.random.default_rng(1)
-    for _ in range(40):
-        chosen = random.permutation(bricks)[: max(1, bricks // 3)]
-        error = float(slab.train(chosen))
-        assert error == pytest.approx(float(oracle.train(chosen)), rel=1e-3, abs=1e-6)
-    assert_near(slab.parameters(), oracle.parameters())
-
-
 def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(engines_of) -> None:
-    _, slab, oracle = engines_of((3, 30, 40, 50), {"low": 0.9999})
+    _, slab, oracle = engines_of("a few vertices far apart")
     coarse = sum(len(table) * 2 for table in list(oracle.model.tables)[1:])
     assert 0 < len(slab.upsampling.used) < 0.6 * coarse
     assert slab.parameters().coarse.numel() == coarse
@@ -305,7 +264,7 @@ def test_samples_alone_give_the_same_gradients_as_all_vertices_of_sparse_bricks(
     gradients, errors, moments = [], [], []
     for full in (1.0, -1.0):
         monkeypatch.setattr("fhash_codec.paper.engines.slab.FULL", full)
-        coreset, slab, _ = engines_of(shape, settings)
+        coreset, slab, _ = engines_of((shape, settings))
         errors.append(float(slab.train(np.arange(len(coreset.bricks)))))
         gradients.append(slab.gradient.clone())
         moments.append(slab.fine_mean.clone())

@@ -53,11 +53,9 @@ inline Place block, grid;
 inline std::function<void()> body;
 inline float4* shared;
 inline sigjmp_buf escape;
-inline int skipped;  // line of a barrier that is left out
 
 // Signal masks are of no interest, and to save them takes a call of the system at each change.
 inline void wait(int line) {
-    if (line == skipped) return;
     now->barrier = line;
     if (!_setjmp(now->at)) _longjmp(scheduler, 1);
 }

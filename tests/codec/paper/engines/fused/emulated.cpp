@@ -1,5 +1,5 @@
-// A library of the kernels in the file KERNELS, with a function that launches them, and one that
-// leaves out the barrier of a line. FHASH_KERNELS lists them as FHASH_KERNEL(name), ...
+// A library of the kernels in the file KERNELS, with a function that launches them.
+// FHASH_KERNELS lists them as FHASH_KERNEL(name), ...
 #include "emulate.hpp"
 #include KERNELS
 
@@ -15,5 +15,3 @@ extern "C" int launch(
             return emulated::launch(blocks, THREADS, bytes, order, bind(arguments));
     return 2;
 }
-
-extern "C" void skip_barrier(int line) { emulated::skipped = line; }

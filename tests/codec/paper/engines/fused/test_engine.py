@@ -104,49 +104,6 @@ def test_the_order_of_the_threads_changes_nothing(engines_of) -> None:
             np.testing.assert_array_equal(ours, theirs)
 
 
-def within_the_rows(text: str) -> str:
-    """The kernels with places of finest embeddings that stay in their rows.
-
-    A missing barrier makes them wrong, and wrong ones would destroy other memory.
-    """
-    place = "e * model.fine_row + brick.offset + samples_before(model, brick, samples, vertex)"
-    within = place.replace("brick.offset + ", "(brick.offset + (unsigned)") + ") % model.fine_row"
-    assert place in text
-    return text.replace(place, within)
-
-
-def test_every_barrier_is_needed_and_its_absence_is_found(engines_of) -> None:
-    """Without a barrier, some order of the threads gives other numbers, or none at all."""
-
-    def run(order, barrier):
-        coreset, fused, _, _ = engines_of(
-            (2, 9, 9, 13), {"hidden_layers": 2}, order=order, change=within_the_rows
-        )
-        fused._program.library.skip_barrier(barrier)
-        try:
-            return fused._sizes.text(), trained(fused, coreset)
-        except Unavailable:
-            return "", None
-        finally:
-            fused._program.library.skip_barrier(0)
-
-    def differs(numbers):
-        return numbers is None or any(
-            not np.allclose(ours, theirs, rtol=1e-4, atol=1e-4 * np.abs(theirs).max())
-            for ours, theirs in zip(numbers, usual, strict=True)
-        )
-
-    text, usual = run(0, 0)
-    barriers = [
-        number
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip().startswith("__syncthreads()")
-    ]
-    assert len(barriers) > 20
-    unseen = [b for b in barriers if not any(differs(run(order, b)[1]) for order in (0, 1, 5))]
-    assert not unseen, [text.splitlines()[number - 2] for number in unseen]
-
-
 def test_each_engine_goes_on_with_the_other_ones_state(engines_of) -> None:
     coreset, fused, slab, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
     _, straight, _, _ = engines_of((3, 9, 10, 20), {"hidden_layers": 1})
@@ -313,49 +270,6 @@ def test_a_call_is_one_launch_and_no_wait(emulated, networks) -> None:
         assert pretended.counts == {"launches": 1}
         ours = [result.cpu().numpy() for result in results]
     np.testing.assert_allclose(ours[0], expected[0], rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("layers", [0, 2])
-def test_every_barrier_is_needed_and_its_absence_is_found_points(
-    points_of, networks, layers
-) -> None:
-    """Without a barrier, some order of the threads gives other numbers, or none at all."""
-    network = networks.random((5, 13, 18), 4, 2, 2, layers, width=20)
-    places = places_in(network)
-
-    def run(order, barrier):
-        points = points_of(network, order=order)
-        points._program.library.skip_barrier(barrier)
-        try:
-            return evaluated(points, places)
-        except Unavailable:
-            return None
-        finally:
-            points._program.library.skip_barrier(0)
-
-    usual = run(0, 0)
-    lines = points_of(network)._sizes.text().splitlines()
-    begin = next(
-        i for i, line in enumerate(lines) if line.startswith("__device__ inline void run_")
-    )
-    barriers = [
-        number
-        for number, line in enumerate(lines, 1)
-        if number > begin and line.strip().startswith("__syncthreads()")
-    ]
-    kinds = {0: 4, 2: 8}
-    seen = [
-        barrier
-        for barrier in barriers
-        if any(
-            result is None
-            or any(not np.array_equal(a, b) for a, b in zip(result, usual, strict=True))
-            for result in (run(order, barrier) for order in ORDERS)
-        )
-    ]
-    # Those between hidden layers are not reached without any.
-    assert len(barriers) == kinds[2]
-    assert len(seen) == kinds[layers], [lines[number - 2] for number in set(barriers) - set(seen)]
 
 
 @pytest.mark.parametrize(
