@@ -270,6 +270,18 @@ def goal_of(
 
     Raises InputError for a promise about a bulk that is not there.
     """
+    goal = _goal_of(config, value_range, raw_bytes, bulk, integers=integers)
+    return replace(goal, overhead=overhead)
+
+
+def _goal_of(
+    config: EncodeConfig,
+    value_range: ValueRange,
+    raw_bytes: int,
+    bulk: ValueRange | None,
+    *,
+    integers: bool,
+) -> Goal:
     data_range = value_range.high - value_range.low
     error = config.max_error
     if config.max_error_rel is not None:
@@ -279,7 +291,7 @@ def goal_of(
     if error is not None:
         return Goal(error=error, data_range=data_range, lossless=error == 0)
     if config.ratio is not None:
-        return Goal(size=raw_bytes / config.ratio, data_range=data_range, overhead=overhead)
+        return Goal(size=raw_bytes / config.ratio, data_range=data_range)
     promised = promise(config, value_range, bulk)
     psnr, psnr_bulk = promised.get("psnr"), promised.get("psnr_bulk")
     if psnr_bulk is None or bulk is None:

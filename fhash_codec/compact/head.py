@@ -19,33 +19,71 @@ from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.transform.tile_format import TileSettings
 
+PERCEPTRON = Shape((12, 8), cross=False)
+"""Head without a cross: where little is to be gained, its fewer weights may win."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A quick training, whose gain tells which heads are worth a full one."""
+
+    shape: Shape
+    budget: Budget
+    factor: float
+    """Gain of the full training of this head as a multiple of the gain of the trial, roughly."""
+    besides: float
+    """Gain in dB of the full training besides that multiple."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
     """Effort that is spent on the choice of a head."""
 
+    trial: Trial
     candidates: int
-    """Number of the first entries of GAIN_BY_WIDTHS that are considered."""
-    budget: Budget
-    """Training of a head with a cross."""
+    """Number of the first entries of GAIN_BY_WIDTHS that are considered; 0 for no cross."""
+    budget: Budget | None
+    """Training of a head with a cross; None for none."""
     perceptron: Budget
-    """Training of the perceptron, whose updates cost a fifth."""
+    """Training of the perceptron, whose updates cost a sixth."""
+    least: float = 0.0
+    """Share of the file that a head must be expected to save."""
 
     def budget_of(self, shape: Shape) -> Budget:
         """Return the training of a head of a shape."""
-        return self.budget if shape.cross else self.perceptron
+        if not shape.cross:
+            return self.perceptron
+        assert self.budget is not None
+        return self.budget
+
+    def expected_gain(self, gain_of_trial: float) -> float:
+        """Return the gain in dB that a full training of the trial head is expected to have."""
+        return self.trial.factor * gain_of_trial + self.trial.besides
 
 
 GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
 EFFORTS = {
     5: Effort(
-        candidates=4,
-        budget=Budget(updates=1300, samples=400_000, rate=3e-2),
-        perceptron=Budget(updates=5200, samples=800_000),
+        trial=Trial(
+            shape=PERCEPTRON,
+            budget=Budget(updates=400, samples=160_000, rate=3e-2),
+            factor=1.2,
+            besides=0.02,
+        ),
+        candidates=0,
+        budget=None,
+        perceptron=Budget(updates=2000, samples=400_000, rate=3e-2),
+        least=0.003,
     ),
     **{
         effort: Effort(
+            trial=Trial(
+                shape=Shape((8, 8), cross=True),
+                budget=Budget(updates=400, samples=160_000, rate=3e-2),
+                factor=1.2,
+                besides=0.02,
+            ),
             candidates=candidates,
             budget=Budget(updates=updates, samples=400_000),
             perceptron=Budget(updates=2 * updates, samples=800_000),
@@ -56,17 +94,10 @@ EFFORTS = {
         )
     },
 }
-"""Effort spent on heads by the effort of the encoder; below 5 there is no head."""
-TRIAL_HEAD = Shape((8, 8), cross=True)
-"""Head of the quick trial."""
-TRIAL_BUDGET = Budget(updates=400, samples=160_000, rate=3e-2)
-"""Training of the quick trial."""
-PERCEPTRON = Shape((12, 8), cross=False)
-"""Head that competes, too: where little is to be gained, its fewer weights may win."""
-GAIN_FACTOR = 1.2
-"""Gain of the full training as a multiple of the gain of the trial, roughly."""
-GAIN_BESIDES = 0.02
-"""Gain in dB of the full training besides that multiple."""
+"""Effort spent on heads by the effort of the encoder; below 5 there is no head.
+
+At 5 a cross is left out: it gains up to a fifth more, and takes six times as long.
+"""
 MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
@@ -79,12 +110,9 @@ WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
 
 
-def expected_gain(gain_of_trial: float) -> float:
-    """Return the gain in dB that a full training of the trial head is expected to have."""
-    return GAIN_FACTOR * gain_of_trial + GAIN_BESIDES
-
-
-def likely_heads(size: float, gain: float, octave: float, effort: int) -> list[Shape]:
+def likely_heads(
+    size: float, gain: float, octave: float, effort: Effort, *, besides: float = 0.0
+) -> list[Shape]:
     """Return the heads that are worth a training; none where none should save anything.
 
     That with a cross and the perceptron are both trained where nothing but a training says which of
@@ -93,12 +121,16 @@ def likely_heads(size: float, gain: float, octave: float, effort: int) -> list[S
     size: bytes of the coded tiles.
     gain: expected gain in dB of a head of the widths of the trial head.
     octave: dB that an octave of bytes buys.
+    besides: bytes of the file without the tiles.
     """
+    if not effort.candidates:
+        saves = _saved(PERCEPTRON, size, gain, octave)
+        return [PERCEPTRON] if saves > effort.least * (size + besides) else []
 
     def saved(widths: tuple[int, int]) -> float:
         return _saved(Shape(widths, cross=True), size, GAIN_BY_WIDTHS[widths] * gain, octave)
 
-    widths = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
+    widths = max(list(GAIN_BY_WIDTHS)[: effort.candidates], key=saved)
     if saved(widths) <= 0:
         most = _saved(PERCEPTRON, size, MAX_OF_TRIAL * gain, octave)
         return [PERCEPTRON] if most > 0 else []
@@ -162,7 +194,7 @@ def choose_head(
     look: codes the sample once, as that search does.
     """
     sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
-    data_range, effort = task.goal.data_range, task.config.effort
+    data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
     # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
     aim = None if task.goal.psnr is None else task.goal.psnr + AIM
     if outcome.size < MIN_BYTES:
@@ -176,17 +208,18 @@ def choose_head(
 
     with stage("head trial", "gain of a quick training, by which heads are chosen"):
         pairs = training_pairs(sample, settings, attempt.coding)
-        trial = train(TRIAL_HEAD, TRIAL_BUDGET, tell)
+        trial = train(spent.trial.shape, spent.trial.budget, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
         skip("head", "its trial gains nothing")
         return settings, outcome, []
     octave = octave_gain(attempt.tried, data_range)
-    shapes = likely_heads(outcome.size, expected_gain(trial.gain_db), octave, effort)
+    gain = spent.expected_gain(trial.gain_db)
+    shapes = likely_heads(outcome.size, gain, octave, spent, besides=task.goal.overhead)
     if not shapes:
         gained = f"its trial gained {trial.gain_db:.2f} dB"
-        skip("head", f"{gained}: no head would save what it takes itself")
+        skip("head", f"{gained}: no head would save enough")
         return settings, outcome, []
-    why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
+    why = f"at effort {task.config.effort}; its trial gained {trial.gain_db:.2f} dB"
     with stage("head", why):
         # A head is trained on what it will meet: coarser data, which it lifts to the promise.
         coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
@@ -197,7 +230,7 @@ def choose_head(
             pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, attempt.coding)
 
         def train_fully(shape: Shape, tell: Callable[[float], None]) -> TrainedHead | None:
-            return train(shape, EFFORTS[effort].budget_of(shape), tell)
+            return train(shape, spent.budget_of(shape), tell)
 
         trained = _side_by_side(shapes, train_fully, task.parts)
         heads = [head for head in trained if head is not None]

@@ -365,16 +365,16 @@ class Shape:
     def weights(self) -> int:
         """Number of weights, biases not included."""
         first, second = self.widths
-        return INPUTS * first + self._seen * first * second + second
+        return INPUTS * first + self.looked_at * first * second + second
 
     @property
     def products(self) -> int:
         """Multiplications for a voxel in training."""
         first, second = self.widths
-        return self._seen * (INPUTS * first + first * second) + second
+        return self.looked_at * (INPUTS * first + first * second) + second
 
     @property
-    def _seen(self) -> int:
+    def looked_at(self) -> int:
         """Voxels whose first layer the second layer sees."""
         return len(CROSS) if self.cross else 1
 

@@ -330,7 +330,7 @@ def plan(
         return found
     exact_task = replace(
         task,
-        goal=integer_goal(0, goal.data_range),
+        goal=replace(integer_goal(0, goal.data_range), overhead=goal.overhead),
         gains=GainLog(OVERHEAD_BYTES),
         parts=Parts("planning exact values", STAGES, progress),
     )

@@ -22,9 +22,6 @@ from fhash_codec.compact.head import (
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
-    TRIAL_BUDGET,
-    TRIAL_HEAD,
-    expected_gain,
     likely_heads,
 )
 from fhash_codec.compact.head_training import Budget
@@ -62,7 +59,6 @@ from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Series, StepsSeries
 from fhash_formats.support.threads import thread_pool, usable_threads
-from fhash_formats.transform.head import CROSS
 from fhash_formats.transform.tile_format import Shape
 
 TRIES = 2.5
@@ -273,20 +269,23 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     # Without a bound the tiles are coded already, and are only decoded.
     known = rates.search if strict else rates.decode
     pairs = work.wall(known, tile, searched)
-    seconds = {"head trial": pairs + _training(head, TRIAL_BUDGET, 1.0, 1.0)}
+    spent = EFFORTS[config.effort]
+    seconds = {"head trial": pairs + _training(head, spent.trial.budget, 1.0, 1.0)}
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:
         return seconds
-    shapes = likely_heads(size, expected_gain(gain), EXCHANGE, config.effort)
+    shapes = likely_heads(
+        size, spent.expected_gain(gain), EXCHANGE, spent, besides=look.task.goal.overhead
+    )
     if not shapes:
         return seconds
-    spent = EFFORTS[config.effort]
+    trial = spent.trial.shape
     parts = [
         _training(
             head,
             spent.budget_of(shape),
-            shape.products / TRIAL_HEAD.products,
-            1.0 if shape.cross else 1 / len(CROSS),
+            shape.products / trial.products,
+            shape.looked_at / trial.looked_at,
         )
         for shape in shapes
     ]

@@ -24,7 +24,7 @@ from fhash_codec.compact.attempt import (
     parse_tile,
 )
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.head import TRIAL_HEAD, training_pairs
+from fhash_codec.compact.head import EFFORTS, training_pairs
 from fhash_codec.compact.head_training import (
     BATCH_VOXELS,
     CHOSEN_AT,
@@ -396,7 +396,8 @@ def probe_head(look: Look, rates: Rates, config: EncodeConfig) -> HeadProbe | No
     begun = now()
     low, high = rates.settings.low, rates.settings.high
     budget = Budget(updates=HEAD_UPDATES, samples=HEAD_SAMPLES)
-    trained = train_head(pairs, low, high, TRIAL_HEAD, budget, seed=config.seed)
+    shape = EFFORTS[config.effort].trial.shape
+    trained = train_head(pairs, low, high, shape, budget, seed=config.seed)
     if trained is None:
         return None
     seconds = now() - begun
