@@ -37,7 +37,7 @@ from fhash_codec.compact.stages import (
 )
 from fhash_codec.compact.step import allows_trellis
 from fhash_codec.compact.tilings import PICKED_VERTICES, largest_tile
-from fhash_codec.compact.transform import basis_bytes, count_trials
+from fhash_codec.compact.transform import CODED, basis_bytes, count_trials
 from fhash_codec.comparison import ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.probe import (
@@ -205,11 +205,15 @@ def _choices(work: _Work) -> dict[str, float]:
         search = work.tries(TRIES) * work.wall(rates.trial, tile, tried)
         if "transform" in config.without:
             trials = bases = 0
-        coding = TRIAL_SHARE * work.wall(rates.trial, tile, trials * tried)
+        coded = trials if rates.price is None else min(trials, CODED)
+        coding = TRIAL_SHARE * work.wall(rates.trial, tile, coded * tried)
+        pricing = work.wall(rates.price or 0.0, tile, trials * tried)
         if prod(tile) > LARGE * TRIAL_VERTICES:
             # A part stands for the tile in all trials but two.
-            parts = trials * TRIAL_VERTICES / usable_threads() + 2 * prod(tile)
-            coding = TRIAL_SHARE * rates.trial * parts
+            part = TRIAL_VERTICES / usable_threads()
+            coding = TRIAL_SHARE * rates.trial * (coded * part + 2 * prod(tile))
+            pricing = (rates.price or 0.0) * trials * part
+        coding += pricing
         seconds["transform"] = coding + search
         seconds["bases"] = bases * rates.basis * work.vertices
         if look.task.fixed_tile is None and "tiles" not in config.without:
@@ -252,8 +256,11 @@ def _tiles(work: _Work) -> float:
     # Some of the tilings have few tiles, which leave a thread without work.
     share = (1 + 1 / usable_threads()) / 2
     picked = PICKS * min(PICKED_VERTICES, prod(tried)) / usable_threads()
-    once = share * prod(tried) + picked
-    return look.costing + TILINGS * TRIAL_SHARE * rates.trial * once
+    if rates.price is None:
+        once = TRIAL_SHARE * rates.trial * (share * prod(tried) + picked)
+    else:
+        once = TRIAL_SHARE * rates.trial * share * prod(tried) + rates.price * picked
+    return look.costing + TILINGS * once
 
 
 def _head(work: _Work, head: HeadProbe) -> dict[str, float]:

@@ -35,7 +35,7 @@ from fhash_codec.compact.head_training import (
 )
 from fhash_codec.compact.plan import LabelTrial, has_labels, look_at_labels
 from fhash_codec.compact.predictor import TRIAL_ROWS, IntegerTile, fit_weights
-from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.sample import Sample, priced
 from fhash_codec.compact.stages import first_guess, first_settings
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile, code, total
@@ -172,6 +172,7 @@ class Rates:
 
     Attributes:
         trial: coding as for a trial of a transform.
+        price: pricing as for one; None where the encoder codes all trials.
         search: coding as for the search of a step.
         final: coding of all tiles for the file, filling included.
         fill: filling of the vertices that do not count, at density 2; 0 where all count.
@@ -188,6 +189,7 @@ class Rates:
     """
 
     trial: float
+    price: float | None
     search: float
     final: float
     fill: float
@@ -221,6 +223,11 @@ def probe_rates(look: Look, config: EncodeConfig) -> Rates:
     if _is_far(look, outcome):
         settings, _ = find_step(sample, settings, look.attempt.coding, task.goal, tries=4)
         trial, outcome, coded = coded_tiles(sample, settings, trial_coding)
+    trials, price = priced(sample, settings, effort), None
+    if trials is not sample:
+        begun = now()
+        trials.run_all([(settings, trial_coding)])
+        price = (now() - begun) * usable_threads() / _vertices(sample)
     bases = 0.0
     if effort > 1 and "transform" not in config.without:
         with recording() as clock:
@@ -244,6 +251,7 @@ def probe_rates(look: Look, config: EncodeConfig) -> Rates:
     vertices = prod(task.blocks.shape)
     return Rates(
         trial=trial,
+        price=price,
         search=search,
         final=final,
         fill=fill,
