@@ -39,7 +39,6 @@ from fhash_codec.rendering.march import (
     March,
     MarchInput,
     march_native,
-    numbers,
 )
 from fhash_codec.rendering.march_task import GRADES, Grading, Lighting, Surface
 from fhash_codec.rendering.plan import plan_picture
@@ -471,7 +470,7 @@ def test_both_sides_have_the_same_constants() -> None:
 
 
 def test_a_structure_keeps_its_arrays_and_refuses_those_of_another_type() -> None:
-    structure = March(values=np.arange(1000, dtype=np.float32), depth=None, eye=numbers([1, 2, 3]))
+    structure = March(values=np.arange(1000, dtype=np.float32), depth=None, eye=np.arange(1.0, 4))
     assert structure.values[999] == 999
     assert not structure.depth
     assert list(structure.eye) == [1.0, 2.0, 3.0]
@@ -499,11 +498,12 @@ def test_places_of_the_domain_are_those_of_the_frame() -> None:
     whole = input_of(np.zeros(COUNTS[::-1]), 0.0, 1.0, 0.5, first=(0, 0, 0))
     part = input_of(values, 0.0, 1.0, 0.5, first=(2, 4, 6), stride=2)
     shift = np.array([6.0, 4.0, 2.0])
-    np.testing.assert_array_equal(part.eye, (whole.eye - shift) / 2)
-    np.testing.assert_array_equal(part.forward, whole.forward / 2)
-    np.testing.assert_array_equal(part.box, (whole.box - shift[:, None]) / 2)
-    np.testing.assert_array_equal(part.spacing, 2 * whole.spacing)
-    np.testing.assert_array_equal(part.seen, [[0, 4], [0, 3], [0, 2]])
+    part, whole = part.fields, whole.fields
+    np.testing.assert_array_equal(part["eye"], (whole["eye"] - shift) / 2)
+    np.testing.assert_array_equal(part["forward"], whole["forward"] / 2)
+    np.testing.assert_array_equal(part["box"], (whole["box"] - shift[:, None]) / 2)
+    np.testing.assert_array_equal(part["spacing"], 2 * whole["spacing"])
+    np.testing.assert_array_equal(part["seen"], [[0, 4], [0, 3], [0, 2]])
 
 
 @pytest.mark.parametrize(
@@ -513,9 +513,9 @@ def test_values_are_scaled_to_what_float32_can_compute_with(low: float, high: fl
     shares = np.linspace(0, 1, 27).reshape(3, 3, 3)
     given = input_of(low + shares * (high - low), low, high, (low + high) / 2, first=(0, 0, 0))
     assert 1e-28 < given.high - given.low < MAX_MAGNITUDE
-    scaled = (given.values - given.low) / (given.high - given.low)
+    scaled = (given.fields["values"] - given.low) / (given.high - given.low)
     np.testing.assert_allclose(scaled, shares, atol=1e-5)
-    assert given.levels[0] == pytest.approx((given.low + given.high) / 2)
+    assert given.fields["surface"][0, 0] == pytest.approx((given.low + given.high) / 2)
 
 
 CENTRAL = Lighting(
