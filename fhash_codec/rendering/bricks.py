@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Table, Task
 from fhash_formats.support.threads import in_threads
 
@@ -92,7 +93,6 @@ class Palette:
         return before, entry - before
 
 
-Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Result = TypeVar("Result")
 

@@ -11,12 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
-
-Floats = npt.NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "iso": ((1, 1, 1), (0, 0, 1)),

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.image import Draw, Image
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scenes import Scene, digest_in_png, scene_in_png
+from fhash_codec.rendering.scenes import DIGEST_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.rendering.timeline import Animation
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -455,7 +455,8 @@ def _is_good(path: Path, scene: Scene, volume: Volume) -> bool:
             path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers
         ):
             return False
-        return digest_in_png(path) == volume.container.digest and scene_in_png(path) == scene
+        is_of_volume = text_in_png(path, DIGEST_KEY) == volume.container.digest.encode()
+        return is_of_volume and scene_in_png(path) == scene
     except (OSError, InputError):
         return False
 

@@ -14,6 +14,8 @@ from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
 
 Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+Vector = tuple[float, float, float]
 
 TOLERANCE = 1e-3
 """Largest distance of even coordinates from evenly spaced ones, as a share of the extent."""
@@ -212,8 +214,6 @@ def _unwrapped(degrees: Floats) -> Floats:
     steps = np.abs(np.diff(degrees))
     return np.unwrap(degrees, period=360.0) if np.any(np.abs(steps - 360) < 180) else degrees
 
-
-Vector = tuple[float, float, float]
 
 MAX_AXES_RATIO = 1e14
 """Largest ratio of the longest axis to the shortest vertex spacing.

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid, Single
 from fhash_codec.rendering.march_task import (
     GRADES,
     Frame,
@@ -39,8 +38,6 @@ from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads
-
-Floats = npt.NDArray[np.float64]
 
 FLATTEST = 1e-6
 """Gradient, as a share of the value range per vertex, at which shading has faded by half. The
@@ -111,8 +108,6 @@ def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
         factors: Floats = np.clip(grid.vertex_spacing / (span * grid.spacing), -limit, limit)
     return factors
 
-
-Single = npt.NDArray[np.float32]
 
 LEAST_TOP = 1e-300
 """Least gradient of the last factor in marched units, so that there are numbers to divide by it."""

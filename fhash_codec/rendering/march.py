@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
+from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
     GRADES,
@@ -134,8 +135,6 @@ class March(ctypes.Structure):
         self._arrays = tuple(arrays.values())
         super().__init__(**fields)
 
-
-Single = npt.NDArray[np.float32]
 
 MAX_MAGNITUDE = 1e36
 """Largest magnitude of values that float32 can compute with; larger values are scaled."""

@@ -16,7 +16,7 @@ from fhash_codec.boxes import MAX_LOD, Box
 from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.layout import Layout, lay_out, quantity_of
 from fhash_codec.rendering.light import (
     coding_noise,
@@ -325,8 +325,6 @@ def _end_text(plan: Plan) -> str:
         return f"where less than {threshold:.3g} of the light is left"
     return "behind the volume"
 
-
-Floats = npt.NDArray[np.float64]
 
 LONG_RAY = 10**5
 """Samples of a ray above which a warning is given: a picture of usual size then takes minutes."""

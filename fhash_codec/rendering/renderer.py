@@ -483,12 +483,4 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
         if after != before:
             share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
             values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
-    return Frame(
-        values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod
-    )
-
-
-def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:
-    """Values in the units of the march, float32 and contiguous."""
-    converted = values if units == Units() else units.to(values)
-    return np.ascontiguousarray(converted, dtype=np.float32)
+    return Frame(values=units.single(values), first=(first[0], first[1], first[2]), stride=1 << lod)

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.records import Record, limits
 from fhash_codec.rendering.cameras import CameraPath
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.times import time_range
 from fhash_codec.volume import Volume
@@ -70,8 +69,6 @@ def _mixed_colour(first: str, second: str, weight: float) -> str:
         return first
     return colour_code((1 - weight) * colours[0] + weight * colours[1])
 
-
-Floats = npt.NDArray[np.float64]
 
 STEP_DIGITS = 12
 """Decimals of a step: later ones are rounding, and whole steps need only one decoded frame."""

@@ -23,14 +23,12 @@ from fhash_codec.features.features import (
 from fhash_codec.features.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Isosurface, LegendEntry, Scene, TransferFunctionSpec
 from fhash_codec.rendering.transfer_function import opacity_preset, raised
 from fhash_codec.volume import Volume, feature_names, holds_features_apart
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
-
-Floats = npt.NDArray[np.float64]
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#555555")
 """Default colours of features: Okabe and Ito chose them to be told apart by colour-blind people."""

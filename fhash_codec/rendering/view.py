@@ -10,12 +10,10 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid, Warp
+from fhash_codec.rendering.grid import Floats, Grid, Warp
 from fhash_codec.rendering.scenes import Clip
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
-
-Floats = npt.NDArray[np.float64]
 
 SNAP = 1e-6
 """Distance from a vertex, in vertices, at which a clip's end is taken for the vertex: coordinates

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Finding, Run
 from fhash_formats.errors import FhashError, RegionError
 from fhash_formats.series import AXIS_NAMES, ArraySeries, Coordinate
 
 Shape = tuple[int, int, int, int]
-Floats = npt.NDArray[np.float64]
 Values = npt.NDArray[Any]
 
 SHAPE: Shape = (4, 9, 10, 11)

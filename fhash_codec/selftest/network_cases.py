@@ -17,13 +17,12 @@ from fhash_codec.encoding import encode
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import ArrayTable, Network, NumberType
 from fhash_codec.paper.storage import load_network
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
 from fhash_codec.selftest.field_cases import Settings, noise, series, single, waves
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
-
-Floats = npt.NDArray[np.float64]
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 rounding."""

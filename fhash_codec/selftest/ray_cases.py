@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Task, warped
 from fhash_codec.rendering.plan import Plan, plan_picture
@@ -18,8 +19,6 @@ from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest.case import Case, Check, Finding, Run
 from fhash_codec.selftest.field_cases import Settings, Shape, series, single, waves
 from fhash_formats.series import ArraySeries
-
-Floats = npt.NDArray[np.float64]
 
 SNAP = 1e-9
 """Distance from a vertex, in vertex spacings, below which a coordinate is that of the vertex."""
