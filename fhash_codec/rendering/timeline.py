@@ -89,28 +89,13 @@ class Clock:
     physical: bool
 
     @classmethod
-    def of_steps(cls, steps: tuple[float, float], volume: Volume) -> Clock:
-        """A clock from the first step to the last; raises RegionError outside the series."""
-        values = np.array([_step(Scene(step=step), volume) for step in steps])
-        return cls(at=np.array([0.0, 1.0]), values=values, physical=False)
-
-    @classmethod
-    def of_times(cls, times: tuple[float, float], volume: Volume) -> Clock:
-        """A clock from the first physical time to the last; raises RegionError outside."""
-        for time in times:
-            _step(Scene(time=time), volume)
-        return cls(at=np.array([0.0, 1.0]), values=np.array(times), physical=True)
-
-    @classmethod
-    def of_scenes(cls, at: Floats, scenes: Sequence[Scene], volume: Volume) -> Clock | None:
-        """A clock through the steps of scenes; None if they all have the same.
-
-        Raises RegionError for a scene outside the series.
-        """
+    def of(
+        cls, at: Floats, scenes: Sequence[Scene], volume: Volume, *, physical: bool = False
+    ) -> Clock:
+        """A clock through the steps, or the times, of scenes; raises RegionError outside."""
         steps = [_step(scene, volume) for scene in scenes]
-        if all(step == steps[0] for step in steps):
-            return None
-        return cls(at=at, values=np.array(steps), physical=False)
+        values = [scene.time for scene in scenes] if physical else steps
+        return cls(at=at, values=np.array(values, dtype=np.float64), physical=physical)
 
     def moment(self, share: float) -> dict[str, float | None]:
         """The fields `step` and `time` of a scene at a share of the animation."""
@@ -152,11 +137,14 @@ class Timeline:
             size=self._scenes[0].size,
         )
         # The steps of the keys are checked in any case.
-        self._clock = Clock.of_scenes(self._at, self._scenes, volume)
+        clock = Clock.of(self._at, self._scenes, volume)
+        self._clock = clock if np.ptp(clock.values) else None
+        ends = np.array([0.0, 1.0])
         if steps is not None:
-            self._clock = Clock.of_steps(steps, volume)
+            self._clock = Clock.of(ends, [Scene(step=step) for step in steps], volume)
         elif times is not None:
-            self._clock = Clock.of_times(times, volume)
+            given = [Scene(time=time) for time in times]
+            self._clock = Clock.of(ends, given, volume, physical=True)
         self._orbit = orbit
 
     def scene(self, share: float) -> Scene:
@@ -421,9 +409,8 @@ class Animation(Record):
             orbit=self.orbit,
         )
         if self.every is not None:  # the last picture may lie before the end of the range
-            for check, ends in ((Clock.of_steps, self.steps), (Clock.of_times, self.times)):
-                if ends is not None:
-                    check(ends, volume)
+            ends = [Scene(step=step) for step in self.steps or ()]
+            Clock.of(np.empty(0), [*ends, *(Scene(time=time) for time in self.times or ())], volume)
         shares = np.arange(self.count) / max(self.count if self.closed else self.count - 1, 1)
         return [timeline.scene(float(share)) for share in shares]
 
