@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.grid import Floats, Grid
+from fhash_codec.rendering.grid import Floats, Grid, vector
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
 
@@ -221,19 +221,19 @@ def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
     return unit, right / np.linalg.norm(right)
 
 
-def _turned(vector: Floats, axis: Floats, degrees: float) -> Floats:
+def _turned(given: Floats, axis: Floats, degrees: float) -> Floats:
     """Turn a vector about a unit axis, by Rodrigues' formula."""
     angle = np.radians(degrees)
     return np.asarray(
-        vector * np.cos(angle)
-        + np.cross(axis, vector) * np.sin(angle)
-        + axis * (axis @ vector) * (1 - np.cos(angle)),
+        given * np.cos(angle)
+        + np.cross(axis, given) * np.sin(angle)
+        + axis * (axis @ given) * (1 - np.cos(angle)),
         dtype=np.float64,
     )
 
 
-def _text(vector: Floats) -> str:
-    return ", ".join(f"{number:g}" for number in vector)
+def _text(numbers: Floats) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def pchip(at: Floats, values: Floats, share: float) -> Floats:
@@ -461,9 +461,9 @@ class CameraPath:
         return {
             "azimuth": 0.0,
             "elevation": 0.0,
-            "position": _triple(focal + away * distance),
-            "focal_point": _triple(focal),
-            "view_up": _triple(up),
+            "position": vector(focal + away * distance),
+            "focal_point": vector(focal),
+            "view_up": vector(up),
         }
 
     def _upright(self, rotations: Floats, share: float) -> tuple[Floats, Floats] | None:
@@ -519,8 +519,3 @@ def _pose(rays: Rays, camera: Camera) -> _Pose:
         distance=float(np.linalg.norm(eye - focal)),
         rotation=from_matrix(np.stack([np.cross(forward, up), up, -forward], axis=1)),
     )
-
-
-def _triple(vector: Floats) -> tuple[float, float, float]:
-    x, y, z = (float(number) for number in vector)
-    return x, y, z

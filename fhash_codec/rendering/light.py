@@ -353,12 +353,13 @@ def _sums(extinction: Single, step: Floats, count: int) -> Single:
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
     shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
-    _in_layers(
-        extinction.shape[0],
-        lambda z: library.fhash_march_sum(
+
+    def layer(z: int) -> None:
+        library.fhash_march_sum(
             extinction.ctypes.data, shape, along, count, z, z + 1, sums.ctypes.data
-        ),
-    )
+        )
+
+    list(in_threads(layer, range(len(extinction))))
     return sums
 
 
@@ -402,13 +403,8 @@ def _extinction(values: Single, table: Table, across: int, factors: Single | Non
             scratch.ctypes.data,
         )
 
-    _in_layers(points[0], layer)
+    list(in_threads(layer, range(points[0])))
     return out
-
-
-def _in_layers(count: int, function: Callable[[int], object]) -> None:
-    """Call a function of the layers 0 .. count - 1 in several threads."""
-    list(in_threads(function, range(count)))
 
 
 SHOULDER = (-0.7, 1.0, 1.0)

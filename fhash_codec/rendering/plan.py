@@ -406,12 +406,6 @@ def plan_at(plan: Plan, volume: Volume, scene: Scene) -> Plan:
     return replace(moved, reasons=tuple(reasons(moved, volume)))
 
 
-def parse_background(name: str) -> None:
-    """Raise InputError for a background that is neither a colour nor 'transparent'."""
-    if name != "transparent":
-        parse_colour(name)
-
-
 def _check(scene: Scene) -> None:
     """Raise InputError for a scene that asks for too much, for nothing or for a contradiction."""
     effects, nothing = scene.effects, scene.transfer_function.nothing
@@ -425,7 +419,8 @@ def _check(scene: Scene) -> None:
         raise InputError(
             "the scene is an evolution, of several pictures; leave 'evolution' out for one of them"
         )
-    parse_background(scene.background)
+    if scene.background != "transparent":
+        parse_colour(scene.background)
     if nothing and not effects.isosurfaces:
         raise InputError(
             "the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface"
@@ -571,16 +566,11 @@ def _table(function: TransferFunction, units: Units, whole: bool) -> Table:
     whole: whether it covers all colours, not only those of values that have an opacity.
     """
     if whole:
-        ends = function.colours.positions[[0, -1]]
-        function = replace(function, span=_about((float(ends[0]), float(ends[1]))))
+        first, last = (float(end) for end in function.colours.positions[[0, -1]])
+        function = replace(function, span=(first, last) if first < last else about(first))
     low, high, colours, extinctions = function.table()
     ends = units.to([low, high])
     return Table(low=float(ends[0]), high=float(ends[1]), colours=colours, extinctions=extinctions)
-
-
-def _about(ends: tuple[float, float]) -> tuple[float, float]:
-    """A range of values, widened where its ends are the same."""
-    return ends if ends[0] < ends[1] else about(ends[0])
 
 
 def _margin(task: Task, lod: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,13 +75,13 @@ def terms_of(scene: SimulatedScene, seed: int) -> Terms:
     """
     terms = Terms(spacing=spacing_of(scene))
     bodies = any(effect.role == "body" and not effect.idle for effect in scene.effects)
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for number, effect in enumerate(scene.effects):
         reason = effect.idle or ("" if bodies else "the scene has no body, so nothing shows it")
         if reason:
             terms.idle[number] = reason
             continue
-        counts[effect.kind] = counts.get(effect.kind, 0) + 1
+        counts[effect.kind] += 1
         key = [seed, zlib.crc32(effect.kind.encode()), counts[effect.kind]]
         _add(terms, number, effect, np.random.default_rng(key))
     return terms
@@ -135,12 +136,8 @@ class Counters:
     vertices: int = 0
     places: int = 0
     parts: int = 0
-    evaluations: dict[int, int] = field(default_factory=dict)
+    evaluations: Counter[int] = field(default_factory=Counter)
     stretches: int = 0
-
-    def add(self, number: int, count: int) -> None:
-        """Count places for which the effect of a number was computed."""
-        self.evaluations[number] = self.evaluations.get(number, 0) + count
 
 
 class Simulation(Series):
@@ -213,8 +210,7 @@ class Simulation(Series):
         for counters in done:
             self.counters.places += counters.places
             self.counters.stretches += counters.stretches
-            for number, count in counters.evaluations.items():
-                self.counters.add(number, count)
+            self.counters.evaluations += counters.evaluations
 
     def _values(self, block: Block, time: float, counters: Counters) -> Array:
         """The values of a block; a last layer beside it shows how distances change."""
@@ -236,7 +232,7 @@ class Simulation(Series):
         shifts: Shifts = {}
         for number, body in terms.bodies:
             surface = body.surface(place, time)
-            counters.add(number, surface.distance.size)
+            counters.evaluations[number] += surface.distance.size
             distance = self._bent(surface, body, time, shifts, counters)
             widths = stretch
             if terms.bends:
@@ -265,7 +261,7 @@ class Simulation(Series):
             start, stop = time * (part - 1) / parts, time * part / parts
             for number, flow in reversed(self.terms.flows):
                 place = flow.carry(place, start, stop)
-                counters.add(number, max(axis.size for axis in place))
+                counters.evaluations[number] += max(axis.size for axis in place)
         return place
 
     def _bent(
@@ -280,7 +276,7 @@ class Simulation(Series):
             key = number, body.middle
             if key not in shifts:
                 shifts[key] = bend(surface.waves(), body.middle is not None, time)
-                counters.add(number, shifts[key].size)
+                counters.evaluations[number] += shifts[key].size
             distance = distance - shifts[key] * np.float32(surface.scale)
         return distance
 
@@ -331,7 +327,7 @@ class Simulation(Series):
         spread, vertex = 4 * self.terms.diffusivity * time, VERTEX_WIDTH**2
         if spread:
             for number in self.terms.spreads:
-                counters.add(number, 1 if stretch is None else stretch[0].size)
+                counters.evaluations[number] += 1 if stretch is None else stretch[0].size
         if stretch is None:
             return min(vertex * max(self.terms.spacing) ** 2 + spread, MAX_WIDENING)
         change, steepest = stretch
@@ -439,7 +435,7 @@ def counts(simulation: Simulation) -> dict[str, Any]:
     kinds = {kind: {"made": 0, "places": 0} for kind in EFFECTS}
     for number, effect in enumerate(simulation.scene.effects):
         kinds[effect.kind]["made"] += number not in terms.idle
-        kinds[effect.kind]["places"] += counters.evaluations.get(number, 0)
+        kinds[effect.kind]["places"] += counters.evaluations[number]
     return {
         "frames": counters.frames,
         "vertices": counters.vertices,
