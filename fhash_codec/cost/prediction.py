@@ -441,7 +441,7 @@ class Predictor:
         The first one also pays for what is loaded and read for the first time. The encoding that
         follows does not pay it again.
         """
-        part, steps = self._part(LOOKED_AT), self._series.shape[0]
+        part, steps = self._windows(LOOKED_AT), self._series.shape[0]
         begun = now()
         look = look_at(part, steps, config, self._workers)
         if self._looks or now() - begun > SHORT_LOOK:
@@ -463,7 +463,7 @@ class Predictor:
     def _paper(self, config: EncodeConfig) -> Prediction:
         begun = now()
         key = replace(config, epochs=0, timings=True)
-        part = self._part(TRAINED_ON) if config.key_frames == "all" else self._series
+        part = self._windows(TRAINED_ON) if config.key_frames == "all" else self._series
         share = part.shape[0] / self._series.shape[0]
         if key not in self._trainings:
             self._trainings[key] = probe_paper(part, share, key)
@@ -480,7 +480,7 @@ class Predictor:
             stages=stages,
         )
 
-    def _part(self, vertices: int) -> Series:
+    def _windows(self, vertices: int) -> Series:
         """Return the series, or windows of it, evenly spread, of at most some vertices."""
         steps = self._series.shape[0]
         count = vertices // prod(self._series.shape[1:])

@@ -153,7 +153,7 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
         if len(report.encodings) > 1:
             yield Panel(key, "encode", title, x, y, traces)
     yield from _courses(report)
-    yield _foretold(report.encodings)
+    yield _predictions(report.encodings)
 
 
 def _frontier(points: Sequence[Encoded], x_of: Names, y_of: Names) -> Iterator[Trace]:
@@ -232,7 +232,7 @@ def _courses(report: CostReport) -> Iterator[Panel]:
     )
 
 
-def _foretold(points: Sequence[Encoded]) -> Panel:
+def _predictions(points: Sequence[Encoded]) -> Panel:
     """Seconds that were predicted beside those measured."""
     traces = []
     for place, group in enumerate(dict.fromkeys(point.group for point in points)):

@@ -106,7 +106,7 @@ largest magnitude.
 """
 LAYERS = 4
 """Layers of bricks that a thread looks at together."""
-KEPT = 3
+CACHED = 3
 """Results of each kind that bricks keep, by default: those of the last transfer functions."""
 SMALL = 2**18
 """Vertices of a frame below which threads take longer to start than the work takes."""
@@ -146,7 +146,7 @@ class Bricks:
         return (low, high) if low <= high else (0.0, 0.0)
 
     def remembered(
-        self, kind: str, key: object, compute: Callable[[], Result], most: int = KEPT
+        self, kind: str, key: object, compute: Callable[[], Result], most: int = CACHED
     ) -> Result:
         """The result of a function, kept from an earlier call with the same kind and key.
 

@@ -431,7 +431,7 @@ class CameraPath:
         if exact.size:
             return self.cameras[int(exact[0])]
         before = self.cameras[int(np.searchsorted(self.at, share)) - 1]
-        place = self._angles(share) if self._is_turning() else self._place(share)
+        place = self._angles(share) if self._is_turning() else self._position(share)
         return dataclasses.replace(before, **place, **self._lens(share))
 
     def _is_turning(self) -> bool:
@@ -448,7 +448,7 @@ class CameraPath:
         azimuth, elevation = pchip(self.at, angles, share)
         return {"azimuth": float(azimuth), "elevation": float(np.clip(elevation, -90, 90))}
 
-    def _place(self, share: float) -> dict[str, Any]:
+    def _position(self, share: float) -> dict[str, Any]:
         """Position, focal point and upward direction; the distance changes by constant factors."""
         poses = [_pose(Rays.of(camera, self.grid, self.size), camera) for camera in self.cameras]
         places = np.array([[*pose.focal, np.log(pose.distance)] for pose in poses])

@@ -227,7 +227,7 @@ def light_grid(
     unit = grid.vertex_spacing
     table = replace(table, extinctions=extinctions_in(table.extinctions, unit))
     cell = float(across * frame.stride)
-    kept = _Kept(
+    cache = _Cache(
         bricks,
         (
             *(table.low, table.high, table.extinctions.tobytes(), across, grid.spacing.tobytes()),
@@ -235,26 +235,26 @@ def light_grid(
             None if grading is None else (grading.top, grading.factors.tobytes()),
         ),
     )
-    extinction, first = kept(
+    extinction, first = cache(
         "extinction", (), lambda: _extinction_of(frame, grid, table, across, body, grading)
     )
     points = _Points(extinction=extinction, spacing=grid.spacing, cell=cell, unit=unit)
     shares = np.ones((*extinction.shape, 2), dtype=np.float32)
     rays = 0
     if shadows is not None and lamp is not None:
-        passed = kept("lamp", lamp.tobytes(), lambda: points.from_lamp(lamp))
+        passed = cache("lamp", lamp.tobytes(), lambda: points.from_lamp(lamp))
         shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
         rays += extinction.size
     if ambient_occlusion is not None:
         radius = ambient_occlusion.radius
-        around = kept("around", radius, lambda: points.from_around(radius))
+        around = cache("around", radius, lambda: points.from_around(radius))
         shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around)
         rays += extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Cache:
     """The light of one transfer function that bricks keep; without bricks nothing is kept."""
 
     bricks: Bricks | None

@@ -29,7 +29,7 @@ from fhash_codec.rendering.light import (
 from fhash_codec.rendering.march_task import MAX_VALUES, NUMPY, Arrays, Surface, Table, Task, Units
 from fhash_codec.rendering.scenes import DEVICES, AmbientOcclusion, Effects, Scene, Shadows
 from fhash_codec.rendering.transfer_function import Histogram, TransferFunction, about
-from fhash_codec.rendering.view import Body, part_in_view, part_of_body, pixel_vertices
+from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
 
@@ -374,9 +374,9 @@ def plan_picture(
     mode, why_mode = _mode(volume, scene)
     margin = _margin(task, lod)
     # Light comes from all of the volume, whether it is in view or not.
-    domain = part_of_body(volume, task.body, grid.warp, margin)
+    domain = region_of_body(volume, task.body, grid.warp, margin)
     lit = shadows is not None or occlusion is not None
-    region = domain if lit else part_in_view(rays, volume, task.body, margin)
+    region = domain if lit else region_in_view(rays, volume, task.body, margin)
     if mode == "cache" or lit:
         _check_frame(region, lod)
     plan = Plan(

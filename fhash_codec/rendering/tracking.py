@@ -137,11 +137,11 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
         scene,
         transfer_function=function,
         effects=effects,
-        features=scene.features or _held_apart(tracked, volume),
+        features=scene.features or _features_apart(tracked, volume),
     )
 
 
-def _held_apart(tracked: Sequence[Tracked], volume: Volume) -> tuple[str, ...]:
+def _features_apart(tracked: Sequence[Tracked], volume: Volume) -> tuple[str, ...]:
     """The tracked features if the file keeps each of them apart, so that the rest is skipped.
 
     Empty if some are not of the file: they may be anywhere in its coreset.
@@ -248,14 +248,14 @@ def follow(
         time = float(np.interp(step, np.arange(len(times)), times))
         for item, items_places in zip(tracked, places, strict=True):
             selected = np.asarray(item.feature.select(frame, int(step)))
-            items_places.append({"step": float(step), "time": time, **_place(selected, axes)})
+            items_places.append({"step": float(step), "time": time, **_extent(selected, axes)})
     return [
         {"feature": str(item.feature), "colour": item.colour, "steps": items_places}
         for item, items_places in zip(tracked, places, strict=True)
     ]
 
 
-def _place(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
+def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
     """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])

@@ -180,7 +180,7 @@ def pixel_vertices(rays: Rays) -> float:
     return 0.0 if np.array_equal(nearest, rays.eye) else width * max(depth, 0.0)
 
 
-def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: int = 0) -> Box:
+def region_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: int = 0) -> Box:
     """Find the region (z, y, x) of vertices around what is in view, widened to whole chunks.
 
     The region is all of the domain, or of what a clip leaves of it, where that is not much more,
@@ -192,7 +192,7 @@ def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: i
         body: what a clip leaves; None without one.
         margin: vertices around a clipped part that its samples need, too.
     """
-    domain = part_of_body(volume, body, rays.grid.warp, margin)
+    domain = region_of_body(volume, body, rays.grid.warp, margin)
     # Cameras at the ends of float64 overflow.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         seen = _seen(rays, body)
@@ -203,7 +203,7 @@ def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: i
     return domain if share > MAX_PART else region
 
 
-def part_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin: int = 0) -> Box:
+def region_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin: int = 0) -> Box:
     """Find the region (z, y, x) around what a clip leaves, widened to whole chunks.
 
     Without a clip it is the domain.

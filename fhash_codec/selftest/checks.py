@@ -209,7 +209,7 @@ def quality(run: Run) -> Iterator[Finding]:
     if promised is not None and reached > 0:
         yield Finding("promised PSNR", promised / reached, 1.0, "of the dB reached")
     stated = run.volume.container.header["quality"]
-    worst = largest_difference(run.values, _own_values(run), where)
+    worst = largest_difference(run.values, _in_source_type(run), where)
     if stated["max_abs_error"]:
         # The stated error is a difference of two float64, which is rounded.
         beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
@@ -308,7 +308,7 @@ def _psnr(run: Run, where: Mask) -> float:
     span = Fraction(finite.max().item()) - Fraction(finite.min().item())
     if span == 0:
         return 0.0
-    given_values, decoded_values = run.values[where], _own_values(run)[where]
+    given_values, decoded_values = run.values[where], _in_source_type(run)[where]
     if is_wide_integer(given_values.dtype):
         shares = np.array(
             [
@@ -345,12 +345,12 @@ def _error_bound(run: Run) -> Fraction | None:
 
 def _differing(run: Run) -> float:
     """The number of coreset values that differ from the original, rounded to the decoded dtype."""
-    decoded = _own_values(run)
+    decoded = _in_source_type(run)
     same = run.values.astype(decoded.dtype) == decoded
     return _count(~same & np.isfinite(run.decoded))
 
 
-def _own_values(run: Run) -> Values:
+def _in_source_type(run: Run) -> Values:
     """The decoded values in the source's type: floats cannot tell all integers of 64 bits apart."""
     volume = run.volume
     if volume.dtype.kind == "f" or volume.value_type.has_gaps:

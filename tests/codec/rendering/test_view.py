@@ -19,9 +19,9 @@ from fhash_codec.rendering.view import (
     Body,
     edges,
     outer_edges,
-    part_in_view,
-    part_of_body,
     pixel_vertices,
+    region_in_view,
+    region_of_body,
 )
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
@@ -104,13 +104,13 @@ def test_the_region_is_that_of_whole_tiles_around_the_clip(volume: Volume) -> No
     tile = volume.chunks[1:]
     for low, high in ((0, 3), (5, 9), (17.5, 19)):
         body = body_of(grid, z=[low, high])
-        region = part_in_view(rays, volume, body)
-        assert region == part_of_body(volume, body, None)
+        region = region_in_view(rays, volume, body)
+        assert region == region_of_body(volume, body, None)
         assert region.z[0] == low // tile[0] * tile[0]
         assert region.z[1] == min(-(-(int(np.ceil(high)) + 1) // tile[0]) * tile[0], 20)
         assert (region.y, region.x) == ((0, 24), (0, 28))
-    assert part_of_body(volume, None, None) == ((0, 20), (0, 24), (0, 28))
-    wider = part_of_body(volume, body_of(grid, z=[5, 7]), None, margin=20)
+    assert region_of_body(volume, None, None) == ((0, 20), (0, 24), (0, 28))
+    wider = region_of_body(volume, body_of(grid, z=[5, 7]), None, margin=20)
     assert wider.z == (0, 20)
 
 
@@ -121,7 +121,7 @@ def test_only_what_is_in_the_picture_is_decoded(volume: Volume) -> None:
     rays = Rays.of(
         Camera(view="xy", projection="parallel", zoom=12), Grid.of(volume.coords), (64, 64)
     )
-    region = part_in_view(rays, volume)
+    region = region_in_view(rays, volume)
     origins, _ = rays.pixels()
     for axis, (low, high) in zip((1, 0), region[1:], strict=True):
         assert low <= origins[..., axis].min()
@@ -140,7 +140,7 @@ def test_no_ray_meets_the_volume_outside_the_part_in_view(
     rays = Rays.of(
         Camera(projection=projection, zoom=zoom, azimuth=20), Grid.of(volume.coords), (24, 24)
     )
-    region = part_in_view(rays, volume)
+    region = region_in_view(rays, volume)
     origin, direction = rays.pixels()
     along = np.linspace(0, 3 * float(np.linalg.norm(rays.eye)), 4000)[:, None, None, None]
     places = origin + along * direction / np.linalg.norm(
