@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from frame_field import FrameField
+from frame_field import CENTRAL, NETWORK_SCENES, SCENES, FrameField
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
@@ -148,6 +148,7 @@ def frame_picture(planned: Planned, volume: Volume) -> Callable[[str, dict[str, 
     return of
 
 
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_three_ways_make_one_picture(frame_picture: FramePicture, scene: dict[str, Any]) -> None:
     cache, streamed, adaptive = (frame_picture(mode, scene) for mode in ("cache", "stream", "arm"))
     assert cache.rgba[..., 3].max() > 0.05
@@ -243,6 +244,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
     assert alike == here.counters
 
 
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
     planned: Planned, volume: Volume, tensors: Arrays, scene: dict[str, Any], adaptive: bool
@@ -300,18 +302,18 @@ def test_nothing_leaves_the_device_before_the_picture(
     assert sorted(taken) == [rays, 3 * rays, 4 * rays]
 
 
+@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
 def test_torch_marches_through_a_network_as_numpy_does(
-    planned: Planned, files: dict[str, Path], tensors: Arrays, network_scene: dict[str, Any]
+    planned: Planned, files: dict[str, Path], tensors: Arrays, scene: dict[str, Any]
 ) -> None:
     with fhash_codec.open(files["paper"]) as network:
         here, there = (
-            stream(*planned(network, network_scene, arrays), adaptive=True)
-            for arrays in (NUMPY, tensors)
+            stream(*planned(network, scene, arrays), adaptive=True) for arrays in (NUMPY, tensors)
         )
     assert here.rgba[..., 3].max() > 0.05
     np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
     assert there.counters["evaluations"] > 0
-    assert_same_work(here, there, network_scene)
+    assert_same_work(here, there, scene)
     if here.normal is not None:
         assert here.normal.any()
         np.testing.assert_allclose(there.depth, here.depth, atol=1e-3)
@@ -320,7 +322,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])
 def test_cuda_makes_the_picture_of_numpy(
-    files: dict[str, Path], planned: Planned, central_scene: dict[str, Any], kind: str
+    files: dict[str, Path], planned: Planned, kind: str
 ) -> None:
     import torch
 
@@ -328,7 +330,7 @@ def test_cuda_makes_the_picture_of_numpy(
         pytest.skip("no CUDA device")
     with fhash_codec.open(files[kind]) as opened:
         here, there = (
-            stream(*planned(opened, central_scene, arrays_on(device)), adaptive=True)
+            stream(*planned(opened, CENTRAL, arrays_on(device)), adaptive=True)
             for device in ("cpu", "cuda")
         )
     assert here.rgba[..., 3].max() > 0.05
