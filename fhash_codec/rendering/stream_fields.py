@@ -15,7 +15,16 @@ from fhash_codec.paper.network import Network
 from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Warp
-from fhash_codec.rendering.march_task import GRADES, NUMPY, Array, Arrays, Frame, Task, Units
+from fhash_codec.rendering.march_task import (
+    GRADES,
+    NUMPY,
+    Array,
+    Arrays,
+    Frame,
+    Grading,
+    Task,
+    Units,
+)
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import usable_threads
@@ -721,21 +730,13 @@ class Leaping:
 class Factors:
     """The factors of a `Grading`, as a function of places in a field."""
 
-    def __init__(self, field: Field, task: Task) -> None:
-        assert task.grading is not None
+    def __init__(self, field: Field, task: Task, grading: Grading) -> None:
         arrays = field.arrays
         self._field, self._arrays = field, arrays
         self._central = task.lighting is not None and task.lighting.central
         self._spacing = arrays.array(task.rays.grid.spacing)
-        self._scale = GRADES / task.grading.top
-        self._factors = arrays.array(
-            np.append(task.grading.factors, task.grading.factors[-1]), "float64"
-        )
-
-    @classmethod
-    def of(cls, task: Task, field: Field) -> Factors | None:
-        """The factors of a task in a field; None where gradients decide on no opacity."""
-        return None if task.grading is None else cls(field, task)
+        self._scale = GRADES / grading.top
+        self._factors = arrays.array(np.append(grading.factors, grading.factors[-1]), "float64")
 
     def __call__(self, places: Array) -> Array:
         """Factors (n,) of the extinction at places (n, 3) of the domain."""
