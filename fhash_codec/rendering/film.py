@@ -81,13 +81,10 @@ def film(
         rate: pictures per second.
         force: whether to replace a file.
 
-    Raises InputError for another kind of file, OutputError for what cannot be written,
-    MissingDependencyError without the package for MP4.
+    Raises OutputError for what cannot be written, MissingDependencyError without the package for
+    MP4.
     """
-    suffix = path.suffix.lower()
-    if suffix not in FILMS:
-        raise InputError(f"{path}: a film is written as {' or '.join(FILMS)}; use such a name")
-    ffmpeg = check_film(suffix)
+    ffmpeg = check_film(path.suffix.lower())
     with replacing(path, force=force) as temporary:
         if ffmpeg is None:
             _write_gif(temporary, frames, rate)

@@ -211,12 +211,9 @@ def light_grid(
 
     task: of a marcher, without light. What its clip leaves takes light away, as far as its table
         and its opacity by gradient let it.
-    lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
+    lamp: unit vector (x, y, z) of the coordinates towards the light; shadows need one.
     bricks: of the frame. They keep what the next picture needs again; None keeps nothing.
-    Raises InputError for shadows without a lamp.
     """
-    if shadows is not None and lamp is None:
-        raise InputError("shadows need the direction towards a lamp")
     grid, table, body, grading = task.rays.grid, task.table, task.body, task.grading
     resolution = shadows.resolution if shadows is not None else Shadows().resolution
     across = max(1, round(resolution / frame.stride))

@@ -511,10 +511,8 @@ def march(
         bricks: of the frame; made if None.
         threads: most threads; None for all processors.
 
-    Raises InputError for more than MAX_SURFACES surfaces and for a step that is not above 0.
+    Raises InputError for more than MAX_SURFACES surfaces.
     """
-    if not task.step > 0:
-        raise InputError(f"a step has the length {task.step:g}; it must be above 0")
     if len(task.surfaces) > MAX_SURFACES:
         raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
     if bricks is None:

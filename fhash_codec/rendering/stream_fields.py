@@ -26,7 +26,6 @@ from fhash_codec.rendering.march_task import (
     Units,
 )
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError
 from fhash_formats.support.threads import usable_threads
 
 
@@ -232,10 +231,7 @@ class NetworkField(CoresetField):
 
     def __init__(self, volume: Volume, step: float, units: Units, arrays: Arrays = NUMPY) -> None:
         model = volume._model
-        if not isinstance(model, PaperModel):
-            raise InputError(
-                f"{volume.path}: a file of the profile {volume.profile} has no network"
-            )
+        assert isinstance(model, PaperModel), "a plan marches through no other file"
         self._low, self._high = (
             float(end) for end in units.to([volume.value_range.low, volume.value_range.high])
         )

@@ -259,7 +259,7 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     low, high = value_range
     if not low < high:
         return np.array([[low, BACKGROUND]])
-    if len(edges) != len(counts) + 1 or len(counts) == 0 or not counts.sum() > 0:
+    if not counts.any():
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
     # Scaled by a power of two, 1 for every ordinary range, so that no difference overflows or is a
     # denormal.

@@ -43,7 +43,6 @@ from fhash_codec.rendering.march_task import GRADES, Grading, Lighting, Surface
 from fhash_codec.rendering.plan import plan_picture
 from fhash_codec.rendering.scenes import AmbientOcclusion, Camera, Shadows
 from fhash_codec.rendering.view import Body
-from fhash_formats.errors import InputError
 
 
 def grid(*spacing: float) -> Grid:
@@ -183,11 +182,6 @@ def test_nothing_that_takes_light_leaves_all_of_it() -> None:
         light = light_grid(frame_of(np.ones((5, 5, 5))), task, shadows=Shadows(), lamp=UP)
         assert np.all(light.shares == 1)
         assert light.secondary_rays == 0
-
-
-def test_shadows_need_a_lamp() -> None:
-    with pytest.raises(InputError, match="lamp"):
-        lit(np.ones((5, 5, 5)), [1.0, 1.0], shadows=Shadows())
 
 
 def test_opacity_by_gradient_takes_as_little_light_as_it_draws() -> None:
