@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -81,7 +80,9 @@ def measure_reads(
     for number, file in enumerate(files):
         with allowance.work(f"reads of {file.name}"):
             expected = 0.0
-            for kind in _kinds(series, _profile(file.path)):
+            with open_volume(file.path) as volume:
+                profile = volume.profile
+            for kind in _kinds(series, profile):
                 if not allowance.has(f"{kind.what} of {file.name}", expected):
                     break
                 begun = time.perf_counter()
@@ -90,11 +91,6 @@ def measure_reads(
         progress("reading", number + 1, len(files), file.name)
         if allowance.interrupted:
             break
-
-
-def _profile(path: Path) -> str:
-    with open_volume(path) as volume:
-        return volume.profile
 
 
 def _kinds(series: Series, profile: str) -> Iterator[_Kind]:

@@ -323,7 +323,9 @@ class _Points:
         """Shares of a lamp's light that reach the points; lamp: unit vector towards it."""
         step = np.asarray(lamp, dtype=np.float64) / (self.spacing * self.cell)
         step /= np.abs(step).max()
-        return self._passed(step, _steps_out(step, self.extinction.shape))
+        with np.errstate(divide="ignore", over="ignore"):
+            out = np.ceil(np.array(self.extinction.shape[::-1]) / np.abs(step))
+        return self._passed(step, int(out.min()) + 1)  # then every point has left the grid
 
     def from_around(self, radius: float) -> Single:
         """Shares of the light that reaches the points from as far as `radius`, in vertices."""
@@ -337,12 +339,6 @@ class _Points:
         """Share of the light that passes `count` steps (x, y, z, in cells) from each point."""
         sums = _sums(self.extinction, step, count)
         return _left(sums, float(np.linalg.norm(step * self.spacing * self.cell)) / self.unit)
-
-
-def _steps_out(step: Floats, shape: tuple[int, ...]) -> int:
-    """Steps after which every point has left the grid; step: x, y, z in its cells."""
-    with np.errstate(divide="ignore", over="ignore"):
-        return int(np.min(np.ceil(np.array(shape[::-1]) / np.abs(step)))) + 1
 
 
 def _sums(extinction: Single, step: Floats, count: int) -> Single:

@@ -267,13 +267,6 @@ class _Scaling:
             return scaled.clip(-MAX_MAGNITUDE, MAX_MAGNITUDE).astype(np.float32)
 
 
-def empty_table(low: float, high: float) -> Table:
-    """A table of nothing, for surfaces alone."""
-    return Table(
-        low=low, high=high, colours=np.zeros((2, 3), dtype=np.float32), extinctions=np.zeros(2)
-    )
-
-
 ENTRIES = 4000
 """Entries of a table of a step, at least. So close together, opacity is linear between them as
 extinction is.
@@ -379,7 +372,9 @@ def _skipping_fields(
 
 def _table_fields(given: MarchInput, task: Task) -> dict[str, object]:
     """The fields of the transfer function."""
-    entries, extinctions = _entries(task.table or empty_table(given.low, given.high), task.step)
+    colours = np.zeros((2, 3), dtype=np.float32)
+    nothing = Table(low=given.low, high=given.high, colours=colours, extinctions=np.zeros(2))
+    entries, extinctions = _entries(task.table or nothing, task.step)
     return {
         "table": entries,
         "extinction": extinctions,

@@ -319,27 +319,23 @@ class WarpedField:
         self._origin = np.floor(arrays.host(self.vertices)[:, 0]).astype(np.int64)
         self._last = np.ceil(arrays.host(self.vertices)[:, 1]).astype(np.int64)
         self.first = arrays.array(self._origin.astype(np.float64))
-        self.bricks = self._drawn_bricks()
-
-    def _drawn(self, places: Array) -> Array:
-        """Places (3,) of the series in drawn vertices, beyond the ends as far beyond."""
-        drawn = []
-        for at, own, table in zip(places, self._places, self._tables, strict=True):
-            drawn.append(
-                float(at) if table is None else float(np.interp(at, own, np.arange(len(own))))
-            )
-        return np.array(drawn)
-
-    def _drawn_bricks(self) -> Bricks:
-        """Bricks of drawn cells with the extreme values of all bricks that they touch."""
-        bricks = self._field.bricks
-        first = self.arrays.host(self._field.first)
-        low, high = bricks.low, bricks.high
+        low, high, first = field.bricks.low, field.bricks.high, arrays.host(field.first)
+        # Bricks of drawn cells have the extreme values of all bricks that they touch.
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, SIDE, low.shape[axis], float(first[number]))
             low = _extremes(low, begin, end, axis, np.minimum)
             high = _extremes(high, begin, end, axis, np.maximum)
-        return replace(bricks, low=low, high=high)
+        self.bricks = replace(field.bricks, low=low, high=high)
+
+    def _drawn(self, places: Array) -> Array:
+        """Places (3,) of the series in drawn vertices, beyond the ends as far beyond."""
+        return np.array(
+            [
+                at if table is None else np.interp(at, own, np.arange(len(own)))
+                for at, own, table in zip(places, self._places, self._tables, strict=True)
+            ],
+            dtype=np.float64,
+        )
 
     def _touched(
         self, number: int, side: int, blocks: int, first: float

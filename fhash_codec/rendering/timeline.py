@@ -41,7 +41,13 @@ def mixed(first: Any, second: Any, weight: float) -> Any:
     if weight == 1:
         return second
     if isinstance(first, Record) and type(first) is type(second):
-        return _mixed_record(first, second, weight)
+        names = [field.name for field in dataclasses.fields(first)]  # type: ignore[arg-type]
+        values = {
+            name: mixed(getattr(first, name), getattr(second, name), weight)
+            for name in names
+            if name not in TIME_AND_CAMERA
+        }
+        return dataclasses.replace(first, **values)  # type: ignore[type-var]
     if isinstance(first, float) and isinstance(second, float):
         return (1 - weight) * first + weight * second
     if isinstance(first, tuple) and isinstance(second, tuple) and len(first) == len(second):
@@ -49,16 +55,6 @@ def mixed(first: Any, second: Any, weight: float) -> Any:
     if isinstance(first, str) and isinstance(second, str):
         return _mixed_colour(first, second, weight)
     return first
-
-
-def _mixed_record(first: Record, second: Record, weight: float) -> Record:
-    names = [field.name for field in dataclasses.fields(first)]  # type: ignore[arg-type]
-    values = {
-        name: mixed(getattr(first, name), getattr(second, name), weight)
-        for name in names
-        if name not in TIME_AND_CAMERA
-    }
-    return dataclasses.replace(first, **values)  # type: ignore[type-var]
 
 
 def _mixed_colour(first: str, second: str, weight: float) -> str:
@@ -152,12 +148,10 @@ class Timeline:
         camera = self._path.camera(share)
         if self._orbit:
             camera = dataclasses.replace(camera, azimuth=camera.azimuth + self._orbit * share)
-        return dataclasses.replace(self._mixed(share), camera=camera, **self._moment(share))
-
-    def _moment(self, share: float) -> dict[str, Any]:
+        moment: dict[str, Any] = {"step": self._scenes[0].step, "time": self._scenes[0].time}
         if self._clock is not None:
-            return self._clock.moment(share)
-        return {"step": self._scenes[0].step, "time": self._scenes[0].time}
+            moment = self._clock.moment(share)
+        return dataclasses.replace(self._mixed(share), camera=camera, **moment)
 
     def _mixed(self, share: float) -> Scene:
         """The settings at a share, but for time and camera; they change smoothly at the keys."""

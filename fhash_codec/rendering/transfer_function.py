@@ -442,7 +442,7 @@ class TransferFunction:
                 FhashWarning,
                 stacklevel=2,
             )
-        return low, high, self.colour(values).astype(np.float32), extinctions
+        return low, high, self.colours(values).astype(np.float32), extinctions
 
     def shows(self, low: float, high: float) -> bool:
         """Whether a value of a range, or within an entry of a table of it, has an extinction."""

@@ -293,7 +293,8 @@ def run_case(
         checks: the checks of every run, in addition to the checks of the case.
     """
     settings: Mapping[str, EncodeConfig] = {**case.settings, **(case.more if everything else {})}
-    left_out = [name for name, config in settings.items() if not _possible(config)]
+    torch = has_torch()  # which the profile paper needs
+    left_out = [name for name, each in settings.items() if each.profile == "paper" and not torch]
     settings = {name: config for name, config in settings.items() if name not in left_out}
     findings: list[Finding] = []
     errors: list[str] = []
@@ -330,11 +331,6 @@ def run_case(
         errors=tuple(errors),
         left_out=tuple(left_out),
     )
-
-
-def _possible(config: EncodeConfig) -> bool:
-    """Whether settings can be tried here: the profile paper needs torch."""
-    return config.profile != "paper" or has_torch()
 
 
 def _run(

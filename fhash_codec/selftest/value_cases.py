@@ -134,10 +134,6 @@ def _integers(dtype: str) -> Callable[[], Values]:
     return make
 
 
-def _largest_whole() -> Values:
-    return np.full(SHAPE, 2**64 - 1, dtype=np.uint64)
-
-
 def _beyond_floats() -> Values:
     """Integers near 2^62 that differ by less than float64 can represent."""
     return np.asarray(2**62 + np.rint(200 * waves()).astype(np.int64), dtype=np.int64)
@@ -218,7 +214,7 @@ VALUE_CASES: tuple[Case, ...] = (
     _case(
         "constant-uint64-beyond",
         "the largest 64-bit integer, which float64 cannot represent",
-        _largest_whole,
+        lambda: np.full(SHAPE, 2**64 - 1, dtype=np.uint64),
         {**PAPER, **WIDE},
         more={},
     ),

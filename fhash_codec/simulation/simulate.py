@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.simulation.effects import Array, Bend, Body, Effect, Flow, Place, Surface, Vector
+from fhash_codec.simulation.effects import Array, Bend, Body, Flow, Place, Surface, Vector
 from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
@@ -58,22 +58,17 @@ class Terms:
         return not self.flows or (len(self.flows) == 1 and self.flows[0][1].exact)
 
 
-def spacing_of(scene: SimulatedScene) -> Vector:
-    """Metres between vertices along z, y and x, 0 along an axis of one vertex."""
-    z, y, x = (
-        length / count if count > 1 else 0.0
-        for length, count in zip(scene.size, scene.shape, strict=True)
-    )
-    return z, y, x
-
-
 def terms_of(scene: SimulatedScene, seed: int) -> Terms:
     """Make the terms of a scene.
 
     An effect draws its random numbers from the seed, its kind and its number among the effects of
     this kind that are computed. So an effect of strength 0 changes those of no other.
     """
-    terms = Terms(spacing=spacing_of(scene))
+    z, y, x = (
+        length / count if count > 1 else 0.0
+        for length, count in zip(scene.size, scene.shape, strict=True)
+    )
+    terms = Terms(spacing=(z, y, x))
     bodies = any(effect.role == "body" and not effect.idle for effect in scene.effects)
     counts: Counter[str] = Counter()
     for number, effect in enumerate(scene.effects):
@@ -83,22 +78,17 @@ def terms_of(scene: SimulatedScene, seed: int) -> Terms:
             continue
         counts[effect.kind] += 1
         key = [seed, zlib.crc32(effect.kind.encode()), counts[effect.kind]]
-        _add(terms, number, effect, np.random.default_rng(key))
+        term = effect.term(np.random.default_rng(key), terms.spacing)
+        if isinstance(term, Flow):
+            terms.flows.append((number, term))
+        elif isinstance(term, Body):
+            terms.bodies.append((number, term))
+        elif isinstance(term, float):
+            terms.diffusivity += term
+            terms.spreads.append(number)
+        else:
+            terms.bends.append((number, term))
     return terms
-
-
-def _add(terms: Terms, number: int, effect: Effect, generator: np.random.Generator) -> None:
-    """Make the term of one effect."""
-    term = effect.term(generator, terms.spacing)
-    if isinstance(term, Flow):
-        terms.flows.append((number, term))
-    elif isinstance(term, Body):
-        terms.bodies.append((number, term))
-    elif isinstance(term, float):
-        terms.diffusivity += term
-        terms.spreads.append(number)
-    else:
-        terms.bends.append((number, term))
 
 
 Block = tuple[slice, slice, slice]
