@@ -43,6 +43,17 @@ def noise(shape: Shape = SHAPE, seed: int = 0) -> Floats:
     return np.random.default_rng(seed).standard_normal(shape)
 
 
+def spike(background: float, at: Shape, value: float, shape: Shape = SHAPE) -> Callable[[], Values]:
+    """A function that makes a field (float32) of one number but for one vertex."""
+
+    def make() -> Values:
+        values = np.full(shape, background, dtype=np.float32)
+        values[at] = value
+        return values
+
+    return make
+
+
 def series(
     values: npt.NDArray[np.generic],
     *,
@@ -438,12 +449,6 @@ def _checkerboard() -> Values:
     return np.asarray((t + z + y + x) % 2)
 
 
-def _spike() -> Values:
-    values = np.zeros(SHAPE)
-    values[1, 4, 5, 6] = 1e6
-    return values
-
-
 def _spikes() -> Values:
     t, z, y, x = lattice()
     return np.where((z % 4 == 0) & (y % 4 == 1) & (x % 4 == 2) & (t % 2 == 0), 1e6, 0.0) * np.where(
@@ -504,7 +509,7 @@ FRONT_CASES: tuple[Case, ...] = (
         {**QUICK, **EXACT},
         dtype="int16",
     ),
-    _front_case("spike", "one value of 1e6, all others 0", _spike),
+    _front_case("spike", "one value of 1e6, all others 0", spike(0.0, (1, 4, 5, 6), 1e6)),
     _front_case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
     _front_case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
     _front_case("step-between", "a step between two vertices", _step(5.5)),

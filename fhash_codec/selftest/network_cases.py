@@ -19,10 +19,9 @@ from fhash_codec.paper.network import ArrayTable, Network, NumberType
 from fhash_codec.paper.storage import load_network
 from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
-from fhash_codec.selftest.field_cases import Settings, noise, series, single, waves
+from fhash_codec.selftest.field_cases import Settings, noise, single, spike, waves
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 rounding."""
@@ -389,12 +388,6 @@ EXACT = replace(PLAIN, tables="float32", epochs=30)
 _waves, _noise = single(partial(waves, SHAPE)), single(partial(noise, SHAPE))
 
 
-def _spike() -> ArraySeries:
-    values = np.zeros(SHAPE, np.float32)
-    values[1, 3, 3, 4] = 1.0
-    return series(values)
-
-
 def _case(name: str, about: str, settings: Settings, *checks: Check, **rest: Any) -> Case:
     make = rest.pop("make", _waves)
     return Case("networks", name, about, make, settings, checks=checks, **rest)
@@ -526,6 +519,6 @@ NETWORK_CASES = (
         "one vertex that differs from all others",
         {"2-layers": replace(PLAIN, hidden_layers=2)},
         agrees,
-        make=_spike,
+        make=single(spike(0.0, (1, 3, 3, 4), 1.0, shape=SHAPE)),
     ),
 )

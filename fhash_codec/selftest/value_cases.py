@@ -27,6 +27,7 @@ from fhash_codec.selftest.field_cases import (
     noise,
     series,
     single,
+    spike,
     waves,
 )
 from fhash_codec.volume import Volume
@@ -52,12 +53,6 @@ def _constant(value: float, dtype: str) -> Callable[[], Values]:
 
 def _offset(low: float, extent: float, dtype: str) -> Callable[[], Values]:
     return lambda: (low + extent * waves()).astype(dtype)
-
-
-def _one_ulp() -> Values:
-    values = np.full(SHAPE, 1e8, dtype=np.float32)
-    values[2, 3, 4, 5] = np.nextafter(np.float32(1e8), np.float32(np.inf))
-    return values
 
 
 def _magnitudes(exponent: float, dtype: str) -> Values:
@@ -105,12 +100,6 @@ def _isolated() -> Values:
     for number, value in enumerate((np.nan, np.inf, -np.inf)):
         values[1, 2, 3, 2 * number] = value
         values[3, 8, 9, 8 + number] = value
-    return values
-
-
-def _one_finite() -> Values:
-    values = np.full(SHAPE, np.nan, dtype=np.float32)
-    values[2, 4, 5, 6] = 7.5
     return values
 
 
@@ -221,7 +210,7 @@ VALUE_CASES: tuple[Case, ...] = (
     _case(
         "nearly-constant-float32",
         "1e8 everywhere but at one vertex, which has the next float32",
-        _one_ulp,
+        spike(1e8, (2, 3, 4, 5), np.nextafter(np.float32(1e8), np.float32(np.inf))),
     ),
     _case(
         "nearly-constant-float64",
@@ -307,7 +296,7 @@ VALUE_CASES: tuple[Case, ...] = (
         "every second vertex is -Inf",
         _with(-np.inf, lambda t, z, y, x: (t + z + y + x) % 2 == 0),
     ),
-    _case("one-finite-value", "a single value is finite", _one_finite),
+    _case("one-finite-value", "a single value is finite", spike(np.nan, (2, 4, 5, 6), 7.5)),
     _case(
         "nothing-finite",
         "refused: there is nothing to encode",
