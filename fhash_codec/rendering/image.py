@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -50,13 +50,6 @@ PICTURES = (".png", ".jpg", ".jpeg")
 """Suffixes of pictures, in lower case."""
 JPEG_QUALITY = 92
 """Quality of a JPEG, 1..95, at which letters and edges stay clean."""
-
-
-class Draw(Protocol):
-    """Renders a scene while the next one is prepared, as `Renderer.render` does."""
-
-    def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
-        """Render `scene`; `upcoming` is the scene of the next picture."""
 
 
 def check_picture_name(path: Path, background: str) -> None:

@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections import Counter, OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
-from fhash_codec.rendering.image import Draw, Image, overlay, surrounded, time_text
+from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
@@ -36,7 +37,9 @@ WIDE = 1.6
 """Width over height that the picture aims at when the scene gives no number of columns."""
 
 
-def evolution(volume: Volume, scene: Scene, *, draw: Draw, progress: Progress = silent) -> Image:
+def evolution(
+    volume: Volume, scene: Scene, *, draw: Callable[..., Image], progress: Progress = silent
+) -> Image:
     """Draw the steps of `scene.evolution` row by row in one picture.
 
     Each panel has a time label. Colour bar and legend of the scene are of the whole picture and are
