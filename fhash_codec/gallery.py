@@ -11,10 +11,9 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.series import ArraySeries, Coordinate, Series
-
-Floats = npt.NDArray[np.float64]
 
 DAY = 86400.0
 """Seconds of a day."""

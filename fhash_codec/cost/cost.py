@@ -42,8 +42,6 @@ FAST_SHARE = 0.12
 """Share of the budget that the fastest encoding may take, else a crop is measured."""
 MAX_READ_FILES = 8
 """Files that reads are measured from, at most."""
-PARTS = ("encodings", "curves", "stages", "gains", "per_step", "reads", "pictures", "advice")
-"""Fields of a report that hold measurements."""
 NOTES = (
     "seconds of fhash are those of the whole command: reading, scanning, encoding, writing, and the"
     " measurement of the written file; those of a peer are encoding and writing alone, on one"
@@ -181,7 +179,6 @@ def report_on(
 
     parts: the fields of CostReport that hold measurements, by name; others stay empty.
     """
-    empty = {name: () for name in PARTS}
     return CostReport(
         series=f"{whole.source} {whole.name}",
         units=whole.units,
@@ -197,7 +194,7 @@ def report_on(
         left_out=tuple(allowance.left_out),
         machine=machine(),
         notes=NOTES,
-        **(empty | parts),
+        **parts,
     )
 
 

@@ -141,8 +141,9 @@ class OwnEncodings:
         limit = 0.5 * self._share * self._allowance.left
         fitting = [epochs for epochs in EPOCHS if rest + epochs * epoch <= limit]
         if fitting:
-            self._expect(paper_config(fitting[-1]), rest + fitting[-1] * epoch)
-            self._measure(replace(wish, config=paper_config(fitting[-1])))
+            config = paper_config(fitting[-1])
+            self._usual[_kind(config)] = rest + fitting[-1] * epoch
+            self._measure(replace(wish, config=config))
         else:
             self._allowance.has("paper, more epochs", max(rest + EPOCHS[0] * epoch, limit))
 
@@ -156,10 +157,6 @@ class OwnEncodings:
         self._predictions[config] = self._predict_one(config)
         self._progress("predicting", 1, 1, "")
         self._predicting += self._allowance.spent - spent
-
-    def _expect(self, config: EncodeConfig, seconds: float) -> None:
-        """Expect an encoding to take so long, whatever is predicted."""
-        self._usual[_kind(config)] = seconds
 
     def _expected(self, config: EncodeConfig) -> float:
         """Seconds that an encoding will take: as one of its kind did, or by its prediction."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -53,6 +53,7 @@ from fhash_codec.cost.probe import (
     probe_rates,
     updates_of,
 )
+from fhash_codec.cost.results import seconds_text
 from fhash_codec.encoding import DECODED_AGAIN
 from fhash_codec.measure.metrics import ssim_steps
 from fhash_codec.progress import Progress, silent
@@ -382,27 +383,6 @@ class Prediction:
     stages: dict[str, float] = field(default_factory=dict)
 
 
-def predict(
-    series: Series, configs: Sequence[EncodeConfig], *, progress: Progress = silent
-) -> list[Prediction]:
-    """Predict the encodings of a series, one for each of the settings.
-
-    series: the data; at least a part of them is read.
-    configs: the settings.
-    progress: called with each step of the work.
-
-    Raises InputError for settings that do not fit the series, and MissingDependencyError for the
-    profile paper without torch.
-    """
-    with predictor(series) as one:
-        predictions = []
-        for number, config in enumerate(configs):
-            progress("predicting", number, len(configs), "")
-            predictions.append(one.predict(config))
-        progress("predicting", len(configs), len(configs), "")
-        return predictions
-
-
 @contextmanager
 def predictor(series: Series) -> Iterator[Predictor]:
     """A predictor of a series, which keeps its probes for all settings that share them."""
@@ -421,7 +401,11 @@ class Predictor:
         self._trainings: dict[EncodeConfig, PaperProbe] = {}
 
     def predict(self, config: EncodeConfig) -> Prediction:
-        """Predict the encoding with some settings; raises what `predict` raises."""
+        """Predict the encoding with some settings; at least a part of the series is read.
+
+        Raises InputError for settings that do not fit the series, and MissingDependencyError for
+        the profile paper without torch.
+        """
         with warnings.catch_warnings():
             # The encoding itself will say them.
             warnings.simplefilter("ignore", FhashWarning)
@@ -463,7 +447,7 @@ class Predictor:
         The first one also pays for what is loaded and read for the first time. The encoding that
         follows does not pay it again.
         """
-        part, steps = self._part(LOOKED_AT), self._series.shape[0]
+        part, steps = self._windows(LOOKED_AT), self._series.shape[0]
         begun = now()
         look = look_at(part, steps, config, self._workers)
         if self._looks or now() - begun > SHORT_LOOK:
@@ -485,7 +469,7 @@ class Predictor:
     def _paper(self, config: EncodeConfig) -> Prediction:
         begun = now()
         key = replace(config, epochs=0, timings=True)
-        part = self._part(TRAINED_ON) if config.key_frames == "all" else self._series
+        part = self._windows(TRAINED_ON) if config.key_frames == "all" else self._series
         share = part.shape[0] / self._series.shape[0]
         if key not in self._trainings:
             self._trainings[key] = probe_paper(part, share, key)
@@ -502,7 +486,7 @@ class Predictor:
             stages=stages,
         )
 
-    def _part(self, vertices: int) -> Series:
+    def _windows(self, vertices: int) -> Series:
         """Return the series, or windows of it, evenly spread, of at most some vertices."""
         steps = self._series.shape[0]
         count = vertices // prod(self._series.shape[1:])
@@ -680,7 +664,11 @@ def _highest_effort(
         further = replace(config, effort=effort)
         predicted = one.predict(further)
         if predicted.seconds * MARGIN > left():
-            return chosen, prediction, f"{_option(further)} would take {_brief(predicted.seconds)}"
+            return (
+                chosen,
+                prediction,
+                f"{_option(further)} would take {seconds_text(predicted.seconds)}",
+            )
         chosen, prediction = further, predicted
     return chosen, prediction, "the most that is allowed" if capped else "the highest"
 
@@ -715,10 +703,6 @@ def _option(config: EncodeConfig) -> str:
     return f"--effort {config.effort}"
 
 
-def _brief(seconds: float) -> str:
-    return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
-
-
 def _why(
     seconds: float,
     probing: float,
@@ -729,15 +713,16 @@ def _why(
     fits: bool,
 ) -> str:
     """One line that says what was chosen and why."""
-    told = _brief(prediction.seconds)
+    told = seconds_text(prediction.seconds)
+    budget, probed = seconds_text(seconds), seconds_text(probing)
     if prediction.bytes is not None:
         told += f" and {prediction.bytes:,} bytes"
     if not fits:
         return (
-            f"the time budget of {_brief(seconds)} may not be kept: even {_option(chosen)} is"
-            f" predicted to take {told}, after {_brief(probing)} of probing; it is done anyway"
+            f"the time budget of {budget} may not be kept: even {_option(chosen)} is"
+            f" predicted to take {told}, after {probed} of probing; it is done anyway"
         )
     return (
-        f"time budget {_brief(seconds)}: {_option(chosen)}, predicted to take {told} after"
-        f" {_brief(probing)} of probing; {beyond}"
+        f"time budget {budget}: {_option(chosen)}, predicted to take {told} after"
+        f" {probed} of probing; {beyond}"
     )

@@ -43,7 +43,7 @@ from fhash_codec.compact.transform import likely_transform, tile_costs, usual_tr
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.features.bricks import BRICK_BITS
-from fhash_codec.features.selection import FeatureSelection, select_features
+from fhash_codec.features.selection import select_features
 from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import BUDGET, Comparer, measure_quality, ssim_steps
 from fhash_codec.progress import recording, silent
@@ -83,7 +83,6 @@ class Look:
 
     Attributes:
         task: the series, or a part of it, and the promise.
-        selection: its coreset.
         attempt: outcome of the first guess.
         labels: outcome of coding as labels; None where the values are none.
         tile: tile of the whole series, by the size of the first guess.
@@ -96,7 +95,6 @@ class Look:
     """
 
     task: PlanTask
-    selection: FeatureSelection
     attempt: Attempt
     labels: LabelTrial | None
     tile: Shape
@@ -153,7 +151,6 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
     size = attempt.outcome.size / share
     return Look(
         task=task,
-        selection=selection,
         attempt=attempt,
         labels=labels,
         tile=fixed or cheap_tiling(shape, size, config.access).tile,

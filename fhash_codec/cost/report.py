@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from fhash_codec.cost.results import CostReport, Encoded, Picture, bytes_text, seconds_text, told
@@ -42,7 +43,7 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "cross")
 """Symbols of curves that have none of their own."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Axis:
     """An axis.
 
@@ -79,7 +80,7 @@ class Trace:
     line: bool = True
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Panel:
     """A plot.
 
@@ -94,13 +95,9 @@ class Panel:
     title: str
     x: Axis
     y: Axis
-    traces: tuple[Trace, ...]
+    traces: tuple[Trace, ...] = ()
     bars: bool = False
     diagonal: bool = False
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON values by field name."""
-        return asdict(self)
 
 
 def style_of(name: str, place: int) -> tuple[str, str]:
@@ -125,6 +122,12 @@ def single(panel: Panel, x: Sequence[float], y: Sequence[Any]) -> Panel:
     return replace(panel, traces=(curve("", (CYCLE[0], SYMBOLS[0]), points),))
 
 
+SIZE = Axis("size of the file, bytes", unit="B", log=True)
+"""Bytes of a file."""
+READ = Axis("bytes read", unit="B", log=True)
+"""Bytes that a read takes of a file."""
+TIME = Axis("milliseconds", log=True)
+"""Time of a read or a picture."""
 Names = tuple[str, str]
 """Fields of an encoding: a figure as measured and as predicted, empty where none is predicted."""
 
@@ -135,38 +138,22 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     seconds, size = ("seconds", "predicted_seconds"), ("bytes", "predicted_bytes")
     psnr, bulk, largest = ("psnr", "predicted_psnr"), ("psnr_bulk", ""), ("max_abs_error", "")
     units = f", {report.units}" if report.units not in ("", "1") else ", in the units of the data"
-    second, byte = (
-        Axis(label="seconds of encoding", log=True),
-        Axis(label="size of the file, bytes", unit="B", log=True),
-    )
-    decibel = Axis(label="PSNR of all values, dB")
+    second, byte = Axis("seconds of encoding", log=True), SIZE
+    decibel, middle = Axis("PSNR of all values, dB"), Axis("PSNR of the middle 98 %, dB")
+    error = Axis(f"largest error{units}", log=True, reversed=True)
     for key, title, x, y, x_of, y_of in (
         ("encode-seconds", "Accuracy against time", second, decibel, seconds, psnr),
         ("encode-bytes", "Accuracy against size", byte, decibel, size, psnr),
-        (
-            "encode-bulk",
-            "Accuracy of the bulk against size",
-            byte,
-            Axis(label="PSNR of the middle 98 %, dB"),
-            size,
-            bulk,
-        ),
-        (
-            "encode-error",
-            "Largest error against size",
-            byte,
-            Axis(label=f"largest error{units}", log=True, reversed=True),
-            size,
-            largest,
-        ),
+        ("encode-bulk", "Accuracy of the bulk against size", byte, middle, size, bulk),
+        ("encode-error", "Largest error against size", byte, error, size, largest),
     ):
         traces = tuple(_frontier(report.encodings, x_of, y_of))
         if key == "encode-seconds":
             traces += tuple(trace for trace in _trainings(report) if trace.name.startswith("paper"))
         if len(report.encodings) > 1:
-            yield Panel(key=key, section="encode", title=title, x=x, y=y, traces=traces)
+            yield Panel(key, "encode", title, x, y, traces)
     yield from _courses(report)
-    yield _foretold(report.encodings)
+    yield _predictions(report.encodings)
 
 
 def _frontier(points: Sequence[Encoded], x_of: Names, y_of: Names) -> Iterator[Trace]:
@@ -228,44 +215,24 @@ def _trainings(report: CostReport) -> Iterator[Trace]:
 
 def _courses(report: CostReport) -> Iterator[Panel]:
     """The trainings, and what the stages and steps of one encoding have."""
-    yield Panel(
-        key="training",
-        section="encode",
-        title="Course of the trainings",
-        x=Axis(label="seconds of training", log=True),
-        y=Axis(label="PSNR on samples, dB"),
-        traces=tuple(_trainings(report)),
-    )
+    x, y = Axis("seconds of training", log=True), Axis("PSNR on samples, dB")
+    traces = tuple(_trainings(report))
+    yield Panel("training", "encode", "Course of the trainings", x, y, traces)
     stages = [stage for stage in reversed(report.stages) if stage.times]
     yield single(
-        Panel(
-            key="stages",
-            section="encode",
-            title="Seconds of each stage",
-            x=Axis(label="seconds"),
-            y=Axis(label=""),
-            traces=(),
-            bars=True,
-        ),
+        Panel("stages", "encode", "Seconds of each stage", Axis("seconds"), Axis(""), bars=True),
         [stage.seconds for stage in stages],
         [stage.stage for stage in stages],
     )
     steps = [step for step in report.per_step if step["psnr"] is not None]
     yield single(
-        Panel(
-            key="per-step",
-            section="encode",
-            title="Accuracy of each step",
-            x=Axis(label="step"),
-            y=Axis(label="PSNR, dB"),
-            traces=(),
-        ),
+        Panel("per-step", "encode", "Accuracy of each step", Axis("step"), Axis("PSNR, dB")),
         [float(step["step"]) for step in steps],
         [step["psnr"] for step in steps],
     )
 
 
-def _foretold(points: Sequence[Encoded]) -> Panel:
+def _predictions(points: Sequence[Encoded]) -> Panel:
     """Seconds that were predicted beside those measured."""
     traces = []
     for place, group in enumerate(dict.fromkeys(point.group for point in points)):
@@ -280,15 +247,9 @@ def _foretold(points: Sequence[Encoded]) -> Panel:
                 for a, b, name in mine
             ]
             traces.append(curve(group, style_of(group, place), told, line=False))
-    return Panel(
-        key="predicted",
-        section="encode",
-        title="Predicted and measured time",
-        x=Axis(label="seconds predicted", log=True),
-        y=Axis(label="seconds measured", log=True),
-        traces=tuple(traces),
-        diagonal=True,
-    )
+    x, y = Axis("seconds predicted", log=True), Axis("seconds measured", log=True)
+    title = "Predicted and measured time"
+    return Panel("predicted", "encode", title, x, y, tuple(traces), diagonal=True)
 
 
 KNOBS = ("step length", "level of detail", "level of detail, first picture", "threshold")
@@ -298,20 +259,16 @@ KNOBS = ("step length", "level of detail", "level of detail, first picture", "th
 def read_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the reads, empty ones included."""
     kinds = dict.fromkeys(read.what for read in report.reads)
-    for key, title, x, pick in (
-        ("read-ms", "Accuracy of reads against time", Axis(label="milliseconds", log=True), 0),
-        (
-            "read-bytes",
-            "Accuracy of reads against bytes",
-            Axis(label="bytes read", unit="B", log=True),
-            1,
-        ),
+    y = Axis("PSNR of what was read, dB")
+    for key, title, x, field in (
+        ("read-ms", "Accuracy of reads against time", TIME, "milliseconds"),
+        ("read-bytes", "Accuracy of reads against bytes", READ, "bytes_read"),
     ):
         traces = []
         for place, kind in enumerate(kinds):
             points = sorted(
                 (
-                    (read.milliseconds, float(read.bytes_read))[pick],
+                    float(getattr(read, field)),
                     read.psnr,
                     f"{read.what}<br>{read.file}<br>{read.milliseconds:.3g} ms,"
                     f" {bytes_text(read.bytes_read)}<br>{read.psnr:.2f} dB",
@@ -321,57 +278,40 @@ def read_panels(report: CostReport) -> Iterator[Panel]:
             )
             style = (CYCLE[place % len(CYCLE)], SYMBOLS[place % len(SYMBOLS)])
             traces.append(curve(kind, style, points, line=False))
-        yield Panel(
-            key=key,
-            section="read",
-            title=title,
-            x=x,
-            y=Axis(label="PSNR of what was read, dB"),
-            traces=tuple(trace for trace in traces if trace.x),
-        )
+        yield Panel(key, "read", title, x, y, tuple(trace for trace in traces if trace.x))
 
 
 def picture_panels(report: CostReport) -> Iterator[Panel]:
     """Plots of the pictures, empty ones included."""
-    for key, title, y, pick in (
-        ("picture-psnr", "Pictures: likeness against time", "PSNR to the finest picture, dB", 0),
-        ("picture-ssim", "Pictures: SSIM against time", "SSIM to the finest picture", 1),
-    ):
-        yield Panel(
-            key=key,
-            section="picture",
-            title=title,
-            x=Axis(label="milliseconds", log=True),
-            y=Axis(label=y),
-            traces=tuple(_knobs(report.pictures, pick)),
-        )
-    effects = [picture for picture in report.pictures if picture.group == "effect"]
-    yield single(
-        Panel(
-            key="effects",
-            section="picture",
-            title="Effects, each alone",
-            x=Axis(label="milliseconds"),
-            y=Axis(label=""),
-            traces=(),
-            bars=True,
+    for key, title, label, field in (
+        (
+            "picture-psnr",
+            "Pictures: likeness against time",
+            "PSNR to the finest picture, dB",
+            "psnr",
         ),
-        [picture.milliseconds for picture in reversed(effects)],
-        [picture.setting for picture in reversed(effects)],
+        ("picture-ssim", "Pictures: SSIM against time", "SSIM to the finest picture", "ssim"),
+    ):
+        traces = tuple(_knobs(report.pictures, field))
+        yield Panel(key, "picture", title, TIME, Axis(label), traces)
+    effects = [picture for picture in reversed(report.pictures) if picture.group == "effect"]
+    x, y = Axis("milliseconds"), Axis("")
+    yield single(
+        Panel("effects", "picture", "Effects, each alone", x, y, bars=True),
+        [picture.milliseconds for picture in effects],
+        [picture.setting for picture in effects],
     )
     yield _pictures_by_size(report)
 
 
-def _knobs(pictures: Iterable[Picture], pick: int) -> Iterator[Trace]:
+def _knobs(pictures: Iterable[Picture], field: str) -> Iterator[Trace]:
     """A curve of time and likeness for each knob."""
     groups = dict.fromkeys(each.group for each in pictures if each.group in KNOBS)
     for place, group in enumerate(groups):
         points = [  # in the order of the settings: times alone may go up and down
             (each.milliseconds, value, f"{group} {each.setting}<br>{each.milliseconds:.3g} ms")
             for each in pictures
-            if each.group == group
-            and not each.best
-            and (value := (each.psnr, each.ssim)[pick]) is not None
+            if each.group == group and not each.best and (value := getattr(each, field)) is not None
         ]
         if points:
             yield curve(group, (CYCLE[place], SYMBOLS[place]), points)
@@ -398,13 +338,9 @@ def _pictures_by_size(report: CostReport) -> Panel:
             if point.group == group
         )
         traces.append(curve(group, style_of(group, place), mine))
+    title = "Likeness to the source's picture against size"
     return Panel(
-        key="picture-bytes",
-        section="picture",
-        title="Likeness to the source's picture against size",
-        x=Axis(label="size of the file, bytes", unit="B", log=True),
-        y=Axis(label="PSNR of the picture, dB"),
-        traces=tuple(traces),
+        "picture-bytes", "picture", title, SIZE, Axis("PSNR of the picture, dB"), tuple(traces)
     )
 
 
@@ -654,13 +590,11 @@ def page(report: CostReport) -> str:
         "sections": "".join(_section(name, report) for name in SECTIONS),
         # JSON that may stand in a script element: no tag can end it early.
         "data": json_text(report).replace("<", "\\u003c"),
-        "panels": json.dumps([panel.to_dict() for panel in panels(report)]).replace("<", "\\u003c"),
+        "panels": json.dumps([*map(asdict, panels(report))]).replace("<", "\\u003c"),
         "plotly": require_plotly().get_plotlyjs(),
     }
     template = files("fhash_codec.cost").joinpath("page.html").read_text(encoding="utf-8")
-    head, *parts = template.split("{{")
-    pieces = [part.split("}}", 1) for part in parts]
-    return head + "".join(filled[name] + rest for name, rest in pieces)
+    return Template(template).substitute(filled)
 
 
 def _summary(report: CostReport) -> str:

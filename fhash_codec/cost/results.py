@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 OWN = ("compact", "paper")
@@ -203,17 +203,17 @@ class CostReport:
     budget_seconds: float
     seconds: float
     interrupted: bool
-    encodings: tuple[Encoded, ...]
-    curves: tuple[Curve, ...]
-    stages: tuple[Stage, ...]
-    gains: tuple[Gain, ...]
-    per_step: tuple[dict[str, Any], ...]
-    reads: tuple[Read, ...]
-    pictures: tuple[Picture, ...]
-    advice: tuple[Advice, ...]
-    left_out: tuple[LeftOut, ...]
+    encodings: tuple[Encoded, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    stages: tuple[Stage, ...] = ()
+    gains: tuple[Gain, ...] = ()
+    per_step: tuple[dict[str, Any], ...] = ()
+    reads: tuple[Read, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    advice: tuple[Advice, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     machine: dict[str, Any]
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""

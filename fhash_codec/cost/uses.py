@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -21,9 +20,10 @@ from fhash_codec.cost.results import Picture, Read
 from fhash_codec.measure.errors import psnr
 from fhash_codec.measure.metrics import ssim
 from fhash_codec.progress import Progress
+from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
-from fhash_codec.rendering.march_task import Frame, Units, complete, warped
+from fhash_codec.rendering.march_task import Frame, complete, warped
 from fhash_codec.rendering.plan import Plan
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
 from fhash_codec.rendering.scenes import (
@@ -80,7 +80,9 @@ def measure_reads(
     for number, file in enumerate(files):
         with allowance.work(f"reads of {file.name}"):
             expected = 0.0
-            for kind in _kinds(series, _profile(file.path)):
+            with open_volume(file.path) as volume:
+                profile = volume.profile
+            for kind in _kinds(series, profile):
                 if not allowance.has(f"{kind.what} of {file.name}", expected):
                     break
                 begun = time.perf_counter()
@@ -89,11 +91,6 @@ def measure_reads(
         progress("reading", number + 1, len(files), file.name)
         if allowance.interrupted:
             break
-
-
-def _profile(path: Path) -> str:
-    with open_volume(path) as volume:
-        return volume.profile
 
 
 def _kinds(series: Series, profile: str) -> Iterator[_Kind]:
@@ -214,7 +211,6 @@ def _measured(series: Series, file: KeptFile, kind: _Kind, facts: Facts) -> Read
 
 
 Pixels = npt.NDArray[np.uint8]
-Single = npt.NDArray[np.float32]
 
 
 def black(rgba: Single) -> Pixels:
@@ -433,24 +429,15 @@ class PictureCosts:
 
 def source_frame(series: Series, plan: Plan) -> Frame:
     """The frame of the source that a plan decodes from a file, in the units of its march."""
-    values = series.read(int(plan.step))[tuple(slice(*span) for span in plan.region)]
-    converted = values if plan.units == Units() else plan.units.to(values)
+    values = series.read(int(plan.step))[plan.region.slices()]
     z, y, x = (low for low, _ in plan.region)
-    return Frame(values=np.ascontiguousarray(converted, dtype=np.float32), first=(z, y, x))
+    return Frame(values=plan.units.single(values), first=(z, y, x))
 
 
 def _marched(frame: Frame, plan: Plan) -> Image:
     """A picture of a frame by the task of a plan, without what is drawn around it."""
     result = march(warped(frame, plan.task.rays.grid.warp), plan.task)
-    return Image(
-        rgba=result.rgba,
-        depth=None,
-        normal=None,
-        counters=complete(result.counters),
-        scene={},
-        source="",
-        digest="",
-    )
+    return Image(rgba=result.rgba, counters=complete(result.counters))
 
 
 def _likeness(rgba: Single, reference: Single | None) -> tuple[float | None, float | None]:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Table, Task
 from fhash_formats.support.threads import in_threads
 
@@ -92,7 +93,6 @@ class Palette:
         return before, entry - before
 
 
-Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Result = TypeVar("Result")
 
@@ -106,7 +106,7 @@ largest magnitude.
 """
 LAYERS = 4
 """Layers of bricks that a thread looks at together."""
-KEPT = 3
+CACHED = 3
 """Results of each kind that bricks keep, by default: those of the last transfer functions."""
 SMALL = 2**18
 """Vertices of a frame below which threads take longer to start than the work takes."""
@@ -146,7 +146,7 @@ class Bricks:
         return (low, high) if low <= high else (0.0, 0.0)
 
     def remembered(
-        self, kind: str, key: object, compute: Callable[[], Result], most: int = KEPT
+        self, kind: str, key: object, compute: Callable[[], Result], most: int = CACHED
     ) -> Result:
         """The result of a function, kept from an earlier call with the same kind and key.
 
@@ -197,22 +197,20 @@ class Bricks:
         """
 
         def compute() -> npt.NDArray[np.int32]:
-            distance = self._distance(task)
+            matters = self.matters(task)
+            distance = np.where(matters, 0, FARTHEST).astype(np.int32)
+            if matters.any():
+                library, (layers, rows, _), size = (
+                    native.library(),
+                    distance.shape,
+                    self.values.size,
+                )
+                _find_distances(library.fhash_march_distance_layers, distance, layers, size)
+                _find_distances(library.fhash_march_distance_rows, distance, rows, size)
             distance.flags.writeable = False
             return distance
 
         return self.remembered("distance", task.visibility, compute)
-
-    def _distance(self, task: Task) -> npt.NDArray[np.int32]:
-        """The distances of `distance`, computed."""
-        matters = self.matters(task)
-        distance = np.where(matters, 0, FARTHEST).astype(np.int32)
-        if not matters.any():
-            return distance
-        library, (layers, rows, _) = native.library(), distance.shape
-        _find_distances(library.fhash_march_distance_layers, distance, layers, self.values.size)
-        _find_distances(library.fhash_march_distance_rows, distance, rows, self.values.size)
-        return distance
 
 
 def _extremes(values: Single) -> tuple[Single, Single]:
@@ -283,21 +281,6 @@ def smoothed(values: Single, deviation: float, error: float = math.inf) -> Singl
         deviation: standard deviation of the Gaussian, in vertices, above 0.
         error: largest difference of a smoothed value from its own, in the units of the values.
     """
-    out = _blurred(values, deviation)
-    if error < math.inf:
-        list(in_threads(lambda z: _clip(out[z], values[z], np.float32(error)), range(len(out))))
-    return out
-
-
-def _clip(blurred: Single, values: Single, error: np.float32) -> None:
-    """Clip a layer of smoothed values, in place."""
-    blurred -= values
-    np.clip(blurred, -error, error, out=blurred)
-    blurred += values
-
-
-def _blurred(values: Single, deviation: float) -> Single:
-    """The values after a Gaussian along each axis; a new array."""
     weights = _weights(deviation)
     library = native.library()
     shape = (ctypes.c_int64 * 3)(*values.shape)
@@ -314,8 +297,15 @@ def _blurred(values: Single, deviation: float) -> Single:
     def row(y: int) -> None:
         library.fhash_march_smooth_rows(flat.ctypes.data, *given, y, y + 1, out.ctypes.data)
 
+    def clip(z: int) -> None:
+        out[z] -= values[z]
+        np.clip(out[z], -np.float32(error), np.float32(error), out=out[z])
+        out[z] += values[z]
+
     list(in_threads(layer, range(layers)))
     list(in_threads(row, range(rows)))
+    if error < math.inf:
+        list(in_threads(clip, range(layers)))
     return out
 
 

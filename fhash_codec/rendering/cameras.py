@@ -11,12 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid, vector
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
-
-Floats = npt.NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "iso": ((1, 1, 1), (0, 0, 1)),
@@ -224,19 +221,19 @@ def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
     return unit, right / np.linalg.norm(right)
 
 
-def _turned(vector: Floats, axis: Floats, degrees: float) -> Floats:
+def _turned(given: Floats, axis: Floats, degrees: float) -> Floats:
     """Turn a vector about a unit axis, by Rodrigues' formula."""
     angle = np.radians(degrees)
     return np.asarray(
-        vector * np.cos(angle)
-        + np.cross(axis, vector) * np.sin(angle)
-        + axis * (axis @ vector) * (1 - np.cos(angle)),
+        given * np.cos(angle)
+        + np.cross(axis, given) * np.sin(angle)
+        + axis * (axis @ given) * (1 - np.cos(angle)),
         dtype=np.float64,
     )
 
 
-def _text(vector: Floats) -> str:
-    return ", ".join(f"{number:g}" for number in vector)
+def _text(numbers: Floats) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def pchip(at: Floats, values: Floats, share: float) -> Floats:
@@ -434,7 +431,7 @@ class CameraPath:
         if exact.size:
             return self.cameras[int(exact[0])]
         before = self.cameras[int(np.searchsorted(self.at, share)) - 1]
-        place = self._angles(share) if self._is_turning() else self._place(share)
+        place = self._angles(share) if self._is_turning() else self._position(share)
         return dataclasses.replace(before, **place, **self._lens(share))
 
     def _is_turning(self) -> bool:
@@ -451,7 +448,7 @@ class CameraPath:
         azimuth, elevation = pchip(self.at, angles, share)
         return {"azimuth": float(azimuth), "elevation": float(np.clip(elevation, -90, 90))}
 
-    def _place(self, share: float) -> dict[str, Any]:
+    def _position(self, share: float) -> dict[str, Any]:
         """Position, focal point and upward direction; the distance changes by constant factors."""
         poses = [_pose(Rays.of(camera, self.grid, self.size), camera) for camera in self.cameras]
         places = np.array([[*pose.focal, np.log(pose.distance)] for pose in poses])
@@ -464,9 +461,9 @@ class CameraPath:
         return {
             "azimuth": 0.0,
             "elevation": 0.0,
-            "position": _triple(focal + away * distance),
-            "focal_point": _triple(focal),
-            "view_up": _triple(up),
+            "position": vector(focal + away * distance),
+            "focal_point": vector(focal),
+            "view_up": vector(up),
         }
 
     def _upright(self, rotations: Floats, share: float) -> tuple[Floats, Floats] | None:
@@ -522,8 +519,3 @@ def _pose(rays: Rays, camera: Camera) -> _Pose:
         distance=float(np.linalg.norm(eye - focal)),
         rotation=from_matrix(np.stack([np.cross(forward, up), up, -forward], axis=1)),
     )
-
-
-def _triple(vector: Floats) -> tuple[float, float, float]:
-    x, y, z = (float(number) for number in vector)
-    return x, y, z

@@ -15,9 +15,8 @@ import numpy.typing as npt
 from PIL import ImageColor
 
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
+from fhash_codec.rendering.grid import Floats
 from fhash_formats.errors import InputError, MissingInputError
-
-Floats = npt.NDArray[np.float64]
 
 WHITE = (0.9505, 1.0, 1.089)
 """The white point D65 in XYZ, rounded as in VTK."""

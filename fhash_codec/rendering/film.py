@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.image import Draw, Image
+from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.renderer import Renderer
-from fhash_codec.rendering.scenes import Scene, digest_in_png, scene_in_png
+from fhash_codec.rendering.scenes import DIGEST_KEY, Scene, scene_in_png, text_in_png
 from fhash_codec.rendering.timeline import Animation
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -81,13 +81,10 @@ def film(
         rate: pictures per second.
         force: whether to replace a file.
 
-    Raises InputError for another kind of file, OutputError for what cannot be written,
-    MissingDependencyError without the package for MP4.
+    Raises OutputError for what cannot be written, MissingDependencyError without the package for
+    MP4.
     """
-    suffix = path.suffix.lower()
-    if suffix not in FILMS:
-        raise InputError(f"{path}: a film is written as {' or '.join(FILMS)}; use such a name")
-    ffmpeg = check_film(suffix)
+    ffmpeg = check_film(path.suffix.lower())
     with replacing(path, force=force) as temporary:
         if ffmpeg is None:
             _write_gif(temporary, frames, rate)
@@ -353,7 +350,6 @@ def animate(
     target: Target,
     *,
     progress: Progress = silent,
-    draw: Draw | None = None,
 ) -> Animated:
     """Render every picture of an animation to numbered files or to a film.
 
@@ -366,18 +362,14 @@ def animate(
         animation: what changes.
         target: the files to write.
         progress: is told about each finished picture.
-        draw: renders one picture; `Renderer(volume).render` if None.
 
-    Raises InputError for file names of other kinds, for what `Animation.scenes` refuses and for
-    `draw` with several processes, FhashError where one of these ends by itself,
-    OutputExistsError before anything is rendered, OutputError for what cannot be written,
-    MissingDependencyError without the package for MP4.
+    Raises InputError for file names of other kinds and for what `Animation.scenes` refuses,
+    FhashError where a process ends by itself, OutputExistsError before anything is rendered,
+    OutputError for what cannot be written, MissingDependencyError without the package for MP4.
     """
     output, force, processes = Path(target.output), target.force, target.processes
-    if processes < 1 or (draw is not None and processes > 1):
-        raise InputError(
-            f"processes is {processes}; at least 1 is needed, and 1 where 'draw' is given"
-        )
+    if processes < 1:
+        raise InputError(f"processes is {processes}; at least 1 is needed")
     _check_names(output, target.pictures)
     is_film = output.suffix.lower() != ".png"
     begun = time.perf_counter()
@@ -394,7 +386,7 @@ def animate(
             check_output(frame.path, force, sources=[volume.path])
     _warn_of_others(paths)
     counters: Counter[str] = Counter()
-    with closing(_rendered(frames, volume, draw, processes)) as rendered:
+    with closing(_rendered(frames, volume, processes)) as rendered:
         made = _made(frames, volume, rendered, force, counters, progress)
         if is_film:
             film(output, map(_pixels, made), scene.size, animation.rate, force=force)
@@ -455,13 +447,14 @@ def _is_good(path: Path, scene: Scene, volume: Volume) -> bool:
             path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers
         ):
             return False
-        return digest_in_png(path) == volume.container.digest and scene_in_png(path) == scene
+        is_of_volume = text_in_png(path, DIGEST_KEY) == volume.container.digest.encode()
+        return is_of_volume and scene_in_png(path) == scene
     except (OSError, InputError):
         return False
 
 
 def _rendered(
-    frames: Sequence[_Frame], volume: Volume, draw: Draw | None, processes: int
+    frames: Sequence[_Frame], volume: Volume, processes: int
 ) -> Generator[Image, None, None]:
     """Render the frames that are not kept, in order, here or in several processes."""
     scenes = [frame.scene for frame in frames if not frame.kept]
@@ -469,12 +462,12 @@ def _rendered(
     if processes > 1:
         yield from rendered_by_workers(volume, scenes, processes)
         return
-    draw = Renderer(volume).render if draw is None else draw
+    renderer = Renderer(volume)
     # A frame is decoded ahead only for the very next picture.
     following = {number: after.scene for number, after in enumerate(frames[1:]) if not after.kept}
     for number, frame in enumerate(frames):
         if not frame.kept:
-            yield draw(frame.scene, upcoming=following.get(number))
+            yield renderer.render(frame.scene, upcoming=following.get(number))
 
 
 def _made(

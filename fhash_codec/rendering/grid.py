@@ -14,6 +14,8 @@ from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
 
 Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+Vector = tuple[float, float, float]
 
 TOLERANCE = 1e-3
 """Largest distance of even coordinates from evenly spaced ones, as a share of the extent."""
@@ -213,8 +215,6 @@ def _unwrapped(degrees: Floats) -> Floats:
     return np.unwrap(degrees, period=360.0) if np.any(np.abs(steps - 360) < 180) else degrees
 
 
-Vector = tuple[float, float, float]
-
 MAX_AXES_RATIO = 1e14
 """Largest ratio of the longest axis to the shortest vertex spacing.
 
@@ -282,12 +282,7 @@ class Grid:
         factors = np.where([downward(coords[axis]) for axis in "xyz"], -factors, factors)
         series_counts = [len(axis.values) for axis in axes]
         counts = drawn_counts(axes)
-        finer = np.array(
-            [
-                max(count - 1, 1) / max(own - 1, 1)
-                for count, own in zip(counts, series_counts, strict=True)
-            ]
-        )
+        finer = np.array(_finer(counts, series_counts))
         spacing = mean * factors / finer
         _check_lengths(spacing, counts)
         uneven = not all(axis.even for axis in axes)
@@ -298,18 +293,14 @@ class Grid:
             counts=(counts[0], counts[1], counts[2]),
             origin=np.array([axis.values[0] for axis in axes]) * factors,
             spacing=spacing,
-            scale=(float(factors[0]), float(factors[1]), float(factors[2])),
+            scale=vector(factors),
             warp=Warp(
                 counts=(series_counts[0], series_counts[1], series_counts[2]),
                 places=(places[0], places[1], places[2]),
             )
             if uneven
             else None,
-            coarseness=(
-                float(finer[0] * axes[0].coarsest),
-                float(finer[1] * axes[1].coarsest),
-                float(finer[2] * axes[2].coarsest),
-            ),
+            coarseness=vector(finer * [axis.coarsest for axis in axes]),
         )
 
     @property
@@ -352,6 +343,12 @@ class Grid:
     def corners(self) -> Floats:
         """The drawn box in physical coordinates (3, 2); descending on descending axes."""
         return self.origin[:, None] + self.bounds * self.spacing[:, None]
+
+
+def vector(numbers: npt.ArrayLike) -> Vector:
+    """Three numbers of an array."""
+    x, y, z = (float(number) for number in np.asarray(numbers))
+    return x, y, z
 
 
 def _finer(counts: Sequence[int], series_counts: Sequence[int]) -> list[float]:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ import numpy.typing as npt
 from fhash_codec import times
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import ColourMap, parse_colour
+from fhash_codec.rendering.grid import Floats, Single
 from fhash_codec.rendering.layout import (
     TITLE_GAP,
     Bar,
@@ -49,15 +50,6 @@ PICTURES = (".png", ".jpg", ".jpeg")
 """Suffixes of pictures, in lower case."""
 JPEG_QUALITY = 92
 """Quality of a JPEG, 1..95, at which letters and edges stay clean."""
-
-Single = npt.NDArray[np.float32]
-
-
-class Draw(Protocol):
-    """Renders a scene while the next one is prepared, as `Renderer.render` does."""
-
-    def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
-        """Render `scene`; `upcoming` is the scene of the next picture."""
 
 
 def check_picture_name(path: Path, background: str) -> None:
@@ -185,7 +177,6 @@ class Image:
         return f"<fhash Image {width}x{height} of {source} in {self.seconds:.3g} s>"
 
 
-Floats = npt.NDArray[np.float64]
 Layer = tuple[Floats, Single]
 """Colour and opacity."""
 
@@ -333,15 +324,12 @@ class _Canvas:
         self.colours: Floats = np.zeros((height, width, 3))
         self.opacity: Single = np.zeros((height, width), dtype=np.float32)
 
-    def fill(
-        self, rectangle: tuple[int, int, int, int], colour: Floats, opacity: float = 1.0
-    ) -> None:
+    def fill(self, rectangle: tuple[int, int, int, int], colour: Floats) -> None:
         """Fill a rectangle, as far as it lies on the canvas.
 
         Args:
             rectangle: left, top, right, bottom in pixels; the last two lie outside.
             colour: (3,), or a colour for each row of the rectangle (rows, 1, 3).
-            opacity: 0..1.
         """
         left, top, right, bottom = rectangle
         height, width = self.opacity.shape
@@ -349,7 +337,7 @@ class _Canvas:
         last = max(min(bottom, height), first)  # a rectangle below the canvas has no row on it
         area = slice(first, last), slice(max(left, 0), max(min(right, width), 0))
         self.colours[area] = colour[first - top : last - top] if colour.ndim == 3 else colour
-        self.opacity[area] = opacity
+        self.opacity[area] = 1
 
 
 def _opacity(mask: PicturesImage) -> Single:

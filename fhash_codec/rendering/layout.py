@@ -10,11 +10,10 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import ColourMap
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Effects, LegendEntry, Scene
 from fhash_codec.rendering.view import Edge, outer_edges
 from fhash_formats.series import Coordinate
@@ -174,7 +173,6 @@ def _texts(values: list[float], step: float) -> list[str]:
     return [f"{value + 0.0:.{max(0, finer - digits)}f}" for value in values]
 
 
-Floats = npt.NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 """Left, top, right and bottom in pixels."""
 

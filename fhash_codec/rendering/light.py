@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid, Single
 from fhash_codec.rendering.march_task import (
     GRADES,
     Frame,
@@ -39,8 +38,6 @@ from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads
-
-Floats = npt.NDArray[np.float64]
 
 FLATTEST = 1e-6
 """Gradient, as a share of the value range per vertex, at which shading has faded by half. The
@@ -111,8 +108,6 @@ def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
         factors: Floats = np.clip(grid.vertex_spacing / (span * grid.spacing), -limit, limit)
     return factors
 
-
-Single = npt.NDArray[np.float32]
 
 LEAST_TOP = 1e-300
 """Least gradient of the last factor in marched units, so that there are numbers to divide by it."""
@@ -216,12 +211,9 @@ def light_grid(
 
     task: of a marcher, without light. What its clip leaves takes light away, as far as its table
         and its opacity by gradient let it.
-    lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
+    lamp: unit vector (x, y, z) of the coordinates towards the light; shadows need one.
     bricks: of the frame. They keep what the next picture needs again; None keeps nothing.
-    Raises InputError for shadows without a lamp.
     """
-    if shadows is not None and lamp is None:
-        raise InputError("shadows need the direction towards a lamp")
     grid, table, body, grading = task.rays.grid, task.table, task.body, task.grading
     resolution = shadows.resolution if shadows is not None else Shadows().resolution
     across = max(1, round(resolution / frame.stride))
@@ -232,7 +224,7 @@ def light_grid(
     unit = grid.vertex_spacing
     table = replace(table, extinctions=extinctions_in(table.extinctions, unit))
     cell = float(across * frame.stride)
-    kept = _Kept(
+    cache = _Cache(
         bricks,
         (
             *(table.low, table.high, table.extinctions.tobytes(), across, grid.spacing.tobytes()),
@@ -240,26 +232,26 @@ def light_grid(
             None if grading is None else (grading.top, grading.factors.tobytes()),
         ),
     )
-    extinction, first = kept(
+    extinction, first = cache(
         "extinction", (), lambda: _extinction_of(frame, grid, table, across, body, grading)
     )
     points = _Points(extinction=extinction, spacing=grid.spacing, cell=cell, unit=unit)
     shares = np.ones((*extinction.shape, 2), dtype=np.float32)
     rays = 0
     if shadows is not None and lamp is not None:
-        passed = kept("lamp", lamp.tobytes(), lambda: points.from_lamp(lamp))
+        passed = cache("lamp", lamp.tobytes(), lambda: points.from_lamp(lamp))
         shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
         rays += extinction.size
     if ambient_occlusion is not None:
         radius = ambient_occlusion.radius
-        around = kept("around", radius, lambda: points.from_around(radius))
+        around = cache("around", radius, lambda: points.from_around(radius))
         shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around)
         rays += extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Cache:
     """The light of one transfer function that bricks keep; without bricks nothing is kept."""
 
     bricks: Bricks | None
@@ -331,7 +323,9 @@ class _Points:
         """Shares of a lamp's light that reach the points; lamp: unit vector towards it."""
         step = np.asarray(lamp, dtype=np.float64) / (self.spacing * self.cell)
         step /= np.abs(step).max()
-        return self._passed(step, _steps_out(step, self.extinction.shape))
+        with np.errstate(divide="ignore", over="ignore"):
+            out = np.ceil(np.array(self.extinction.shape[::-1]) / np.abs(step))
+        return self._passed(step, int(out.min()) + 1)  # then every point has left the grid
 
     def from_around(self, radius: float) -> Single:
         """Shares of the light that reaches the points from as far as `radius`, in vertices."""
@@ -347,23 +341,18 @@ class _Points:
         return _left(sums, float(np.linalg.norm(step * self.spacing * self.cell)) / self.unit)
 
 
-def _steps_out(step: Floats, shape: tuple[int, ...]) -> int:
-    """Steps after which every point has left the grid; step: x, y, z in its cells."""
-    with np.errstate(divide="ignore", over="ignore"):
-        return int(np.min(np.ceil(np.array(shape[::-1]) / np.abs(step)))) + 1
-
-
 def _sums(extinction: Single, step: Floats, count: int) -> Single:
     """Sums of the extinction in the middle of `count` steps from each point."""
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
     shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
-    _in_layers(
-        extinction.shape[0],
-        lambda z: library.fhash_march_sum(
+
+    def layer(z: int) -> None:
+        library.fhash_march_sum(
             extinction.ctypes.data, shape, along, count, z, z + 1, sums.ctypes.data
-        ),
-    )
+        )
+
+    list(in_threads(layer, range(len(extinction))))
     return sums
 
 
@@ -407,13 +396,8 @@ def _extinction(values: Single, table: Table, across: int, factors: Single | Non
             scratch.ctypes.data,
         )
 
-    _in_layers(points[0], layer)
+    list(in_threads(layer, range(points[0])))
     return out
-
-
-def _in_layers(count: int, function: Callable[[int], object]) -> None:
-    """Call a function of the layers 0 .. count - 1 in several threads."""
-    list(in_threads(function, range(count)))
 
 
 SHOULDER = (-0.7, 1.0, 1.0)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
+from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
     GRADES,
@@ -54,16 +55,14 @@ GRADED = 256
 """Flag of `fhash_march`, with SHADED: the gradients decide on the opacity, too."""
 
 _Three = c_double * 3
-_Pair = c_double * 2
-_Box = _Pair * 3
-_Surface = c_double * 5
-_Plane = c_double * 4
+_Box = c_double * 2 * 3
 
 
 class March(ctypes.Structure):
     """`FhashMarch` of march.hpp, field by field.
 
     Pointers are given as contiguous arrays, or None for null. The structure keeps them alive.
+    Arrays for fields that lie within the structure are copied; their lengths may be smaller.
     """
 
     _fields_ = (
@@ -105,14 +104,14 @@ class March(ctypes.Structure):
         ("floor", c_double),
         ("powers", POINTER(c_float)),
         ("surfaces", c_int64),
-        ("surface", _Surface * MAX_SURFACES),
+        ("surface", c_double * 5 * MAX_SURFACES),
         ("out", POINTER(c_float)),
         ("depth", POINTER(c_float)),
         ("normal", POINTER(c_float)),
         ("central", c_int64),
         ("path", c_int64),
         ("planes", c_int64),
-        ("plane", _Plane * MAX_PLANES),
+        ("plane", c_double * 4 * MAX_PLANES),
         ("grading", POINTER(c_float)),
         ("grade_scale", c_double),
         ("unlit", c_int64),
@@ -123,6 +122,10 @@ class March(ctypes.Structure):
         arrays = {name: field for name, field in fields.items() if isinstance(field, np.ndarray)}
         kinds: dict[str, Any] = dict(self._fields_)
         for name, array in arrays.items():
+            if issubclass(kinds[name], ctypes.Array):
+                fields[name] = kinds[name]()
+                np.ctypeslib.as_array(fields[name])[: len(array)] = array
+                continue
             assert array.flags.c_contiguous, f"{name} is not contiguous"
             assert np.ctypeslib.as_ctypes_type(array.dtype) is kinds[name]._type_, (
                 f"{name} is {array.dtype}"
@@ -132,29 +135,6 @@ class March(ctypes.Structure):
         self._arrays = tuple(arrays.values())
         super().__init__(**fields)
 
-
-def numbers(values: npt.ArrayLike) -> ctypes.Array[c_double]:
-    """Three numbers, x, y, z."""
-    return _Three(*np.asarray(values))
-
-
-def box(ends: npt.NDArray[np.float64]) -> ctypes.Array[Any]:
-    """A box (3, 2), x, y, z."""
-    return _Box(*(_Pair(*pair) for pair in ends))
-
-
-def surface(level: float, colour: npt.ArrayLike, opacity: float) -> ctypes.Array[c_double]:
-    """An isosurface: its value, red, green, blue and opacity."""
-    return _Surface(level, *np.asarray(colour), opacity)
-
-
-def plane(normal_and_distance: npt.ArrayLike) -> ctypes.Array[c_double]:
-    """A plane: its normal x, y, z, and the product with it from which on places are kept."""
-    return _Plane(*np.asarray(normal_and_distance))
-
-
-Floats = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 
 MAX_MAGNITUDE = 1e36
 """Largest magnitude of values that float32 can compute with; larger values are scaled."""
@@ -169,83 +149,90 @@ class MarchInput:
     All places and directions are in vertices of the frame, x, y, z.
 
     Attributes:
-        values: float32 (z, y, x), scaled where float32 could not compute with them.
+        fields: of `March`, by name: values, scaled where float32 could not compute with them, rays,
+            the drawn box as it is clipped, the part `seen` of it in which the frame has values, and
+            what follows from these.
         low, high: values of the table's ends, scaled likewise.
-        levels: values of the surfaces, scaled likewise.
-        eye, right, up, forward: camera of the rays, each (3,).
-        box: (3, 2), the drawn box as it is clipped, in which steps are counted.
-        seen: (3, 2), the part of the box in which the frame has values.
-        planes: (n, 4), planes that cut the box, as `Body` has them.
-        spacing: (3,), length of one vertex spacing in the coordinates.
-        gradient: (3,), factors from differences between vertices to the gradients of shading.
         steepness: a gradient of shading of 1, in marched units per unit of the coordinates.
-        floor: gradient at which shading has faded by half.
         smoothing: deviation of the Gaussian by which values are smoothed before shading, in
             vertices; 0 for none.
         error: largest error of a value, scaled likewise; smoothed values stay within it.
-        light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
     """
 
-    values: Single
+    fields: dict[str, Any]
     low: float
     high: float
-    levels: tuple[float, ...]
-    eye: Floats
-    right: Floats
-    up: Floats
-    forward: Floats
-    box: Floats
-    seen: Floats
-    planes: Floats
-    spacing: Floats
-    gradient: Floats
     steepness: float
-    floor: float
     smoothing: float
     error: float
-    light_offset: Floats
-    light_scale: float
 
     @classmethod
     def of(cls, frame: Frame, task: Task, bricks: Bricks) -> MarchInput:
         """The input for a task and a frame with its bricks."""
-        grid, stride = task.rays.grid, float(frame.stride)
+        rays, grid, stride = task.rays, task.rays.grid, float(frame.stride)
         first = np.array(frame.first[::-1], dtype=np.float64)
         least, most = bricks.value_range
         low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
         scaling = _Scaling.of(low, high, max(abs(least), abs(most)))
         low, high, least, most = map(scaling.number, (low, high, least, most))
-        span, floor = flatness(low, high, least, most, scaling.width(task.noise))
-        light = task.light
-        box, planes = task.bounds, task.planes
-        within = frame.bounds(grid)
+        noise = scaling.width(task.noise)
+        span, floor = flatness(low, high, least, most, noise)
+        box, planes, within = task.bounds, task.planes, frame.bounds(grid)
         seen = np.stack(
             [np.maximum(within[:, 0], box[:, 0]), np.minimum(within[:, 1], box[:, 1])], axis=-1
         )
         seen[:, 1] = np.maximum(seen[:, 1], seen[:, 0])  # nothing, and no box that is turned over
-        return cls(
-            values=scaling.array(bricks.values),
-            low=low,
-            high=high if high > low else low + span,
-            levels=tuple(scaling.number(surface.value) for surface in task.surfaces),
-            eye=(task.rays.eye - first) / stride,
-            right=task.rays.right / stride,
-            up=task.rays.up / stride,
-            forward=task.rays.forward / stride,
-            box=(box - first[:, None]) / stride,
-            seen=(seen - first[:, None]) / stride,
-            planes=np.column_stack(
+        values = scaling.array(bricks.values)
+        fields = {
+            "values": values,
+            "shape": values.shape,
+            "bricks": bricks.low.shape,
+            "low": low,
+            "eye": (rays.eye - first) / stride,
+            "right": rays.right / stride,
+            "up": rays.up / stride,
+            "forward": rays.forward / stride,
+            "box": (box - first[:, None]) / stride,
+            "seen": (seen - first[:, None]) / stride,
+            "spacing": grid.spacing * stride,
+            "planes": len(planes),
+            "plane": np.column_stack(
                 [planes[:, :3], (planes[:, 3] - planes[:, :3] @ first) / stride]
             ),
-            spacing=grid.spacing * stride,
-            gradient=slope_scale(grid, span, least, most),
+            "surfaces": 0 if task.projection else len(task.surfaces),
+            "surface": np.reshape(
+                [
+                    (scaling.number(each.value), *each.colour, each.opacity)
+                    for each in task.surfaces
+                ],
+                (-1, 5),
+            ),
+            "gradient": slope_scale(grid, span, least, most),
+            "floor": floor,
+            **_light_fields(task, first, stride),
+        }
+        return cls(
+            fields=fields,
+            low=low,
+            high=high if high > low else low + span,
             steepness=span * scaling.unit / (stride * grid.vertex_spacing),
-            floor=floor,
-            smoothing=smoothing(span, scaling.width(task.noise)),
+            smoothing=smoothing(span, noise),
             error=scaling.width(task.error),
-            light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
-            light_scale=1.0 if light is None else stride / light.cell,
         )
+
+
+def _light_fields(task: Task, first: npt.NDArray[np.float64], stride: float) -> dict[str, Any]:
+    """The fields of the light grid: a place is at place * scale + offset (3,) in it."""
+    light = task.light
+    if light is None:
+        return {"light": None, "light_scale": 1.0}
+    shares = np.ascontiguousarray(light.shares, dtype=np.float32)
+    return {
+        "light": shares,
+        "light_shape": shares.shape[:3],
+        "light_offset": (first - light.first) / light.cell,
+        "light_scale": stride / light.cell,
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,13 +265,6 @@ class _Scaling:
         with np.errstate(over="ignore"):
             scaled = values.astype(np.float64) / self.unit - self.middle / self.unit
             return scaled.clip(-MAX_MAGNITUDE, MAX_MAGNITUDE).astype(np.float32)
-
-
-def empty_table(low: float, high: float) -> Table:
-    """A table of nothing, for surfaces alone."""
-    return Table(
-        low=low, high=high, colours=np.zeros((2, 3), dtype=np.float32), extinctions=np.zeros(2)
-    )
 
 
 ENTRIES = 4000
@@ -327,94 +307,54 @@ def march_native(
     assert frame.values.size <= MAX_VALUES, "a plan has no larger frame"
     task = task.marched
     given = MarchInput.of(frame, task, bricks)
-    buffers = _Buffers.of(task)
-    skipping = _skipping(library, given, task, bricks)
+    (width, height), smooth = task.rays.size, _smooth(given, task, bricks)
+    rgba = np.zeros((height, width, 4), dtype=np.float32)
+    # Normals need the depth, to keep that of the nearest of several rays.
+    depth = np.full((height, width), np.inf, np.float32) if task.depth or task.normal else None
+    normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
     structure = March(
-        values=given.values,
-        shape=given.values.shape,
-        bricks=bricks.low.shape,
-        distance=skipping.distance,
-        cells=skipping.cells,
-        highest=skipping.highest,
+        **given.fields,
+        **_skipping_fields(library, given, task, bricks),
         **_table_fields(given, task),
-        **_light_fields(given, task),
-        **_ray_fields(given, task),
         **_lighting_fields(task.lighting),
-        gradient=numbers(given.gradient),
-        floor=given.floor,
-        smooth=_smooth(given, task, bricks),
         **_grading_fields(given, task),
-        planes=len(given.planes),
-        plane=(ctypes.c_double * 4 * MAX_PLANES)(*map(plane, given.planes)),
-        surfaces=0 if task.projection else len(task.surfaces),
-        surface=_surfaces(given, task),
-        out=buffers.rgba,
-        depth=buffers.depth,
-        normal=buffers.normal,
+        width=width,
+        height=height,
+        parallel=task.rays.parallel,
+        rays=task.antialiasing,
+        step=task.step,
+        threshold=task.threshold,
+        jitter=task.jitter,
+        smooth=smooth,
+        out=rgba,
+        depth=depth,
+        normal=normal,
         path=path,
     )
     counters = _march(library, structure, task, threads)
-    return Marched(
-        rgba=buffers.rgba,
-        depth=buffers.depth if task.depth else None,
-        normal=buffers.normal,
-        counters=counters,
-    )
+    return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Buffers:
-    """The pictures that rays are added to: rgba (H, W, 4), depth (H, W) and normal (H, W, 3).
+def _skipping_fields(
+    library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks
+) -> dict[str, Any]:
+    """The fields of the bricks and cells that rays may pass over; none where all is looked at.
 
-    Normals need the depth, to keep that of the nearest of several rays.
+    They are the distances of `Bricks.distance`, the cells of `cells_of`, or the largest value of
+    each brick for the maximum along a ray, the smallest times -1 for the minimum.
     """
-
-    rgba: Single
-    depth: Single | None
-    normal: Single | None
-
-    @classmethod
-    def of(cls, task: Task) -> _Buffers:
-        width, height = task.rays.size
-        return cls(
-            rgba=np.zeros((height, width, 4), dtype=np.float32),
-            depth=np.full((height, width), np.inf, dtype=np.float32)
-            if task.depth or task.normal
-            else None,
-            normal=np.zeros((height, width, 3), dtype=np.float32) if task.normal else None,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Skipping:
-    """Bricks and cells that rays may pass over; None where all of a frame is looked at.
-
-    Attributes:
-        distance: int32 (z, y, x), as `Bricks.distance` has it.
-        cells: uint32 (z, y, x, 2), as `cells_of` has it.
-        highest: float32 (z, y, x) of bricks, the largest value, for the maximum along a ray, or the
-            smallest times -1 for the minimum.
-    """
-
-    distance: npt.NDArray[np.int32] | None = None
-    cells: npt.NDArray[np.uint32] | None = None
-    highest: Single | None = None
-
-
-def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks) -> _Skipping:
-    """The parts of a frame that a task's rays may pass over."""
     if not task.skipping:
-        return _Skipping()
+        return {}
     if task.projection in ("maximum", "minimum"):
         # Scaled values have other extremes than the bricks.
-        if given.values is not bricks.values:
-            return _Skipping()
-        return _Skipping(highest=bricks.high if task.projection == "maximum" else -bricks.low)
-    shortest = float(np.abs(given.spacing).min())
+        if given.fields["values"] is not bricks.values:
+            return {}
+        return {"highest": bricks.high if task.projection == "maximum" else -bricks.low}
+    shortest = float(np.abs(given.fields["spacing"]).min())
     # A step longer than a brick could pass through one in which a surface lies, on its way from one
     # in which nothing is visible to another.
     if task.surfaces and task.step / shortest > SIDE:
-        return _Skipping()
+        return {}
     distance = bricks.distance(task)
     # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
     by_cells = not (task.surfaces and task.step > 0.99 * shortest)
@@ -426,18 +366,19 @@ def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Brick
         else None
     )
     if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
-        return _Skipping()
-    return _Skipping(distance=distance, cells=cells)
+        return {}
+    return {"distance": distance, "cells": cells}
 
 
 def _table_fields(given: MarchInput, task: Task) -> dict[str, object]:
     """The fields of the transfer function."""
-    entries, extinctions = _entries(task.table or empty_table(given.low, given.high), task.step)
+    colours = np.zeros((2, 3), dtype=np.float32)
+    nothing = Table(low=given.low, high=given.high, colours=colours, extinctions=np.zeros(2))
+    entries, extinctions = _entries(task.table or nothing, task.step)
     return {
         "table": entries,
         "extinction": extinctions,
         "entries": len(entries) - 1,
-        "low": given.low,
         "scale": (len(entries) - 2) / (given.high - given.low),
     }
 
@@ -451,45 +392,13 @@ def _entries(table: Table, step: float) -> tuple[Single, npt.NDArray[np.float64]
     return np.stack([*columns, -np.expm1(-extinctions)], axis=-1).astype(np.float32), extinctions
 
 
-def _light_fields(given: MarchInput, task: Task) -> dict[str, object]:
-    """The fields of the light grid."""
-    light = task.light
-    shares = None if light is None else np.ascontiguousarray(light.shares, dtype=np.float32)
-    return {
-        "light": shares,
-        "light_shape": (0, 0, 0) if shares is None else shares.shape[:3],
-        "light_offset": numbers(given.light_offset),
-        "light_scale": given.light_scale,
-    }
-
-
-def _ray_fields(given: MarchInput, task: Task) -> dict[str, object]:
-    """The fields of the rays and their steps."""
-    width, height = task.rays.size
-    return {
-        "eye": numbers(given.eye),
-        "right": numbers(given.right),
-        "up": numbers(given.up),
-        "forward": numbers(given.forward),
-        "box": box(given.box),
-        "seen": box(given.seen),
-        "spacing": numbers(given.spacing),
-        "width": width,
-        "height": height,
-        "parallel": task.rays.parallel,
-        "rays": task.antialiasing,
-        "step": task.step,
-        "threshold": task.threshold,
-        "jitter": task.jitter,
-    }
-
-
 def _smooth(given: MarchInput, task: Task, bricks: Bricks) -> Single | None:
     """The smoothed values that what is lit is shaded by; None where those of the frame do."""
     if not given.smoothing or not (task.shaded or task.surfaces):
         return None
-    if given.values is not bricks.values:  # scaled for this task alone
-        return smoothed(given.values, given.smoothing, given.error)
+    values: Single = given.fields["values"]
+    if values is not bricks.values:  # scaled for this task alone
+        return smoothed(values, given.smoothing, given.error)
     return bricks.smoothed(given.smoothing, given.error)
 
 
@@ -497,7 +406,7 @@ def _grading_fields(given: MarchInput, task: Task) -> dict[str, object]:
     """The fields of the opacity by gradient."""
     grading = task.grading
     if grading is None:
-        return {"grading": None, "grade_scale": 0.0, "unlit": 0}
+        return {}
     factors = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
     return {
         "grading": factors,
@@ -513,7 +422,7 @@ def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
     steep = max(1.0, lighting.specular_power / SHARPEST)
     cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
     return {
-        "lamp": numbers((0.0, 0.0, 0.0) if lighting.lamp is None else lighting.lamp),
+        "lamp": (0.0, 0.0, 0.0) if lighting.lamp is None else lighting.lamp,
         "ambient": lighting.ambient,
         "diffuse": lighting.diffuse,
         "specular": lighting.specular,
@@ -521,12 +430,6 @@ def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
         "powers": (cosines**lighting.specular_power).astype(np.float32),
         "central": lighting.central,
     }
-
-
-def _surfaces(given: MarchInput, task: Task) -> ctypes.Array[ctypes.Array[ctypes.c_double]]:
-    surfaces = zip(given.levels, task.surfaces, strict=True)
-    rows = (surface(level, each.colour, each.opacity) for level, each in surfaces)
-    return (ctypes.c_double * 5 * MAX_SURFACES)(*rows)
 
 
 def _march(
@@ -603,10 +506,8 @@ def march(
         bricks: of the frame; made if None.
         threads: most threads; None for all processors.
 
-    Raises InputError for more than MAX_SURFACES surfaces and for a step that is not above 0.
+    Raises InputError for more than MAX_SURFACES surfaces.
     """
-    if not task.step > 0:
-        raise InputError(f"a step has the length {task.step:g}; it must be above 0")
     if len(task.surfaces) > MAX_SURFACES:
         raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
     if bricks is None:

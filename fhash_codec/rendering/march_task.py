@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid, Warp
+from fhash_codec.rendering.grid import Floats, Grid, Single, Warp
 from fhash_codec.rendering.transfer_function import about
 from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
@@ -121,10 +121,6 @@ class Arrays:
 
 NUMPY = Arrays()
 """The arrays of the host."""
-
-
-Floats = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -429,6 +425,11 @@ class Units:
         return np.asarray(
             (np.asarray(values, dtype=np.float64) - self.shift) * self.factor, dtype=np.float64
         )
+
+    def single(self, values: npt.NDArray[Any]) -> Single:
+        """Convert data units to marched units, float32 and contiguous."""
+        converted = values if self == Units() else self.to(values)
+        return np.ascontiguousarray(converted, dtype=np.float32)
 
 
 def warped(frame: Frame, warp: Warp | None) -> Frame:

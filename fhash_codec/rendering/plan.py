@@ -16,7 +16,7 @@ from fhash_codec.boxes import MAX_LOD, Box
 from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.layout import Layout, lay_out, quantity_of
 from fhash_codec.rendering.light import (
     coding_noise,
@@ -29,7 +29,7 @@ from fhash_codec.rendering.light import (
 from fhash_codec.rendering.march_task import MAX_VALUES, NUMPY, Arrays, Surface, Table, Task, Units
 from fhash_codec.rendering.scenes import DEVICES, AmbientOcclusion, Effects, Scene, Shadows
 from fhash_codec.rendering.transfer_function import Histogram, TransferFunction, about
-from fhash_codec.rendering.view import Body, part_in_view, part_of_body, pixel_vertices
+from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
 
@@ -326,8 +326,6 @@ def _end_text(plan: Plan) -> str:
     return "behind the volume"
 
 
-Floats = npt.NDArray[np.float64]
-
 LONG_RAY = 10**5
 """Samples of a ray above which a warning is given: a picture of usual size then takes minutes."""
 MAX_RAY_SAMPLES = 10**8
@@ -376,9 +374,9 @@ def plan_picture(
     mode, why_mode = _mode(volume, scene)
     margin = _margin(task, lod)
     # Light comes from all of the volume, whether it is in view or not.
-    domain = part_of_body(volume, task.body, grid.warp, margin)
+    domain = region_of_body(volume, task.body, grid.warp, margin)
     lit = shadows is not None or occlusion is not None
-    region = domain if lit else part_in_view(rays, volume, task.body, margin)
+    region = domain if lit else region_in_view(rays, volume, task.body, margin)
     if mode == "cache" or lit:
         _check_frame(region, lod)
     plan = Plan(
@@ -408,12 +406,6 @@ def plan_at(plan: Plan, volume: Volume, scene: Scene) -> Plan:
     return replace(moved, reasons=tuple(reasons(moved, volume)))
 
 
-def parse_background(name: str) -> None:
-    """Raise InputError for a background that is neither a colour nor 'transparent'."""
-    if name != "transparent":
-        parse_colour(name)
-
-
 def _check(scene: Scene) -> None:
     """Raise InputError for a scene that asks for too much, for nothing or for a contradiction."""
     effects, nothing = scene.effects, scene.transfer_function.nothing
@@ -427,7 +419,8 @@ def _check(scene: Scene) -> None:
         raise InputError(
             "the scene is an evolution, of several pictures; leave 'evolution' out for one of them"
         )
-    parse_background(scene.background)
+    if scene.background != "transparent":
+        parse_colour(scene.background)
     if nothing and not effects.isosurfaces:
         raise InputError(
             "the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface"
@@ -573,16 +566,11 @@ def _table(function: TransferFunction, units: Units, whole: bool) -> Table:
     whole: whether it covers all colours, not only those of values that have an opacity.
     """
     if whole:
-        ends = function.colours.positions[[0, -1]]
-        function = replace(function, span=_about((float(ends[0]), float(ends[1]))))
+        first, last = (float(end) for end in function.colours.positions[[0, -1]])
+        function = replace(function, span=(first, last) if first < last else about(first))
     low, high, colours, extinctions = function.table()
     ends = units.to([low, high])
     return Table(low=float(ends[0]), high=float(ends[1]), colours=colours, extinctions=extinctions)
-
-
-def _about(ends: tuple[float, float]) -> tuple[float, float]:
-    """A range of values, widened where its ends are the same."""
-    return ends if ends[0] < ends[1] else about(ends[0])
 
 
 def _margin(task: Task, lod: int) -> int:

@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections import Counter, OrderedDict
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
-from fhash_codec.rendering.image import Draw, Image, overlay, surrounded, time_text
+from fhash_codec.rendering.image import Image, overlay, surrounded, time_text
 from fhash_codec.rendering.layout import Layout, quantity_of
 from fhash_codec.rendering.light import light_grid
 from fhash_codec.rendering.march import march
@@ -36,7 +37,9 @@ WIDE = 1.6
 """Width over height that the picture aims at when the scene gives no number of columns."""
 
 
-def evolution(volume: Volume, scene: Scene, *, draw: Draw, progress: Progress = silent) -> Image:
+def evolution(
+    volume: Volume, scene: Scene, *, draw: Callable[..., Image], progress: Progress = silent
+) -> Image:
     """Draw the steps of `scene.evolution` row by row in one picture.
 
     Each panel has a time label. Colour bar and legend of the scene are of the whole picture and are
@@ -58,7 +61,7 @@ def evolution(volume: Volume, scene: Scene, *, draw: Draw, progress: Progress = 
     seconds = 0.0
     for number, panel in enumerate(panels):
         image = draw(panel, upcoming=panels[number + 1] if number + 1 < len(panels) else None)
-        rgba[layout.place(number)] = image.rgba
+        rgba[layout.pixels(number)] = image.rgba
         counters.update(image.counters)
         seconds += image.seconds
         progress("rendering", number + 1, len(panels), "")
@@ -96,7 +99,7 @@ class _Layout:
             self.rows * (height + self.gap) - self.gap,
         )
 
-    def place(self, number: int) -> tuple[slice, slice]:
+    def pixels(self, number: int) -> tuple[slice, slice]:
         """Rows and columns of pixels of the panel with a number, from 0."""
         width, height = self.panel
         row, column = divmod(number, self.columns)
@@ -304,9 +307,9 @@ class Renderer:
         volume = self.volume
         layout = plan.layout
         image = Image(
-            rgba=_placed(marched.rgba, layout, 0.0),
-            depth=None if marched.depth is None else _placed(marched.depth, layout, np.inf),
-            normal=None if marched.normal is None else _placed(marched.normal, layout, 0.0),
+            rgba=_in_picture(marched.rgba, layout, 0.0),
+            depth=None if marched.depth is None else _in_picture(marched.depth, layout, np.inf),
+            normal=None if marched.normal is None else _in_picture(marched.normal, layout, 0.0),
             counters=complete(marched.counters, more),
             scene=plan.scene.to_dict(),
             source=file_name(volume.path),
@@ -325,34 +328,35 @@ class Renderer:
         return replace(drawn, seconds=time.perf_counter() - begin)
 
     def _frame(self, plan: Plan, progress: Progress) -> _DecodedFrame:
-        """The decoded frame of a plan: a kept one, the prefetched one, or a new one."""
-        kept = self._kept(plan)
-        if kept is not None:
-            return kept
+        """The decoded frame of a plan: a cached one, the prefetched one, or a new one."""
+        cached = self._cached(plan)
+        if cached is not None:
+            return cached
         key = plan.step, plan.lod
         progress("decoding", 0, 1, "")
         decoded = self._finish_prefetch(key)
         if decoded is None or not decoded.covers(plan.region):
             decoded = _decode(self.volume, plan)
         progress("decoding", 1, 1, "")
-        self._keep(key, decoded)
+        self._cache(key, decoded)
         return decoded
 
-    def _kept(self, plan: Plan) -> _DecodedFrame | None:
-        """The kept frame of a plan, if it covers the plan's region."""
+    def _cached(self, plan: Plan) -> _DecodedFrame | None:
+        """The cached frame of a plan, if it covers the plan's region."""
         key = plan.step, plan.lod
-        kept = self._frames.get(key)
-        if kept is None or not kept.covers(plan.region):
+        cached = self._frames.get(key)
+        if cached is None or not cached.covers(plan.region):
             return None
         self._frames.move_to_end(key)
-        return kept
+        return cached
 
-    def _keep(self, key: Key, decoded: _DecodedFrame) -> None:
+    def _cache(self, key: Key, decoded: _DecodedFrame) -> None:
         """Keep a frame, and drop the least recently used ones beyond the memory."""
         self._frames.pop(key, None)
         while (
             self._frames
-            and sum(kept.nbytes for kept in self._frames.values()) + decoded.nbytes > self.memory
+            and sum(cached.nbytes for cached in self._frames.values()) + decoded.nbytes
+            > self.memory
         ):
             self._frames.popitem(last=False)
         if decoded.nbytes <= self.memory:
@@ -366,7 +370,7 @@ class Renderer:
             plan = self.plan(scene)
         except (FhashError, OSError):
             return
-        if plan.mode != "cache" or self._kept(plan) is not None:
+        if plan.mode != "cache" or self._cached(plan) is not None:
             return
         self._finish_prefetch()
         if self._background is None:
@@ -390,7 +394,7 @@ class Renderer:
         return None
 
 
-def _placed(
+def _in_picture(
     pixels: npt.NDArray[np.float32], layout: Layout, empty: float
 ) -> npt.NDArray[np.float32]:
     """A picture (H, W) or (H, W, n) with the pixels of its view, and one number around them."""
@@ -483,12 +487,4 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
         if after != before:
             share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
             values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
-    return Frame(
-        values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod
-    )
-
-
-def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:
-    """Values in the units of the march, float32 and contiguous."""
-    converted = values if units == Units() else units.to(values)
-    return np.ascontiguousarray(converted, dtype=np.float32)
+    return Frame(values=units.single(values), first=(first[0], first[1], first[2]), stride=1 << lod)

@@ -30,40 +30,24 @@ MAX_CHUNKS = 100_000
 """Most chunks of a PNG before the scene; pillow writes one for each 64 KiB of pixels."""
 
 
-def scene_text_in_png(path: str | Path) -> bytes:
-    """Read the JSON text of the scene that a picture shows.
+def text_in_png(path: str | Path, keyword: str) -> bytes | None:
+    """Read the text of a keyword in a PNG; None without it.
 
-    Raises InputError for a file that is no PNG of `fhash render`, damaged ones included.
+    Pixels are skipped, and no more of the file is held than a scene can be long. Raises InputError
+    for a file that is no PNG, and for a damaged text.
     """
     path = Path(path)
     try:
         with path.open("rb") as file:
-            return _scene_text(path, file)
+            return _text(path, file, keyword)
     except FileNotFoundError as error:
         raise MissingInputError(f"{path}: no such picture") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def digest_in_png(path: str | Path) -> str:
-    """Read the digest of the volume that a picture shows; empty if the picture has none.
-
-    Raises InputError for a file that is no PNG.
-    """
-    from PIL import Image as Pictures
-
-    try:
-        with Pictures.open(path, formats=("PNG",)) as picture:
-            return str(picture.info.get(DIGEST_KEY, ""))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"{path}: not a PNG: {error}") from error
-
-
-def _scene_text(path: Path, file: BinaryIO) -> bytes:
-    """Find the scene's chunk and return its text.
-
-    Pixels are skipped, and no more of the file is held than a scene can be long.
-    """
+def _text(path: Path, file: BinaryIO, keyword: str) -> bytes | None:
+    """Find the chunk of a keyword and return its text."""
     if file.read(len(SIGNATURE)) != SIGNATURE:
         raise InputError(f"{path}: not a PNG")
     for _ in range(MAX_CHUNKS):
@@ -75,8 +59,8 @@ def _scene_text(path: Path, file: BinaryIO) -> bytes:
             file.seek(length + 4, io.SEEK_CUR)
             continue
         data, checksum = file.read(length), file.read(4)
-        keyword, _, rest = data.partition(b"\0")
-        if keyword != SCENE_KEY.encode():
+        name, _, rest = data.partition(b"\0")
+        if name != keyword.encode():
             continue
         if len(data) != length or zlib.crc32(kind + data).to_bytes(4, "big") != checksum:
             raise InputError(f"{path}: its scene is damaged; render it again")
@@ -84,7 +68,7 @@ def _scene_text(path: Path, file: BinaryIO) -> bytes:
         # keyword, the last two ended by a zero each.
         packed, text = rest[:1] == b"\1", rest[2:].split(b"\0", 2)[-1]
         return _unpacked(path, text) if packed else text
-    raise InputError(f"{path}: holds no scene; only pictures of 'fhash render' do")
+    return None
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
@@ -460,7 +444,9 @@ def scene_in_png(path: str | Path) -> Scene:
 
     Raises InputError for a file that is no PNG of `fhash render`, damaged ones included.
     """
-    text = scene_text_in_png(path)
+    text = text_in_png(path, SCENE_KEY)
+    if text is None:
+        raise InputError(f"{path}: holds no scene; only pictures of 'fhash render' do")
     try:
         return Scene.from_dict(json.loads(text))
     except InputError as error:

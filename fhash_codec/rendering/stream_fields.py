@@ -15,9 +15,17 @@ from fhash_codec.paper.network import Network
 from fhash_codec.rendering.bricks import SIDE, Bricks, Palette
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.grid import Warp
-from fhash_codec.rendering.march_task import GRADES, NUMPY, Array, Arrays, Frame, Task, Units
+from fhash_codec.rendering.march_task import (
+    GRADES,
+    NUMPY,
+    Array,
+    Arrays,
+    Frame,
+    Grading,
+    Task,
+    Units,
+)
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError
 from fhash_formats.support.threads import usable_threads
 
 
@@ -223,10 +231,7 @@ class NetworkField(CoresetField):
 
     def __init__(self, volume: Volume, step: float, units: Units, arrays: Arrays = NUMPY) -> None:
         model = volume._model
-        if not isinstance(model, PaperModel):
-            raise InputError(
-                f"{volume.path}: a file of the profile {volume.profile} has no network"
-            )
+        assert isinstance(model, PaperModel), "a plan marches through no other file"
         self._low, self._high = (
             float(end) for end in units.to([volume.value_range.low, volume.value_range.high])
         )
@@ -314,27 +319,23 @@ class WarpedField:
         self._origin = np.floor(arrays.host(self.vertices)[:, 0]).astype(np.int64)
         self._last = np.ceil(arrays.host(self.vertices)[:, 1]).astype(np.int64)
         self.first = arrays.array(self._origin.astype(np.float64))
-        self.bricks = self._drawn_bricks()
-
-    def _drawn(self, places: Array) -> Array:
-        """Places (3,) of the series in drawn vertices, beyond the ends as far beyond."""
-        drawn = []
-        for at, own, table in zip(places, self._places, self._tables, strict=True):
-            drawn.append(
-                float(at) if table is None else float(np.interp(at, own, np.arange(len(own))))
-            )
-        return np.array(drawn)
-
-    def _drawn_bricks(self) -> Bricks:
-        """Bricks of drawn cells with the extreme values of all bricks that they touch."""
-        bricks = self._field.bricks
-        first = self.arrays.host(self._field.first)
-        low, high = bricks.low, bricks.high
+        low, high, first = field.bricks.low, field.bricks.high, arrays.host(field.first)
+        # Bricks of drawn cells have the extreme values of all bricks that they touch.
         for axis, number in ((0, 2), (1, 1), (2, 0)):
             begin, end = self._touched(number, SIDE, low.shape[axis], float(first[number]))
             low = _extremes(low, begin, end, axis, np.minimum)
             high = _extremes(high, begin, end, axis, np.maximum)
-        return replace(bricks, low=low, high=high)
+        self.bricks = replace(field.bricks, low=low, high=high)
+
+    def _drawn(self, places: Array) -> Array:
+        """Places (3,) of the series in drawn vertices, beyond the ends as far beyond."""
+        return np.array(
+            [
+                at if table is None else np.interp(at, own, np.arange(len(own)))
+                for at, own, table in zip(places, self._places, self._tables, strict=True)
+            ],
+            dtype=np.float64,
+        )
 
     def _touched(
         self, number: int, side: int, blocks: int, first: float
@@ -721,21 +722,13 @@ class Leaping:
 class Factors:
     """The factors of a `Grading`, as a function of places in a field."""
 
-    def __init__(self, field: Field, task: Task) -> None:
-        assert task.grading is not None
+    def __init__(self, field: Field, task: Task, grading: Grading) -> None:
         arrays = field.arrays
         self._field, self._arrays = field, arrays
         self._central = task.lighting is not None and task.lighting.central
         self._spacing = arrays.array(task.rays.grid.spacing)
-        self._scale = GRADES / task.grading.top
-        self._factors = arrays.array(
-            np.append(task.grading.factors, task.grading.factors[-1]), "float64"
-        )
-
-    @classmethod
-    def of(cls, task: Task, field: Field) -> Factors | None:
-        """The factors of a task in a field; None where gradients decide on no opacity."""
-        return None if task.grading is None else cls(field, task)
+        self._scale = GRADES / grading.top
+        self._factors = arrays.array(np.append(grading.factors, grading.factors[-1]), "float64")
 
     def __call__(self, places: Array) -> Array:
         """Factors (n,) of the extinction at places (n, 3) of the domain."""

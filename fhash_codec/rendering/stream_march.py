@@ -25,13 +25,13 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Palette
 from fhash_codec.rendering.light import flatness, slope_scale
 from fhash_codec.rendering.march_task import (
-    NUMPY,
     Array,
     Arrays,
     LightGrid,
     Lighting,
     Marched,
     Surface,
+    Table,
     Task,
     complete,
 )
@@ -142,8 +142,12 @@ class _Marcher:
         self._one = arrays.full((), 1.0)
         self.next = arrays.copy(beams.begin)
         self.from_, self.before = arrays.copy(beams.entered), arrays.full(count, np.nan)
-        self.projection = Projection.of(task, count, arrays)
-        self.factors = Factors.of(task, field)
+        self.projection = (
+            Projection(task.projection, task.table, count, arrays)
+            if task.projection and task.table is not None
+            else None
+        )
+        self.factors = None if task.grading is None else Factors(field, task, task.grading)
         self.counters = complete({"rays": int(arrays.xp.count_nonzero(beams.end > beams.begin))})
 
     def march(self, adaptive: bool, budget: int | None, report: Callable[[int, int], None]) -> None:
@@ -273,9 +277,8 @@ class _Marcher:
         at = arrays.to_float64(xp.broadcast_to(sample[..., None], shape))
         which = xp.broadcast_to(arrays.range(surfaces + 1), shape)
         if task.surfaces:
-            crossed = self._crossings(alive, sample, values)
-            opacity[..., :-1], at[..., :-1] = crossed.opacity, crossed.at
-            which = xp.concatenate([crossed.which, which[..., -1:]], axis=2)
+            at[..., :-1], opacity[..., :-1], number = self._crossings(alive, sample, values)
+            which = xp.concatenate([number, which[..., -1:]], axis=2)
         if self.palette is not None and not task.projection:
             opacity[..., -1] = self._opacity(self.palette, alive, sample, values)
         return Events(
@@ -285,8 +288,8 @@ class _Marcher:
             values=values,
         )
 
-    def _crossings(self, alive: Array, sample: Array, values: Array) -> Crossings:
-        """The surfaces before each sample.
+    def _crossings(self, alive: Array, sample: Array, values: Array) -> tuple[Array, Array, Array]:
+        """The surfaces before each sample, as `crossings` has them.
 
         Before the first sample of a ray they are looked for from where it enters the field, behind
         the last one to where it leaves.
@@ -305,9 +308,9 @@ class _Marcher:
         looked_up = self._looked_up(beams.borders(alive, at), wanted)
 
         def between(row: Array, place: Array, counted: Array) -> Array:
-            found = self.field.values(beams.places(alive[row], place))
-            self._count(counted, found)
-            return found
+            looked_up = self.field.values(beams.places(alive[row], place))
+            self._count(counted, looked_up)
+            return looked_up
 
         known = xp.where(wanted, looked_up, known)
         result = crossings(between, at, known, self.task.surfaces, arrays)
@@ -347,8 +350,8 @@ class Projection:
         at: (n,), places of the values, in samples; of the first value for the mean.
     """
 
-    def __init__(self, kind: str, ends: tuple[float, float], count: int, arrays: Arrays) -> None:
-        self._kind, self._ends, self._arrays = kind, ends, arrays
+    def __init__(self, kind: str, table: Table, count: int, arrays: Arrays) -> None:
+        self._kind, self._ends, self._arrays = kind, (table.low, table.high), arrays
         self.at = arrays.full(count, 0.0)
         # The best rank so far: of a maximum the value, of a minimum the value times -1, of an
         # attenuated maximum the share of the colours that is left; for the mean minus the place.
@@ -356,13 +359,6 @@ class Projection:
         # The light that is left, for the attenuated maximum; sum and length for the mean.
         self._light = arrays.full(count, 1.0)
         self._sum, self._length = arrays.full(count, 0.0), arrays.full(count, 0.0)
-
-    @classmethod
-    def of(cls, task: Task, count: int, arrays: Arrays) -> Projection | None:
-        """The projection of a task for `count` rays; None where it draws the volume."""
-        if not task.projection or task.table is None:
-            return None
-        return cls(task.projection, (task.table.low, task.table.high), count, arrays)
 
     @property
     def values(self) -> Array:
@@ -431,34 +427,22 @@ MAX_TURNS = 60
 """Turns of the search for a root, at most."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Crossings:
-    """Crossings before each sample of a pass, the nearest first; as many places as surfaces.
-
-    Attributes:
-        at: (rays, samples, surfaces), places in samples of the ray.
-        opacity: (rays, samples, surfaces), 0 where there is no crossing.
-        which: int64 (rays, samples, surfaces), number of the surface.
-    """
-
-    at: Array
-    opacity: Array
-    which: Array
-
-
 def crossings(
     values: Callable[[Array, Array, Array], Array],
     at: Array,
     steps: Array,
     surfaces: Sequence[Surface],
-    arrays: Arrays = NUMPY,
-) -> Crossings:
-    """The crossings of a pass.
+    arrays: Arrays,
+) -> tuple[Array, Array, Array]:
+    """The crossings before each sample of a pass, the nearest first, as many as surfaces.
 
     values: function of rows (n,) of the pass, places (n,) in samples, and which of them count, bool
         (n,); values (n,) there.
     at: (rays, 1 + samples), places of the samples and, first, of the one before the pass.
     steps: (rays, 1 + samples), the values there, NaN where there is none.
+
+    Returns their places in samples of the ray, their opacities, 0 where there is no crossing, and
+    the numbers of the surfaces, int64, each (rays, samples, surfaces).
     """
     xp = arrays.xp
     shape = (len(at), at.shape[1] - 1, len(surfaces))
@@ -483,7 +467,7 @@ def crossings(
         opacity[row, column, number] = xp.where(exists, share, 0.0)
     which = xp.argsort(places, axis=2, stable=True)
     places, opacity = (arrays.take_along(array, which, 2) for array in (places, opacity))
-    return Crossings(at=xp.where(xp.isfinite(places), places, 0.0), opacity=opacity, which=which)
+    return xp.where(xp.isfinite(places), places, 0.0), opacity, which
 
 
 def _roots(

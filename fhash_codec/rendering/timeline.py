@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.records import Record, limits
 from fhash_codec.rendering.cameras import CameraPath
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.times import time_range
 from fhash_codec.volume import Volume
@@ -42,7 +41,13 @@ def mixed(first: Any, second: Any, weight: float) -> Any:
     if weight == 1:
         return second
     if isinstance(first, Record) and type(first) is type(second):
-        return _mixed_record(first, second, weight)
+        names = [field.name for field in dataclasses.fields(first)]  # type: ignore[arg-type]
+        values = {
+            name: mixed(getattr(first, name), getattr(second, name), weight)
+            for name in names
+            if name not in TIME_AND_CAMERA
+        }
+        return dataclasses.replace(first, **values)  # type: ignore[type-var]
     if isinstance(first, float) and isinstance(second, float):
         return (1 - weight) * first + weight * second
     if isinstance(first, tuple) and isinstance(second, tuple) and len(first) == len(second):
@@ -50,16 +55,6 @@ def mixed(first: Any, second: Any, weight: float) -> Any:
     if isinstance(first, str) and isinstance(second, str):
         return _mixed_colour(first, second, weight)
     return first
-
-
-def _mixed_record(first: Record, second: Record, weight: float) -> Record:
-    names = [field.name for field in dataclasses.fields(first)]  # type: ignore[arg-type]
-    values = {
-        name: mixed(getattr(first, name), getattr(second, name), weight)
-        for name in names
-        if name not in TIME_AND_CAMERA
-    }
-    return dataclasses.replace(first, **values)  # type: ignore[type-var]
 
 
 def _mixed_colour(first: str, second: str, weight: float) -> str:
@@ -70,8 +65,6 @@ def _mixed_colour(first: str, second: str, weight: float) -> str:
         return first
     return colour_code((1 - weight) * colours[0] + weight * colours[1])
 
-
-Floats = npt.NDArray[np.float64]
 
 STEP_DIGITS = 12
 """Decimals of a step: later ones are rounding, and whole steps need only one decoded frame."""
@@ -92,28 +85,13 @@ class Clock:
     physical: bool
 
     @classmethod
-    def of_steps(cls, steps: tuple[float, float], volume: Volume) -> Clock:
-        """A clock from the first step to the last; raises RegionError outside the series."""
-        values = np.array([_step(Scene(step=step), volume) for step in steps])
-        return cls(at=np.array([0.0, 1.0]), values=values, physical=False)
-
-    @classmethod
-    def of_times(cls, times: tuple[float, float], volume: Volume) -> Clock:
-        """A clock from the first physical time to the last; raises RegionError outside."""
-        for time in times:
-            _step(Scene(time=time), volume)
-        return cls(at=np.array([0.0, 1.0]), values=np.array(times), physical=True)
-
-    @classmethod
-    def of_scenes(cls, at: Floats, scenes: Sequence[Scene], volume: Volume) -> Clock | None:
-        """A clock through the steps of scenes; None if they all have the same.
-
-        Raises RegionError for a scene outside the series.
-        """
+    def of(
+        cls, at: Floats, scenes: Sequence[Scene], volume: Volume, *, physical: bool = False
+    ) -> Clock:
+        """A clock through the steps, or the times, of scenes; raises RegionError outside."""
         steps = [_step(scene, volume) for scene in scenes]
-        if all(step == steps[0] for step in steps):
-            return None
-        return cls(at=at, values=np.array(steps), physical=False)
+        values = [scene.time for scene in scenes] if physical else steps
+        return cls(at=at, values=np.array(values, dtype=np.float64), physical=physical)
 
     def moment(self, share: float) -> dict[str, float | None]:
         """The fields `step` and `time` of a scene at a share of the animation."""
@@ -155,11 +133,14 @@ class Timeline:
             size=self._scenes[0].size,
         )
         # The steps of the keys are checked in any case.
-        self._clock = Clock.of_scenes(self._at, self._scenes, volume)
+        clock = Clock.of(self._at, self._scenes, volume)
+        self._clock = clock if np.ptp(clock.values) else None
+        ends = np.array([0.0, 1.0])
         if steps is not None:
-            self._clock = Clock.of_steps(steps, volume)
+            self._clock = Clock.of(ends, [Scene(step=step) for step in steps], volume)
         elif times is not None:
-            self._clock = Clock.of_times(times, volume)
+            given = [Scene(time=time) for time in times]
+            self._clock = Clock.of(ends, given, volume, physical=True)
         self._orbit = orbit
 
     def scene(self, share: float) -> Scene:
@@ -167,12 +148,10 @@ class Timeline:
         camera = self._path.camera(share)
         if self._orbit:
             camera = dataclasses.replace(camera, azimuth=camera.azimuth + self._orbit * share)
-        return dataclasses.replace(self._mixed(share), camera=camera, **self._moment(share))
-
-    def _moment(self, share: float) -> dict[str, Any]:
+        moment: dict[str, Any] = {"step": self._scenes[0].step, "time": self._scenes[0].time}
         if self._clock is not None:
-            return self._clock.moment(share)
-        return {"step": self._scenes[0].step, "time": self._scenes[0].time}
+            moment = self._clock.moment(share)
+        return dataclasses.replace(self._mixed(share), camera=camera, **moment)
 
     def _mixed(self, share: float) -> Scene:
         """The settings at a share, but for time and camera; they change smoothly at the keys."""
@@ -424,9 +403,8 @@ class Animation(Record):
             orbit=self.orbit,
         )
         if self.every is not None:  # the last picture may lie before the end of the range
-            for check, ends in ((Clock.of_steps, self.steps), (Clock.of_times, self.times)):
-                if ends is not None:
-                    check(ends, volume)
+            ends = [Scene(step=step) for step in self.steps or ()]
+            Clock.of(np.empty(0), [*ends, *(Scene(time=time) for time in self.times or ())], volume)
         shares = np.arange(self.count) / max(self.count if self.closed else self.count - 1, 1)
         return [timeline.scene(float(share)) for share in shares]
 

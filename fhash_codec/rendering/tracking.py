@@ -23,14 +23,12 @@ from fhash_codec.features.features import (
 from fhash_codec.features.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Grid
+from fhash_codec.rendering.grid import Floats, Grid
 from fhash_codec.rendering.scenes import Isosurface, LegendEntry, Scene, TransferFunctionSpec
 from fhash_codec.rendering.transfer_function import opacity_preset, raised
 from fhash_codec.volume import Volume, feature_names, holds_features_apart
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
-
-Floats = npt.NDArray[np.float64]
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#555555")
 """Default colours of features: Okabe and Ito chose them to be told apart by colour-blind people."""
@@ -139,11 +137,11 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
         scene,
         transfer_function=function,
         effects=effects,
-        features=scene.features or _held_apart(tracked, volume),
+        features=scene.features or _features_apart(tracked, volume),
     )
 
 
-def _held_apart(tracked: Sequence[Tracked], volume: Volume) -> tuple[str, ...]:
+def _features_apart(tracked: Sequence[Tracked], volume: Volume) -> tuple[str, ...]:
     """The tracked features if the file keeps each of them apart, so that the rest is skipped.
 
     Empty if some are not of the file: they may be anywhere in its coreset.
@@ -250,14 +248,14 @@ def follow(
         time = float(np.interp(step, np.arange(len(times)), times))
         for item, items_places in zip(tracked, places, strict=True):
             selected = np.asarray(item.feature.select(frame, int(step)))
-            items_places.append({"step": float(step), "time": time, **_place(selected, axes)})
+            items_places.append({"step": float(step), "time": time, **_extent(selected, axes)})
     return [
         {"feature": str(item.feature), "colour": item.colour, "steps": items_places}
         for item, items_places in zip(tracked, places, strict=True)
     ]
 
 
-def _place(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
+def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
     """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])

@@ -22,10 +22,10 @@ from fhash_codec.rendering.colours import (
     parse_colour,
     read_preset,
 )
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.rendering.scenes import TransferFunctionSpec
 from fhash_formats.errors import FhashWarning, InputError, suggestion
 
-Floats = npt.NDArray[np.float64]
 Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 """Bin edges (n + 1,), ascending, and counts (n,) of values."""
@@ -259,7 +259,7 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     low, high = value_range
     if not low < high:
         return np.array([[low, BACKGROUND]])
-    if len(edges) != len(counts) + 1 or len(counts) == 0 or not counts.sum() > 0:
+    if not counts.any():
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
     # Scaled by a power of two, 1 for every ordinary range, so that no difference overflows or is a
     # denormal.
@@ -388,7 +388,7 @@ class TransferFunction:
             density=spec.density,
             span=_span(points, colours, value_range),
         )
-        if not spec.nothing and not (function.density > 0 and bool(function.visible(low, high))):
+        if not spec.nothing and not function.shows(low, high):
             raise InputError(
                 f"the transfer function shows nothing: no value from {low:g} to {high:g} has an "
                 "opacity above 0; change 'opacity' or 'density', "
@@ -442,36 +442,16 @@ class TransferFunction:
                 FhashWarning,
                 stacklevel=2,
             )
-        return low, high, self.colour(values).astype(np.float32), extinctions
+        return low, high, self.colours(values).astype(np.float32), extinctions
 
-    def visible(
-        self, minimum: npt.ArrayLike, maximum: npt.ArrayLike, n: int = ENTRIES
-    ) -> npt.NDArray[np.bool_]:
-        """Whether ranges of values hold any value with an extinction above 0.
-
-        The answer is exact for ranges widened by one entry of a table on either side, so that it
-        also holds for the table.
-
-        Args:
-            minimum: lowest values, of any shape.
-            maximum: highest values, of the same shape.
-            n: entries of the table.
-
-        Returns:
-            A bool for each range; False where an end is NaN or the minimum is above the maximum.
-        """
-        entry = self.span[1] / (n - 1) - self.span[0] / (n - 1)
-        low, high = np.asarray(minimum, dtype=np.float64), np.asarray(maximum, dtype=np.float64)
-        is_range = low <= high
+    def shows(self, low: float, high: float) -> bool:
+        """Whether a value of a range, or within an entry of a table of it, has an extinction."""
+        entry = self.span[1] / (ENTRIES - 1) - self.span[0] / (ENTRIES - 1)
         with np.errstate(over="ignore"):
-            low, high = np.where(is_range, low, 0.0) - entry, np.where(is_range, high, 0.0) + entry
-        at, positive = self.points[:, 0], self.points[:, 1] > 0
-        # Between two points the opacity is above 0 if it is at either of them.
-        pieces = np.concatenate([positive[:1], positive[1:] | positive[:-1], positive[-1:]])
-        before = np.concatenate([[0], np.cumsum(pieces)])
-        first, last = np.searchsorted(at, low, side="right"), np.searchsorted(at, high, side="left")
-        touched = before[last + 1] > before[np.minimum(first, last + 1)]
-        return np.asarray(is_range & touched & (self.density > 0), dtype=bool)
+            ends = np.float64(low) - entry, np.float64(high) + entry
+        at, opacities = self.points.T
+        inside = opacities[(at >= ends[0]) & (at <= ends[1])]
+        return self.density > 0 and bool(np.any(inside > 0) or np.any(self.opacity(ends) > 0))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values of what the scene's words came to."""

@@ -10,12 +10,10 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Grid, Warp
+from fhash_codec.rendering.grid import Floats, Grid, Warp
 from fhash_codec.rendering.scenes import Clip
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
-
-Floats = npt.NDArray[np.float64]
 
 SNAP = 1e-6
 """Distance from a vertex, in vertices, at which a clip's end is taken for the vertex: coordinates
@@ -67,6 +65,11 @@ class Body:
                 f"the clip planes leave nothing of the volume, which has {_extent_text(grid)}"
             )
         return body
+
+    @classmethod
+    def whole(cls, grid: Grid) -> Body:
+        """The body of all of a grid."""
+        return cls(bounds=grid.bounds, planes=np.empty((0, 4)))
 
     @property
     def half_spaces(self) -> tuple[Floats, Floats]:
@@ -177,7 +180,7 @@ def pixel_vertices(rays: Rays) -> float:
     return 0.0 if np.array_equal(nearest, rays.eye) else width * max(depth, 0.0)
 
 
-def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: int = 0) -> Box:
+def region_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: int = 0) -> Box:
     """Find the region (z, y, x) of vertices around what is in view, widened to whole chunks.
 
     The region is all of the domain, or of what a clip leaves of it, where that is not much more,
@@ -189,7 +192,7 @@ def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: i
         body: what a clip leaves; None without one.
         margin: vertices around a clipped part that its samples need, too.
     """
-    domain = part_of_body(volume, body, rays.grid.warp, margin)
+    domain = region_of_body(volume, body, rays.grid.warp, margin)
     # Cameras at the ends of float64 overflow.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         seen = _seen(rays, body)
@@ -200,7 +203,7 @@ def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: i
     return domain if share > MAX_PART else region
 
 
-def part_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin: int = 0) -> Box:
+def region_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin: int = 0) -> Box:
     """Find the region (z, y, x) around what a clip leaves, widened to whole chunks.
 
     Without a clip it is the domain.
@@ -239,7 +242,7 @@ def _seen(rays: Rays, body: Body | None) -> Floats | None:
 
     The part is convex and bounded by the planes of the box, of a clip and of the view.
     """
-    body = Body(bounds=rays.grid.bounds, planes=np.empty((0, 4))) if body is None else body
+    body = Body.whole(rays.grid) if body is None else body
     bounds = body.bounds
     side_normals, side_offsets = _view_planes(rays)
     faces, distances = body.half_spaces
@@ -299,45 +302,20 @@ class Edge:
 
 
 def edges(rays: Rays, body: Body | None = None) -> list[Edge]:
-    """Find those of the twelve edges that lie before the camera, at least in part.
+    """Find the edges that lie before the camera, at least in part: where two faces share corners.
 
-    body: what a clip leaves of the box, whose edges are found instead; None without a clip.
+    body: what a clip leaves of the box, whose edges are found; None without a clip.
     """
-    if body is not None:
-        return _edges_of_body(rays, body)
-    bounds = rays.grid.bounds
-    toward = (
-        np.array([[1.0], [-1.0]]) * rays.forward
-        if rays.parallel
-        else np.stack([bounds[:, 0] - rays.eye, rays.eye - bounds[:, 1]])
-    )
-    looking = toward > 0  # (low or high face, axis)
-    seen = []
-    for axis in range(3):
-        others = [other for other in range(3) if other != axis]
-        for sides in itertools.product((0, 1), repeat=2):
-            faces = list(zip(sides, others, strict=True))
-            ends = np.empty((2, 3))
-            ends[:, axis] = bounds[axis]
-            for side, other in faces:
-                ends[:, other] = bounds[other, side]
-            clipped = _clipped(rays, ends)
-            if clipped is not None:
-                pixels, _ = rays.project(clipped)
-                fronts = sum(bool(looking[face]) for face in faces)
-                seen.append(Edge(axis=axis, ends=pixels, fronts=fronts, uncut=clipped is ends))
-    return seen
-
-
-def _edges_of_body(rays: Rays, body: Body) -> list[Edge]:
-    """The edges of a clipped box before the camera: where two of its faces share two corners."""
-    normals, offsets = body.half_spaces
+    whole = Body.whole(rays.grid) if body is None else body
+    normals, offsets = whole.half_spaces
     looking = normals @ rays.forward > 0 if rays.parallel else normals @ rays.eye + offsets < 0
-    corners = body.corners
+    corners = whole.corners
     on_face = np.abs(corners @ normals.T + offsets) < ON_FACE
     seen = []
     for one, other in itertools.combinations(range(len(normals)), 2):
         along = np.cross(normals[one], normals[other])
+        if body is None:  # from the first vertex of its axis to the last
+            along = np.abs(along)
         shared = corners[on_face[:, one] & on_face[:, other]]
         if len(shared) < 2 or not along.any():
             continue
@@ -345,9 +323,10 @@ def _edges_of_body(rays: Rays, body: Body) -> list[Edge]:
         ends = shared[order[[0, -1]]]
         clipped = _clipped(rays, ends) if np.abs(ends[1] - ends[0]).max() > ON_FACE else None
         if clipped is not None:
+            axis = int(along.argmax()) if body is None else -1
             pixels, _ = rays.project(clipped)
             fronts = int(looking[one]) + int(looking[other])
-            seen.append(Edge(axis=-1, ends=pixels, fronts=fronts, uncut=clipped is ends))
+            seen.append(Edge(axis=axis, ends=pixels, fronts=fronts, uncut=clipped is ends))
     return seen
 
 
@@ -357,14 +336,9 @@ def outer_edges(rays: Rays) -> list[Edge]:
     It is the lowest edge of the outline in the picture, and of equally low ones the leftmost. An
     axis without an edge that is seen whole, as from inside the volume, has none.
     """
-    chosen = []
-    for axis in range(3):
-        outline = [
-            edge for edge in edges(rays) if edge.axis == axis and edge.fronts == 1 and edge.uncut
-        ]
-        if outline:
-            chosen.append(max(outline, key=_lowest_then_leftmost))
-    return chosen
+    outline = [edge for edge in edges(rays) if edge.fronts == 1 and edge.uncut]
+    by_axis = ([edge for edge in outline if edge.axis == axis] for axis in range(3))
+    return [max(some, key=_lowest_then_leftmost) for some in by_axis if some]
 
 
 def _lowest_then_leftmost(edge: Edge) -> tuple[float, float]:

@@ -26,7 +26,7 @@ RUN_THREADS = 4
 threads."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """A property of a case, measured. It holds if `worst` is at most `limit`; NaN does not hold.
 
@@ -43,6 +43,10 @@ class Finding:
     limit: float
     unit: str
     under: str = ""
+
+    def __post_init__(self) -> None:
+        """Make a count a figure."""
+        object.__setattr__(self, "worst", float(self.worst))
 
     @property
     def holds(self) -> bool:
@@ -96,13 +100,13 @@ def as_floats(volume: Volume) -> npt.NDArray[Any]:
 Check = Callable[[Run], Iterable[Finding]]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Case:
     """One hard case.
 
     Attributes:
-        name: short and unique, in lower case with hyphens.
         group: one of values, shapes, fronts, features, times, networks, rays.
+        name: short and unique, in lower case with hyphens.
         about: one line that says what is hard and what must hold.
         make: returns the series, which is small (some 10,000 values) and the same on every call.
             The series may have no finite value.
@@ -115,8 +119,8 @@ class Case:
             None.
     """
 
-    name: str
     group: str
+    name: str
     about: str
     make: Callable[[], Series]
     settings: Mapping[str, EncodeConfig]

@@ -51,7 +51,7 @@ def regions(run: Run) -> Iterator[Finding]:
         decoded = np.where(np.isnan(decoded), run.volume.fill or 0, decoded)
         part = part.astype(decoded.dtype)
     wrong += _count_unequal(part, decoded)
-    yield Finding(name="region = slice", worst=float(wrong), limit=0.0, unit="values")
+    yield Finding("region = slice", wrong, 0.0, "values")
 
 
 def key_times(run: Run) -> Iterator[Finding]:
@@ -64,7 +64,7 @@ def key_times(run: Run) -> Iterator[Finding]:
         wrong += sum(run.volume.step_of_time(float(times[step])) != step for step in steps)
     keys = run.volume.key_times.key_frames
     wrong += sum(run.volume.key_times.key_index(step) != number for number, step in enumerate(keys))
-    yield Finding(name="exact at key times", worst=float(wrong), limit=0.0, unit="values")
+    yield Finding("exact at key times", wrong, 0.0, "values")
 
 
 def between(run: Run) -> Iterator[Finding]:
@@ -87,13 +87,11 @@ def between(run: Run) -> Iterator[Finding]:
                 )
                 off = np.abs(read - (before_frame * (1 - weight) + after_frame * weight))
                 worst = max(worst, float(np.nanmax(off, initial=0.0)))
-    yield Finding(name="finite between steps", worst=float(lost), limit=0.0, unit="values")
+    yield Finding("finite between steps", lost, 0.0, "values")
     if run.volume.profile == "compact":
         kind = np.finfo(run.decoded.dtype)
         limit = 4 * float(kind.eps) + float(kind.smallest_subnormal) / scale
-        yield Finding(
-            name="even between steps", worst=worst, limit=limit, unit="of the largest value"
-        )
+        yield Finding("even between steps", worst, limit, "of the largest value")
 
 
 def points(run: Run) -> Iterator[Finding]:
@@ -102,22 +100,13 @@ def points(run: Run) -> Iterator[Finding]:
     t, z, y, x = (generator.integers(0, n, N_POINTS) for n in run.volume.shape)
     sampled = np.asarray(run.volume.sample(t=t, z=z, y=y, x=x))
     expected = run.decoded[t, z, y, x]
-    yield Finding(
-        name="points: finite as read",
-        worst=float(np.count_nonzero(np.isnan(sampled) != np.isnan(expected))),
-        limit=0.0,
-        unit="values",
-    )
+    lost = _count(np.isnan(sampled) != np.isnan(expected))
+    yield Finding("points: finite as read", lost, 0.0, "values")
     if run.volume.profile == "compact":
-        wrong = np.count_nonzero((sampled != expected) & ~np.isnan(expected))
-        yield Finding(name="points = read", worst=float(wrong), limit=0.0, unit="values")
+        wrong = _count((sampled != expected) & ~np.isnan(expected))
+        yield Finding("points = read", wrong, 0.0, "values")
         return
-    yield Finding(
-        name="points = read",
-        worst=rounding(run, sampled, expected),
-        limit=1.0,
-        unit="of 1e-5 of the range",
-    )
+    yield Finding("points = read", rounding(run, sampled, expected), 1.0, "of 1e-5 of the range")
 
 
 def levels_of_detail(run: Run) -> Iterator[Finding]:
@@ -133,8 +122,8 @@ def levels_of_detail(run: Run) -> Iterator[Finding]:
             coarse = run.volume.read_lod(step, lod)
             in_coreset = np.isfinite(run.decoded[step][box][(slice(None, None, 1 << lod),) * 3])
             lost += int(np.count_nonzero(np.isfinite(coarse) != in_coreset))
-    yield Finding(name="level 0 = read", worst=float(wrong), limit=0.0, unit="values")
-    yield Finding(name="coarse levels finite", worst=float(lost), limit=0.0, unit="values")
+    yield Finding("level 0 = read", wrong, 0.0, "values")
+    yield Finding("coarse levels finite", lost, 0.0, "values")
 
 
 ACCESS_CHECKS = (regions, key_times, between, points, levels_of_detail)
@@ -191,17 +180,9 @@ def presence(run: Run) -> Iterator[Finding]:
     are missing, just as NaN."""
     in_coreset = expected_coreset(run)
     yield Finding(
-        name="finite in the coreset",
-        worst=_count(in_coreset & ~np.isfinite(run.decoded)),
-        limit=0.0,
-        unit="values",
+        "finite in the coreset", _count(in_coreset & ~np.isfinite(run.decoded)), 0.0, "values"
     )
-    yield Finding(
-        name="NaN outside of it",
-        worst=_count(~in_coreset & ~np.isnan(run.decoded)),
-        limit=0.0,
-        unit="values",
-    )
+    yield Finding("NaN outside of it", _count(~in_coreset & ~np.isnan(run.decoded)), 0.0, "values")
 
 
 def bound(run: Run) -> Iterator[Finding]:
@@ -212,11 +193,9 @@ def bound(run: Run) -> Iterator[Finding]:
         return
     worst = largest_difference(run.values, run.decoded, np.isfinite(run.decoded))
     if error == 0:
-        yield Finding(name="lossless", worst=_differing(run), limit=0.0, unit="values")
+        yield Finding("lossless", _differing(run), 0.0, "values")
     else:
-        yield Finding(
-            name="strict bound", worst=float(worst / error), limit=1.0, unit="of the bound"
-        )
+        yield Finding("strict bound", float(worst / error), 1.0, "of the bound")
 
 
 def quality(run: Run) -> Iterator[Finding]:
@@ -228,34 +207,25 @@ def quality(run: Run) -> Iterator[Finding]:
         promise(run.config).get("psnr") if run.config.profile == "compact" else run.config.psnr
     )
     if promised is not None and reached > 0:
-        yield Finding(
-            name="promised PSNR", worst=promised / reached, limit=1.0, unit="of the dB reached"
-        )
+        yield Finding("promised PSNR", promised / reached, 1.0, "of the dB reached")
     stated = run.volume.container.header["quality"]
-    worst = largest_difference(run.values, _own_values(run), where)
+    worst = largest_difference(run.values, _in_source_type(run), where)
     if stated["max_abs_error"]:
         # The stated error is a difference of two float64, which is rounded.
         beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
-        yield Finding(
-            name="beyond the stated error", worst=beyond, limit=1e-12, unit="of the stated error"
-        )
+        yield Finding("beyond the stated error", beyond, 1e-12, "of the stated error")
     else:
         beyond = float(worst) if stated["max_abs_error"] == 0 else 0.0
-        yield Finding(name="beyond the stated error", worst=beyond, limit=0.0, unit="in data units")
+        yield Finding("beyond the stated error", beyond, 0.0, "in data units")
     if stated["psnr"] is not None and reached > 0:
-        yield Finding(
-            name="below the stated PSNR",
-            worst=max(stated["psnr"] - reached, 0.0),
-            limit=1e-6,
-            unit="dB",
-        )
+        yield Finding("below the stated PSNR", max(stated["psnr"] - reached, 0.0), 1e-6, "dB")
 
 
 def constants(run: Run) -> Iterator[Finding]:
     """A constant series comes back exactly, rounded to the dtype of the volume."""
     finite = run.values[np.isfinite(run.values)]
     if finite.min() == finite.max():
-        yield Finding(name="exact constant", worst=_differing(run), limit=0.0, unit="values")
+        yield Finding("exact constant", _differing(run), 0.0, "values")
 
 
 def within_range(run: Run) -> Iterator[Finding]:
@@ -270,12 +240,7 @@ def within_range(run: Run) -> Iterator[Finding]:
     )
     allowed = _error_bound(run) or Fraction(0)
     span = high - low if high > low else Fraction(1)
-    yield Finding(
-        name="beyond the range",
-        worst=float(excess / span),
-        limit=float(allowed / span),
-        unit="of the range",
-    )
+    yield Finding("beyond the range", float(excess / span), float(allowed / span), "of the range")
 
 
 ACCURACY_CHECKS = (presence, bound, quality, constants, within_range)
@@ -343,7 +308,7 @@ def _psnr(run: Run, where: Mask) -> float:
     span = Fraction(finite.max().item()) - Fraction(finite.min().item())
     if span == 0:
         return 0.0
-    given_values, decoded_values = run.values[where], _own_values(run)[where]
+    given_values, decoded_values = run.values[where], _in_source_type(run)[where]
     if is_wide_integer(given_values.dtype):
         shares = np.array(
             [
@@ -380,12 +345,12 @@ def _error_bound(run: Run) -> Fraction | None:
 
 def _differing(run: Run) -> float:
     """The number of coreset values that differ from the original, rounded to the decoded dtype."""
-    decoded = _own_values(run)
+    decoded = _in_source_type(run)
     same = run.values.astype(decoded.dtype) == decoded
     return _count(~same & np.isfinite(run.decoded))
 
 
-def _own_values(run: Run) -> Values:
+def _in_source_type(run: Run) -> Values:
     """The decoded values in the source's type: floats cannot tell all integers of 64 bits apart."""
     volume = run.volume
     if volume.dtype.kind == "f" or volume.value_type.has_gaps:
@@ -411,13 +376,11 @@ def picture(run: Run) -> Iterator[Finding]:
         cached = _rendered(run, "cache")
     except InputError:
         ends = {float(end) for end in run.volume.value_range.ends}
-        yield Finding(
-            name="refused pictures", worst=float(len(ends) - 1), limit=0.0, unit="of series"
-        )
+        yield Finding("refused pictures", len(ends) - 1, 0.0, "of series")
         return
     yield _finite("finite pixels", cached)
     beyond = max(-float(np.nanmin(cached)), float(np.nanmax(cached)) - 1.0, 0.0)
-    yield Finding(name="pixels in 0..1", worst=beyond, limit=0.0, unit="of a channel")
+    yield Finding("pixels in 0..1", beyond, 0.0, "of a channel")
     # Imported late: decoding does not need the renderer.
     from fhash_codec.selftest.ray_cases import float64_picture, scene
 
@@ -432,7 +395,7 @@ PICTURES_CHECKS = (picture,)
 
 def _finite(name: str, picture: npt.NDArray[np.float32]) -> Finding:
     bad = float(np.count_nonzero(~np.isfinite(picture)))
-    return Finding(name=name, worst=bad, limit=0.0, unit="channels")
+    return Finding(name, bad, 0.0, "channels")
 
 
 def _step(run: Run) -> float:
@@ -459,12 +422,7 @@ def same_bytes(run: Run) -> Iterator[Finding]:
     again = run.folder / "again.fhz"
     if run.config.profile == "paper":
         encode(run.series, again, run.config, force=True)
-        yield Finding(
-            name="same bytes again",
-            worst=_count_unequal_bytes(written, again),
-            limit=0.0,
-            unit="bytes",
-        )
+        yield Finding("same bytes again", _count_unequal_bytes(written, again), 0.0, "bytes")
         return
     wrong = 0.0
     turn = zlib.crc32(f"{run.case.name} {run.under}".encode()) % len(THREADS)
@@ -472,17 +430,12 @@ def same_bytes(run: Run) -> Iterator[Finding]:
         with environment(FHASH_THREADS=str(count)):
             encode(run.series, again, run.config, force=True)
         wrong = max(wrong, _count_unequal_bytes(written, again))
-    yield Finding(name="same bytes by other threads", worst=wrong, limit=0.0, unit="bytes")
+    yield Finding("same bytes by other threads", wrong, 0.0, "bytes")
 
 
 def sound(run: Run) -> Iterator[Finding]:
     """The file passes `verify`, which raises for a damaged file."""
-    yield Finding(
-        name="verify",
-        worst=0.0 if run.volume.verify() > 0 else 1.0,
-        limit=0.0,
-        unit="damaged parts",
-    )
+    yield Finding("verify", 0.0 if run.volume.verify() > 0 else 1.0, 0.0, "damaged parts")
 
 
 REPEATING_CHECKS = (same_bytes, sound)

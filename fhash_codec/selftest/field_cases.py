@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Finding, Run
 from fhash_formats.errors import FhashError, RegionError
 from fhash_formats.series import AXIS_NAMES, ArraySeries, Coordinate
 
 Shape = tuple[int, int, int, int]
-Floats = npt.NDArray[np.float64]
+Values = npt.NDArray[Any]
 
 SHAPE: Shape = (4, 9, 10, 11)
 """Shape (t, z, y, x) of most cases: 3,960 values; only the number of steps is a power of two."""
@@ -40,6 +41,17 @@ def waves(shape: Shape = SHAPE) -> Floats:
 def noise(shape: Shape = SHAPE, seed: int = 0) -> Floats:
     """White noise from a normal distribution with standard deviation 1."""
     return np.random.default_rng(seed).standard_normal(shape)
+
+
+def spike(background: float, at: Shape, value: float, shape: Shape = SHAPE) -> Callable[[], Values]:
+    """A function that makes a field (float32) of one number but for one vertex."""
+
+    def make() -> Values:
+        values = np.full(shape, background, dtype=np.float32)
+        values[at] = value
+        return values
+
+    return make
 
 
 def series(
@@ -115,31 +127,25 @@ TILES: Settings = {
 TILES_OF_ONE: Settings = {"bound": EncodeConfig(max_error_rel=1e-2, effort=1, tile="1x1x1x1")}
 
 
+def single(make: Callable[[], Values], **coords: Any) -> Callable[[], ArraySeries]:
+    """A function that makes a series of values in float32, with coordinates as `series` has them.
+
+    The values may be another type's if it is given as `dtype`.
+    """
+    dtype = coords.pop("dtype", "float32")
+    return lambda: series(make().astype(dtype), **coords)
+
+
 def _shape_case(
     name: str, about: str, shape: Shape, settings: Settings = QUICK, **rest: Any
 ) -> Case:
-    make = _field(shape)
-    return Case(
-        name=name,
-        group="shapes",
-        about=about,
-        make=make,
-        settings=settings,
-        **{"more": MORE, **rest},
-    )
-
-
-def _field(shape: Shape) -> Callable[[], ArraySeries]:
-    return lambda: series(waves(shape).astype(np.float32))
+    make = single(partial(waves, shape))
+    return Case("shapes", name, about, make, settings, **{"more": MORE, **rest})
 
 
 def _placed(name: str, about: str, **axes: Any) -> Case:
     """A case of positions in space. Decoding ignores them, rendering does not."""
-
-    def make() -> ArraySeries:
-        return series(waves().astype(np.float32), **axes)
-
-    return Case(name=name, group="shapes", about=about, make=make, settings=QUICK)
+    return Case("shapes", name, about, single(waves, **axes), QUICK)
 
 
 Z, Y, X = (np.arange(float(n)) for n in SHAPE[1:])
@@ -235,18 +241,8 @@ EVEN = np.arange(float(STEPS))
 def _time_case(
     name: str, about: str, times: npt.NDArray[np.float64], settings: Settings = SETTINGS
 ) -> Case:
-    def make() -> ArraySeries:
-        return series(waves((len(times), *SHAPE[1:])).astype(np.float32), times=times)
-
-    return Case(
-        name=name,
-        group="times",
-        about=about,
-        make=make,
-        settings=settings,
-        more=MORE,
-        checks=(_outside,),
-    )
+    make = single(partial(waves, (len(times), *SHAPE[1:])), times=times)
+    return Case("times", name, about, make, settings, MORE, (_outside,))
 
 
 def _outside(run: Run) -> Iterator[Finding]:
@@ -278,7 +274,7 @@ def _outside(run: Run) -> Iterator[Finding]:
         except FhashError:
             pass
         wrong += 1
-    yield Finding(name="outside is refused", worst=float(wrong), limit=0.0, unit="answers")
+    yield Finding("outside is refused", wrong, 0.0, "answers")
 
 
 TIME_CASES: tuple[Case, ...] = (
@@ -315,8 +311,6 @@ TIME_CASES: tuple[Case, ...] = (
 )
 
 
-Values = npt.NDArray[Any]
-
 INSIDE = "interval:10:30"
 """The interval into which `_lifted` lifts the values of the feature."""
 
@@ -330,15 +324,11 @@ def _feature_case(
     **rest: Any,
 ) -> Case:
     settings: Settings = rest.pop("settings", QUICK)
-    return Case(
-        name=name,
-        group="features",
-        about=about,
-        make=lambda: series(make().astype(np.float32)),
-        settings=of_all(settings, features=features, dilation=dilation),
-        more=of_all(rest.pop("more", MORE), features=features, dilation=dilation),
-        **rest,
+    tried, more = (
+        of_all(given, features=features, dilation=dilation)
+        for given in (settings, rest.pop("more", MORE))
     )
+    return Case("features", name, about, single(make), tried, more, **rest)
 
 
 def _lifted(where: Callable[..., Values]) -> Callable[[], Values]:
@@ -451,23 +441,12 @@ def _front_case(
     dtype: str = "float32",
     **rest: Any,
 ) -> Case:
-    def made() -> Any:
-        return series(make().astype(dtype))
-
-    return Case(
-        name=name, group="fronts", about=about, make=made, settings=settings, more=MORE, **rest
-    )
+    return Case("fronts", name, about, single(make, dtype=dtype), settings, MORE, **rest)
 
 
 def _checkerboard() -> Values:
     t, z, y, x = lattice()
     return np.asarray((t + z + y + x) % 2)
-
-
-def _spike() -> Values:
-    values = np.zeros(SHAPE)
-    values[1, 4, 5, 6] = 1e6
-    return values
 
 
 def _spikes() -> Values:
@@ -530,7 +509,7 @@ FRONT_CASES: tuple[Case, ...] = (
         {**QUICK, **EXACT},
         dtype="int16",
     ),
-    _front_case("spike", "one value of 1e6, all others 0", _spike),
+    _front_case("spike", "one value of 1e6, all others 0", spike(0.0, (1, 4, 5, 6), 1e6)),
     _front_case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
     _front_case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
     _front_case("step-between", "a step between two vertices", _step(5.5)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,11 @@ from fhash_codec.encoding import encode
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import ArrayTable, Network, NumberType
 from fhash_codec.paper.storage import load_network
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
-from fhash_codec.selftest.field_cases import Settings, noise, series, waves
+from fhash_codec.selftest.field_cases import Settings, noise, single, spike, waves
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries
-
-Floats = npt.NDArray[np.float64]
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 rounding."""
@@ -142,18 +140,14 @@ def agrees(run: Run) -> Iterator[Finding]:
         off = np.abs(values.astype(np.float64) - [answer.value for answer in expected])
         allowed = np.array([answer.rounding for answer in expected])
         yield Finding(
-            name="float64 oracle",
-            worst=float(np.max(off / allowed)),
-            limit=1.0,
-            unit="of the rounding of float32",
-            under=name,
+            "float64 oracle", np.max(off / allowed), 1.0, "of the rounding of float32", name
         )
         yield Finding(
-            name="float64 oracle, error",
-            worst=float(off.max()),
-            limit=max(NEAR, float(allowed.max())),
-            unit="of the range",
-            under=name,
+            "float64 oracle, error",
+            off.max(),
+            max(NEAR, float(allowed.max())),
+            "of the range",
+            name,
         )
 
 
@@ -188,15 +182,8 @@ def gradients(run: Run) -> Iterator[Finding]:
                 continue
             difference = (-3 * start.value + 4 * first.value - second.value) / (2 * step)
             worst = max(worst, abs(difference - float(slope[axis])) / scale)
-    yield Finding(
-        name="gradient = differences", worst=worst, limit=1e-3, unit="of the largest derivative"
-    )
-    yield Finding(
-        name="derivatives beside kinks",
-        worst=over / (4 * N_POINTS),
-        limit=0.25,
-        unit="of all, not compared",
-    )
+    yield Finding("gradient = differences", worst, 1e-3, "of the largest derivative")
+    yield Finding("derivatives beside kinks", over / (4 * N_POINTS), 0.25, "of all, not compared")
 
 
 MAX_ENGINE_DIFFERENCE = 1e-5
@@ -225,26 +212,19 @@ def recovered(run: Run) -> Iterator[Finding]:
         training.get("restarts", 0),
     )
     consistent = rate == run.config.learning_rate * 0.25**restarts
-    yield Finding(
-        name="rate and restarts told", worst=float(not consistent), limit=0.0, unit="of them wrong"
-    )
-    yield Finding(name="rate at the end", worst=rate, limit=run.config.learning_rate, unit="")
+    yield Finding("rate and restarts told", not consistent, 0.0, "of them wrong")
+    yield Finding("rate at the end", rate, run.config.learning_rate, "")
     error = float(np.sqrt(np.mean((run.decoded - values) ** 2)))
-    yield Finding(
-        name="better than a constant",
-        worst=error / float(values.std()),
-        limit=0.98,
-        unit="of the deviation",
-    )
+    yield Finding("better than a constant", error / float(values.std()), 0.98, "of the deviation")
 
 
 def diverged(run: Run) -> Iterator[Finding]:
     """A training that diverges at its learning rate has restarted."""
     yield Finding(
-        name="divergence not found",
-        worst=float(not run.volume.container.header["training"].get("restarts", 0)),
-        limit=0.0,
-        unit="",
+        "divergence not found",
+        not run.volume.container.header["training"].get("restarts", 0),
+        0.0,
+        "",
     )
 
 
@@ -272,17 +252,11 @@ def ends_of_half_precision(run: Run) -> Iterator[Finding]:
             except InputError:
                 continue
             accepted += 1
-    yield Finding(
-        name="too large for float16", worst=float(accepted), limit=0.0, unit="tables accepted"
-    )
+    yield Finding("too large for float16", accepted, 0.0, "tables accepted")
     ends = np.array([MAX_FLOAT16, -MAX_FLOAT16], np.float32)
     kept = NumberType.of(ends, "float16").stored(ends)
-    yield Finding(
-        name="largest of float16",
-        worst=float(np.count_nonzero(np.abs(kept) != MAX_FLOAT16)),
-        limit=0.0,
-        unit="values",
-    )
+    other = int(np.count_nonzero(np.abs(kept) != MAX_FLOAT16))
+    yield Finding("largest of float16", other, 0.0, "values")
 
 
 def large_tables(run: Run) -> Iterator[Finding]:
@@ -302,18 +276,10 @@ def large_tables(run: Run) -> Iterator[Finding]:
             answer.rounding for answer in answers
         ]
         name = np.dtype(dtype).name
-        yield Finding(
-            name="large tables",
-            worst=float(off.max()),
-            limit=1.0,
-            unit="of the rounding of float32",
-            under=name,
-        )
+        yield Finding("large tables", off.max(), 1.0, "of the rounding of float32", name)
         frame = decode_region(network, 0.0, ((0, 3), (0, 3), (0, 3)))
         worst = float(np.abs(frame[:, 0, 0] - [0.0, 0.5, 1.0]).max())
-        yield Finding(
-            name="large tables, vertices", worst=worst, limit=1e-6, unit="of the range", under=name
-        )
+        yield Finding("large tables, vertices", worst, 1e-6, "of the range", name)
 
 
 def constant_tables(run: Run) -> Iterator[Finding]:
@@ -326,8 +292,8 @@ def constant_tables(run: Run) -> Iterator[Finding]:
         values, slopes = sample_points(network, *places, gradient=True)
         worst = max(worst, float(np.abs(values - (0.25 + 0.5 * value)).max()))
         slope = max(slope, float(np.abs(slopes).max()))
-    yield Finding(name="constant tables", worst=worst, limit=2.0**-23, unit="of the range")
-    yield Finding(name="constant tables, slopes", worst=slope, limit=0.0, unit="of the range")
+    yield Finding("constant tables", worst, 2.0**-23, "of the range")
+    yield Finding("constant tables, slopes", slope, 0.0, "of the range")
     for kind in ("float32", "float16", "uint8"):
         off = 0.0
         for value in (0.0, 1e-45, 1e-38, 1e-7, 1.0, -3.0):
@@ -337,9 +303,7 @@ def constant_tables(run: Run) -> Iterator[Finding]:
             off = max(
                 off, float(np.abs(back - np.float32(value)).max()) / max(abs(value) / 255, 6e-8)
             )
-        yield Finding(
-            name="constant tables, stored", worst=off, limit=1.0, unit="of a step", under=kind
-        )
+        yield Finding("constant tables, stored", off, 1.0, "of a step", kind)
 
 
 def kinks(run: Run) -> Iterator[Finding]:
@@ -380,10 +344,8 @@ def kinks(run: Run) -> Iterator[Finding]:
                     oracle.at((0, 0, 0, place + step)).value - oracle.at((0, 0, 0, place)).value
                 ) / step
                 off = max(off, abs(change - float(slope)))
-    yield Finding(name="derivatives about kinks", worst=float(wrong), limit=0.0, unit="wrong")
-    yield Finding(
-        name="derivatives about kinks, differences", worst=off, limit=1e-6, unit="of the range"
-    )
+    yield Finding("derivatives about kinks", wrong, 0.0, "wrong")
+    yield Finding("derivatives about kinks, differences", off, 1e-6, "of the range")
 
 
 def _linear(tables: Sequence[npt.NDArray[Any]], *, weight: float, bias: float) -> Network:
@@ -415,7 +377,7 @@ def _apart(run: Run, name: str, config: EncodeConfig, limit: float) -> Finding:
     encode(run.series, run.folder / "other.fhz", config, force=True)
     with open_volume(run.folder / "other.fhz") as volume:
         worst = float(np.nanmax(np.abs(as_floats(volume) - run.decoded))) / run.data_range
-    return Finding(name=name, worst=worst, limit=limit, unit="of the range")
+    return Finding(name, worst, limit, "of the range")
 
 
 SHAPE = (3, 6, 7, 8)
@@ -423,27 +385,12 @@ PLAIN = EncodeConfig(profile="paper", width=8, epochs=60, device="cpu")
 EXACT = replace(PLAIN, tables="float32", epochs=30)
 
 
-def _waves() -> ArraySeries:
-    return series(waves(SHAPE).astype(np.float32))
+_waves, _noise = single(partial(waves, SHAPE)), single(partial(noise, SHAPE))
 
 
-def _noise() -> ArraySeries:
-    return series(noise(SHAPE).astype(np.float32))
-
-
-def _spike() -> ArraySeries:
-    values = np.zeros(SHAPE, np.float32)
-    values[1, 3, 3, 4] = 1.0
-    return series(values)
-
-
-def _case(name: str, about: str, settings: Settings, *checks: Check, **more: Any) -> Case:
-    return Case(
-        name=name,
-        group="networks",
-        about=about,
-        **{"make": _waves, "settings": settings, "checks": checks, **more},
-    )
+def _case(name: str, about: str, settings: Settings, *checks: Check, **rest: Any) -> Case:
+    make = rest.pop("make", _waves)
+    return Case("networks", name, about, make, settings, checks=checks, **rest)
 
 
 def _sizes(field: str, sizes: Sequence[int]) -> Settings:
@@ -572,6 +519,6 @@ NETWORK_CASES = (
         "one vertex that differs from all others",
         {"2-layers": replace(PLAIN, hidden_layers=2)},
         agrees,
-        make=_spike,
+        make=single(spike(0.0, (1, 3, 3, 4), 1.0, shape=SHAPE)),
     ),
 )

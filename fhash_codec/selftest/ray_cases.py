@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.rendering.grid import Floats
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Task, warped
 from fhash_codec.rendering.plan import Plan, plan_picture
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
 from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest.case import Case, Check, Finding, Run
-from fhash_codec.selftest.field_cases import Settings, Shape, series, waves
+from fhash_codec.selftest.field_cases import Settings, Shape, series, single, waves
 from fhash_formats.series import ArraySeries
-
-Floats = npt.NDArray[np.float64]
 
 SNAP = 1e-9
 """Distance from a vertex, in vertex spacings, below which a coordinate is that of the vertex."""
@@ -204,18 +204,21 @@ def scene(**parts: Any) -> Scene:
     )
 
 
-def scenes(scenes_by_name: Mapping[str, Scene], *, oracle: bool = True) -> Check:
-    """A check that draws each scene: finite and within 0..1.
-
-    Args:
-        scenes_by_name: the scenes.
-        oracle: whether the picture is also compared with the float64 picture.
-    """
+def scenes(scenes_by_name: Mapping[str, Scene]) -> Check:
+    """A check that draws each scene: finite, within 0..1, and as in float64."""
 
     def check(run: Run) -> Iterator[Finding]:
         renderer = Renderer(run.volume)
         for name, scene_ in scenes_by_name.items():
-            yield from _pictures(run, renderer, name, scene_, oracle)
+            picture = renderer.render(scene_).rgba
+            bad = float(np.count_nonzero(~np.isfinite(picture)))
+            yield Finding("finite pixels", bad, 0.0, "channels", name)
+            beyond = max(-float(picture.min()), float(picture.max()) - 1.0, 0.0)
+            yield Finding("pixels in 0..1", beyond, 1e-6, "of a channel", name)
+            expected = _expected(run, renderer.plan(scene_))
+            yield _off(picture, expected, name)
+            if not name.startswith("nothing"):
+                yield _not_empty(float(expected[..., 3].max()), name)
 
     return check
 
@@ -236,9 +239,7 @@ def closed_form(scenes_by_name: Mapping[str, Scene], value: float) -> Check:
             path = _path(plan)
             exact = -np.expm1(-extinction * path)
             worst = float(np.abs(picture[..., 3] - exact).max())
-            yield Finding(
-                name="closed form", worst=worst, limit=NEAR, unit="of a channel", under=name
-            )
+            yield Finding("closed form", worst, NEAR, "of a channel", name)
             yield _not_empty(float(path.max()), name)
 
     return check
@@ -259,13 +260,7 @@ def blocks(run: Run) -> Iterator[Finding]:
         front = march(Frame(values=frame.values[cut:], first=(cut, 0, 0)), plan.task).rgba
         back = march(Frame(values=frame.values[: cut + 1], first=(0, 0, 0)), plan.task).rgba
         worst = float(np.abs(front + (1 - front[..., 3:]) * back - uncut).max())
-        yield Finding(
-            name="blocks = whole",
-            worst=worst,
-            limit=2e-6,
-            unit="of a channel",
-            under=f"cut at {cut}",
-        )
+        yield Finding("blocks = whole", worst, 2e-6, "of a channel", f"cut at {cut}")
         yield _not_empty(float(min(front[..., 3].max(), back[..., 3].max())), f"cut at {cut}")
 
 
@@ -278,13 +273,7 @@ def key_times(run: Run) -> Iterator[Finding]:
         at_step = renderer.render(scene(step=step, transfer_function=THIN_FOG)).rgba
         at_time = renderer.render(scene(time=float(times[step]), transfer_function=THIN_FOG)).rgba
         unlike = float(np.count_nonzero(at_step != at_time))
-        yield Finding(
-            name="picture at a key time",
-            worst=unlike,
-            limit=0.0,
-            unit="channels",
-            under=f"step {step}",
-        )
+        yield Finding("picture at a key time", unlike, 0.0, "channels", f"step {step}")
         beside = [place for place in (step - 1e-9, step + 1e-9) if 0 <= place <= len(times) - 1]
         for place in beside:
             off = float(
@@ -292,13 +281,7 @@ def key_times(run: Run) -> Iterator[Finding]:
                     renderer.render(scene(step=place, transfer_function=THIN_FOG)).rgba - at_step
                 ).max()
             )
-            yield Finding(
-                name="picture beside a key time",
-                worst=off,
-                limit=1e-5,
-                unit="of a channel",
-                under=f"step {step}",
-            )
+            yield Finding("picture beside a key time", off, 1e-5, "of a channel", f"step {step}")
 
 
 THIN_FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
@@ -312,21 +295,6 @@ def float64_picture(run: Run, picture_scene: Scene) -> Finding:
     return _off(renderer.render(picture_scene).rgba, _expected(run, plan))
 
 
-def _pictures(
-    run: Run, renderer: Renderer, name: str, picture_scene: Scene, oracle: bool
-) -> Iterator[Finding]:
-    picture = renderer.render(picture_scene).rgba
-    bad = float(np.count_nonzero(~np.isfinite(picture)))
-    yield Finding(name="finite pixels", worst=bad, limit=0.0, unit="channels", under=name)
-    beyond = max(-float(picture.min()), float(picture.max()) - 1.0, 0.0)
-    yield Finding(name="pixels in 0..1", worst=beyond, limit=1e-6, unit="of a channel", under=name)
-    if oracle:
-        expected = _expected(run, renderer.plan(picture_scene))
-        yield _off(picture, expected, name)
-        if not name.startswith("nothing"):
-            yield _not_empty(float(expected[..., 3].max()), name)
-
-
 def _expected(run: Run, plan: Plan) -> Picture:
     """The float64 picture of a plan."""
     frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
@@ -336,18 +304,12 @@ def _expected(run: Run, plan: Plan) -> Picture:
 def _off(picture: Picture, expected: Picture, name: str = "") -> Finding:
     """The largest difference of a picture from the one that is expected."""
     worst = float(np.abs(picture.astype(np.float64) - expected).max())
-    return Finding(name="float64 picture", worst=worst, limit=NEAR, unit="of a channel", under=name)
+    return Finding("float64 picture", worst, NEAR, "of a channel", name)
 
 
 def _not_empty(max_opacity: float, name: str) -> Finding:
     """A finding that fails for an empty picture, since comparing empty pictures proves nothing."""
-    return Finding(
-        name="empty pictures",
-        worst=float(not max_opacity > 0),
-        limit=0.0,
-        unit="pictures",
-        under=name,
-    )
+    return Finding("empty pictures", not max_opacity > 0, 0.0, "pictures", name)
 
 
 def _path(plan: Plan) -> npt.NDArray[np.float64]:
@@ -376,27 +338,14 @@ AXES = ("xy", "yx", "xz", "zx", "yz", "zy")
 FRONT = {"view": "xy", "projection": "parallel"}
 
 
-def _waves() -> ArraySeries:
-    return series(waves(SHAPE).astype(np.float32))
+_waves = partial(waves, SHAPE)
+_series = single(_waves)
+_constant = single(partial(np.ones, (1, 2, 3, 3)))
+"""Makes a volume that is 1 everywhere."""
 
 
-def _placed(values: Callable[[], np.ndarray[Any, Any]], **axes: Any) -> Callable[[], ArraySeries]:
-    return lambda: series(values(), **axes)
-
-
-def _scaled(
-    factor: float, offset: float, dtype: type[np.floating[Any]]
-) -> Callable[[], ArraySeries]:
-    return lambda: series((waves(SHAPE) * factor + offset).astype(dtype))
-
-
-def _shaped(shape: Shape) -> Callable[[], ArraySeries]:
-    return lambda: series(waves(shape).astype(np.float32))
-
-
-def _constant() -> ArraySeries:
-    """A volume that is 1 everywhere."""
-    return series(np.ones((1, 2, 3, 3), np.float32))
+def _scaled(factor: float, offset: float, dtype: str) -> Callable[[], ArraySeries]:
+    return single(lambda: _waves() * factor + offset, dtype=dtype)
 
 
 def _even(origin: float, spacing: float, length: int) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -422,13 +371,11 @@ def _case(
     name: str,
     about: str,
     *checks: Check,
-    make: Callable[[], ArraySeries] = _waves,
+    make: Callable[[], ArraySeries] = _series,
     settings: Settings = BOUND,
     **rest: Any,
 ) -> Case:
-    return Case(
-        name=name, group="rays", about=about, make=make, settings=settings, checks=checks, **rest
-    )
+    return Case("rays", name, about, make, settings, checks=checks, **rest)
 
 
 def _grid_camera(view: str) -> dict[str, Any]:
@@ -476,17 +423,29 @@ CORNERS = {
     "along-a-diagonal-of-a-face": _towards((-4.0, -5.0, 0.0), (4.0, 5.0, 0.0)),
     "along-an-edge": _towards((0.0, 0.0, -5.0), (0.0, 0.0, 3.0), view_up=[1.0, 0.3, 0.0]),
 }
+
+
+def _fog(**parts: Any) -> Scene:
+    """A scene whose volume is a fog."""
+    return scene(transfer_function=FOG, **parts)
+
+
+def _points(*points: list[float], density: float = 1.0, **parts: Any) -> Scene:
+    """A scene of points [value, opacity]."""
+    return scene(transfer_function={"opacity": points, "density": density}, **parts)
+
+
+def _surface(value: float, **fields: Any) -> Scene:
+    """A scene of an isosurface alone."""
+    surface = {"value": value, "colour": "#ff8000", **fields}
+    return scene(transfer_function={"nothing": True}, effects={"isosurfaces": [surface]})
+
+
 SURFACES = {
-    name: scene(
-        transfer_function={"nothing": True},
-        effects={"isosurfaces": [{"value": value, "opacity": opacity, "colour": "#ff8000"}]},
-    )
-    for name, value, opacity in (
-        ("nothing-below-the-least", 0.0, 1.0),
-        ("2", 2.0, 1.0),
-        ("3-half", 3.0, 0.5),
-        ("nothing-above", 7.0, 1.0),
-    )
+    "nothing-below-the-least": _surface(0.0),
+    "2": _surface(2.0),
+    "3-half": _surface(3.0, opacity=0.5),
+    "nothing-above": _surface(7.0),
 }
 RANGE = {
     "iso": scene(),
@@ -501,13 +460,9 @@ RAY_CASES = (
         "opaque values, alone and beside transparent ones",
         scenes(
             {
-                "everywhere": scene(transfer_function={"opacity": [[0.0, 1.0]]}),
-                "a-step": scene(
-                    transfer_function={"opacity": [[0.0, 0.0], [0.5, 0.0], [0.6, 1.0], [1.0, 1.0]]}
-                ),
-                "dense": scene(
-                    transfer_function={"opacity": [[0.0, 0.9], [1.0, 1.0]], "density": 1e6}
-                ),
+                "everywhere": _points([0.0, 1.0]),
+                "a-step": _points([0.0, 0.0], [0.5, 0.0], [0.6, 1.0], [1.0, 1.0]),
+                "dense": _points([0.0, 0.9], [1.0, 1.0], density=1e6),
             }
         ),
     ),
@@ -516,13 +471,9 @@ RAY_CASES = (
         "volumes that are hardly visible, and a fully transparent surface",
         scenes(
             {
-                "thin": scene(transfer_function={"opacity": [[0.0, 0.0], [1.0, 1e-9]]}),
-                "rare": scene(
-                    transfer_function={"opacity": [[0.0, 0.0], [1.0, 1.0]], "density": 1e-6}
-                ),
-                "clear-surface": scene(
-                    transfer_function=FOG, effects={"isosurfaces": [{"value": 0.5, "opacity": 0.0}]}
-                ),
+                "thin": _points([0.0, 0.0], [1.0, 1e-9]),
+                "rare": _points([0.0, 0.0], [1.0, 1.0], density=1e-6),
+                "clear-surface": _fog(effects={"isosurfaces": [{"value": 0.5, "opacity": 0.0}]}),
             }
         ),
     ),
@@ -531,21 +482,11 @@ RAY_CASES = (
         "a million samples of each ray add up to the closed form",
         closed_form(
             {
-                "step-1e-6": scene(
-                    size=[2, 2],
-                    camera=FRONT,
-                    transfer_function={"opacity": [[0.0, 0.5]]},
-                    march={"step": 1e-6},
+                "step-1e-6": _points([0.0, 0.5], size=[2, 2], camera=FRONT, march={"step": 1e-6}),
+                "step-1e-6-thin": _points(
+                    [0.0, 1e-3], size=[2, 2], camera=FRONT, march={"step": 1e-6}
                 ),
-                "step-1e-6-thin": scene(
-                    size=[2, 2],
-                    camera=FRONT,
-                    transfer_function={"opacity": [[0.0, 1e-3]]},
-                    march={"step": 1e-6},
-                ),
-                "step-64": scene(
-                    size=[4, 4], transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 64.0}
-                ),
+                "step-64": _points([0.0, 0.5], size=[4, 4], march={"step": 64.0}),
             },
             1.0,
         ),
@@ -554,29 +495,17 @@ RAY_CASES = (
     _case(
         "rays-along-faces",
         "rays parallel to an axis, through vertices, along edges and faces",
-        scenes(
-            {
-                view: scene(size=[9, 9], camera=_grid_camera(view), transfer_function=FOG)
-                for view in AXES
-            }
-        ),
+        scenes({view: _fog(size=[9, 9], camera=_grid_camera(view)) for view in AXES}),
     ),
     _case(
         "rays-through-corners",
         "rays through corners and edges, and along diagonals",
-        scenes(
-            {
-                name: scene(size=[9, 9], camera=camera, transfer_function=FOG)
-                for name, camera in CORNERS.items()
-            }
-        ),
+        scenes({name: _fog(size=[9, 9], camera=camera) for name, camera in CORNERS.items()}),
     ),
     _case(
         "cameras",
         "a camera inside the volume, on a face, edge or corner, and a million sizes away",
-        scenes(
-            {name: scene(camera=camera, transfer_function=FOG) for name, camera in CAMERAS.items()}
-        ),
+        scenes({name: _fog(camera=camera) for name, camera in CAMERAS.items()}),
     ),
     *(
         _case(
@@ -586,21 +515,15 @@ RAY_CASES = (
             # steps, since a needle takes 10^7 of the usual ones.
             scenes(
                 {
-                    view: scene(
+                    view: _fog(
                         size=[15, 15],
                         camera={"view": view, "projection": "parallel"},
-                        transfer_function=FOG,
                         march={"step": step},
                     )
                     for view in ("xy", "xz", "yz", "iso")
                 }
             ),
-            make=_placed(
-                lambda: waves(SHAPE).astype(np.float32),
-                z=_even(0, dz, 7),
-                y=_even(0, dy, 6),
-                x=_even(0, dx, 5),
-            ),
+            make=single(_waves, z=_even(0, dz, 7), y=_even(0, dy, 6), x=_even(0, dx, 5)),
             quick=name != "needles",
         )
         for name, dz, dy, dx, step in (
@@ -613,13 +536,8 @@ RAY_CASES = (
     _case(
         "far-origin",
         "positions far from the origin compared with the size of the volume",
-        scenes({"iso": scene(transfer_function=FOG)}),
-        make=_placed(
-            lambda: waves(SHAPE).astype(np.float32),
-            z=_even(1e8, 1.0, 7),
-            y=_even(-1e8, 0.5, 6),
-            x=_even(1e8, -1.0, 5),
-        ),
+        scenes({"iso": _fog()}),
+        make=single(_waves, z=_even(1e8, 1.0, 7), y=_even(-1e8, 0.5, 6), x=_even(1e8, -1.0, 5)),
     ),
     *(
         _case(
@@ -629,12 +547,12 @@ RAY_CASES = (
             make=_scaled(factor, offset, dtype),
         )
         for name, factor, offset, dtype in (
-            ("tiny", 1e-38, 0.0, np.float32),
-            ("huge", 3e38, -1e38, np.float32),
-            ("offset-float64", 1e-3, 1e8, np.float64),
-            ("offset-float32", 64.0, 1e8, np.float32),
-            ("float64-tiny", 1e-300, 0.0, np.float64),
-            ("float64-huge", 1e300, 0.0, np.float64),
+            ("tiny", 1e-38, 0.0, "float32"),
+            ("huge", 3e38, -1e38, "float32"),
+            ("offset-float64", 1e-3, 1e8, "float64"),
+            ("offset-float32", 64.0, 1e8, "float32"),
+            ("float64-tiny", 1e-300, 0.0, "float64"),
+            ("float64-huge", 1e300, 0.0, "float64"),
         )
     ),
     _case(
@@ -647,14 +565,7 @@ RAY_CASES = (
     _case(
         "surface-on-a-face",
         "an isosurface that coincides with a face of the volume",
-        scenes(
-            {
-                "6": scene(
-                    transfer_function={"nothing": True},
-                    effects={"isosurfaces": [{"value": 6.0, "colour": "#ff8000"}]},
-                )
-            }
-        ),
+        scenes({"6": _surface(6.0)}),
         make=_stairs,
         settings=EXACT,
     ),
@@ -663,13 +574,9 @@ RAY_CASES = (
         "regions, a slab and single vertices without values",
         scenes(
             {
-                "iso": scene(transfer_function=FOG),
-                "other-side": scene(
-                    camera={"azimuth": 190.0, "elevation": -20.0}, transfer_function=FOG
-                ),
-                "surface": scene(
-                    transfer_function={"nothing": True}, effects={"isosurfaces": [{"value": 0.5}]}
-                ),
+                "iso": _fog(),
+                "other-side": _fog(camera={"azimuth": 190.0, "elevation": -20.0}),
+                "surface": _surface(0.5, colour=None),
             }
         ),
         make=_holes,
@@ -678,13 +585,8 @@ RAY_CASES = (
         _case(
             f"thin-{axis}",
             "a volume of one vertex along an axis",
-            scenes(
-                {
-                    "iso": scene(transfer_function=FOG),
-                    "side": scene(camera={"view": "xz"}, transfer_function=FOG),
-                }
-            ),
-            make=_shaped(shape),
+            scenes({"iso": _fog(), "side": _fog(camera={"view": "xz"})}),
+            make=single(partial(waves, shape)),
         )
         for axis, shape in {
             "z": (2, 1, 6, 5),

@@ -95,38 +95,7 @@ class CaseResult:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; figures that are not finite become text."""
-        return {
-            "name": self.name,
-            "group": self.group,
-            "about": self.about,
-            "under": list(self.under),
-            "holds": self.holds,
-            "findings": [_finding_dict(finding) for finding in self.findings],
-            "errors": list(self.errors),
-            "left_out": list(self.left_out),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> CaseResult:
-        """The result with the values that `to_dict` returned."""
-        findings = tuple(
-            Finding(
-                name=values_of_finding["name"],
-                worst=float(values_of_finding["worst"]),
-                limit=float(values_of_finding["limit"]),
-                unit=values_of_finding["unit"],
-                under=values_of_finding["under"],
-            )
-            for values_of_finding in values["findings"]
-        )
-        plain = {name: values[name] for name in ("name", "group", "about")}
-        return cls(
-            **plain,
-            under=tuple(values["under"]),
-            findings=findings,
-            errors=tuple(values["errors"]),
-            left_out=tuple(values["left_out"]),
-        )
+        return {**vars(self), "holds": self.holds, "findings": [*map(_json, self.findings)]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,18 +146,13 @@ class Summary:
         }
 
 
-def _finding_dict(finding: Finding) -> dict[str, Any]:
+def _json(finding: Finding) -> dict[str, Any]:
+    """JSON values of a finding."""
     figures = {
         name: value if math.isfinite(value) else str(value)
         for name, value in (("worst", finding.worst), ("limit", finding.limit))
     }
-    return {
-        "name": finding.name,
-        **figures,
-        "unit": finding.unit,
-        "under": finding.under,
-        "holds": finding.holds,
-    }
+    return {**vars(finding), **figures, "holds": finding.holds}
 
 
 HEAD = """\
@@ -329,7 +293,8 @@ def run_case(
         checks: the checks of every run, in addition to the checks of the case.
     """
     settings: Mapping[str, EncodeConfig] = {**case.settings, **(case.more if everything else {})}
-    left_out = [name for name, config in settings.items() if not _possible(config)]
+    torch = has_torch()  # which the profile paper needs
+    left_out = [name for name, each in settings.items() if each.profile == "paper" and not torch]
     settings = {name: config for name, config in settings.items() if name not in left_out}
     findings: list[Finding] = []
     errors: list[str] = []
@@ -366,11 +331,6 @@ def run_case(
         errors=tuple(errors),
         left_out=tuple(left_out),
     )
-
-
-def _possible(config: EncodeConfig) -> bool:
-    """Whether settings can be tried here: the profile paper needs torch."""
-    return config.profile != "paper" or has_torch()
 
 
 def _run(
@@ -434,9 +394,7 @@ def _refused(
         left = {entry.name for entry in path.parent.iterdir()} - (
             {path.name} if isinstance(error, QualityError) else set()
         )
-        return [
-            Finding(name="refused, nothing left", worst=float(len(left)), limit=0.0, unit="files")
-        ], []
+        return [Finding("refused, nothing left", len(left), 0.0, "files")], []
     except Exception as error:
         return [], [_line(under, error)]
     return [], [f"{under}: was encoded; it should have been refused with '{expected}'"]
@@ -514,7 +472,8 @@ class _Worker:
             if not self._pipe.poll(max_seconds):
                 self._stop()
                 return _broken(case, f"took longer than {max_seconds:g} s")
-            return CaseResult.from_dict(self._pipe.recv())
+            result: CaseResult = self._pipe.recv()
+            return result
         except (EOFError, OSError):
             code = self._stop(patience=5)
             return _broken(case, f"the process ended with {code}")
@@ -557,12 +516,9 @@ def _broken(case: Case, line: str) -> CaseResult:
 
 def _serve(pipe: Connection, everything: bool) -> None:
     """Run the cases whose names arrive on the pipe, until its other end closes."""
-    pass
-    pass
-
     try:
         while True:
             (case,) = choose_cases(names=[pipe.recv()])
-            pipe.send(run_case(case, everything=everything).to_dict())
+            pipe.send(run_case(case, everything=everything))
     except (EOFError, OSError, KeyboardInterrupt):
         return

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
@@ -23,29 +22,29 @@ from fhash_codec.selftest.field_cases import (
     SHAPE,
     Settings,
     Shape,
+    Values,
     lattice,
     noise,
     series,
+    single,
+    spike,
     waves,
 )
+from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import ArraySeries, Series
 
-Values = npt.NDArray[Any]
 INTEGERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
 
 
 def _case(
     name: str, about: str, make: Callable[[], Values], settings: Settings = QUICK, **rest: Any
 ) -> Case:
-    return Case(
-        name=name,
-        group="values",
-        about=about,
-        make=lambda: series(make()),
-        settings=settings,
-        **{"more": MORE, **rest},
-    )
+
+    def made() -> Series:
+        return series(make())
+
+    return Case("values", name, about, made, settings, **{"more": MORE, **rest})
 
 
 def _constant(value: float, dtype: str) -> Callable[[], Values]:
@@ -54,12 +53,6 @@ def _constant(value: float, dtype: str) -> Callable[[], Values]:
 
 def _offset(low: float, extent: float, dtype: str) -> Callable[[], Values]:
     return lambda: (low + extent * waves()).astype(dtype)
-
-
-def _one_ulp() -> Values:
-    values = np.full(SHAPE, 1e8, dtype=np.float32)
-    values[2, 3, 4, 5] = np.nextafter(np.float32(1e8), np.float32(np.inf))
-    return values
 
 
 def _magnitudes(exponent: float, dtype: str) -> Values:
@@ -110,12 +103,6 @@ def _isolated() -> Values:
     return values
 
 
-def _one_finite() -> Values:
-    values = np.full(SHAPE, np.nan, dtype=np.float32)
-    values[2, 4, 5, 6] = 7.5
-    return values
-
-
 def _integers(dtype: str) -> Callable[[], Values]:
     """A smooth field over all values of the dtype, both ends included, with noise over all values
     in one corner."""
@@ -134,10 +121,6 @@ def _integers(dtype: str) -> Callable[[], Values]:
         return values
 
     return make
-
-
-def _largest_whole() -> Values:
-    return np.full(SHAPE, 2**64 - 1, dtype=np.uint64)
 
 
 def _beyond_floats() -> Values:
@@ -178,7 +161,7 @@ def _declared_values(run: Run) -> Iterator[Finding]:
     wrong = np.count_nonzero(
         ~((run.values == expected) | (np.isnan(run.values) & np.isnan(expected)))
     )
-    yield Finding(name="read as declared", worst=float(wrong), limit=0.0, unit="values")
+    yield Finding("read as declared", int(wrong), 0.0, "values")
 
 
 DEFAULT: Settings = {"default": EncodeConfig()}
@@ -220,14 +203,14 @@ VALUE_CASES: tuple[Case, ...] = (
     _case(
         "constant-uint64-beyond",
         "the largest 64-bit integer, which float64 cannot represent",
-        _largest_whole,
+        lambda: np.full(SHAPE, 2**64 - 1, dtype=np.uint64),
         {**PAPER, **WIDE},
         more={},
     ),
     _case(
         "nearly-constant-float32",
         "1e8 everywhere but at one vertex, which has the next float32",
-        _one_ulp,
+        spike(1e8, (2, 3, 4, 5), np.nextafter(np.float32(1e8), np.float32(np.inf))),
     ),
     _case(
         "nearly-constant-float64",
@@ -313,7 +296,7 @@ VALUE_CASES: tuple[Case, ...] = (
         "every second vertex is -Inf",
         _with(-np.inf, lambda t, z, y, x: (t + z + y + x) % 2 == 0),
     ),
-    _case("one-finite-value", "a single value is finite", _one_finite),
+    _case("one-finite-value", "a single value is finite", spike(np.nan, (2, 4, 5, 6), 7.5)),
     _case(
         "nothing-finite",
         "refused: there is nothing to encode",
@@ -361,13 +344,13 @@ VALUE_CASES: tuple[Case, ...] = (
         lambda: waves().astype(np.dtype("float32").newbyteorder("S")),
     ),
     Case(
-        name="declared-range",
-        group="values",
-        about="a file with a fill value and values outside its valid_range, which are data",
-        make=_from_file,
-        settings=QUICK,
-        more=MORE,
-        checks=(_declared_values,),
+        "values",
+        "declared-range",
+        "a file with a fill value and values outside its valid_range, which are data",
+        _from_file,
+        QUICK,
+        MORE,
+        (_declared_values,),
     ),
 )
 
@@ -413,19 +396,9 @@ def powers_of_two(run: Run) -> Iterator[Finding]:
     for factor in POWERS:
         other, size = _encoded(run, values * np.float32(factor), factor)
         unequal = np.count_nonzero((other.astype(np.float64) / factor - values) != error)
+        yield Finding("times a power of two", int(unequal), 0.0, "errors", f"{factor:g}")
         yield Finding(
-            name="times a power of two",
-            worst=float(unequal),
-            limit=0.0,
-            unit="errors",
-            under=f"{factor:g}",
-        )
-        yield Finding(
-            name="times a power of two, size",
-            worst=float(abs(size - _size(run))),
-            limit=0.0,
-            unit="bytes",
-            under=f"{factor:g}",
+            "times a power of two, size", abs(size - _size(run.volume)), 0.0, "bytes", f"{factor:g}"
         )
 
 
@@ -443,13 +416,7 @@ def affine(run: Run) -> Iterator[Finding]:
             error = (run.decoded - run.values.astype(np.float64)) / run.data_range
             apart = np.abs((other - values.astype(np.float64)) / _range(values) - error)
             worst = float(np.quantile(apart, 0.99))
-            yield Finding(
-                name="scaled and shifted, errors",
-                worst=worst,
-                limit=1e-5,
-                unit="of the range",
-                under=under,
-            )
+            yield Finding("scaled and shifted, errors", worst, 1e-5, "of the range", under)
 
 
 def guises(run: Run) -> Iterator[Finding]:
@@ -465,11 +432,7 @@ def guises(run: Run) -> Iterator[Finding]:
         if seeds:
             least = min(*seeds, _quality(run.values, run.decoded)) - MAX_BELOW_SEEDS
             yield Finding(
-                name="flipped, PSNR",
-                worst=least - _quality(values, other),
-                limit=0.0,
-                unit="dB below other seeds",
-                under=under,
+                "flipped, PSNR", least - _quality(values, other), 0.0, "dB below other seeds", under
             )
         else:
             yield from _alike(run, values, other, size, under)
@@ -498,35 +461,19 @@ def _alike(run: Run, values: Values, other: Values, size: int, under: str) -> It
         under: name of the guise.
     """
     apart = abs(_quality(values, other) - _quality(run.values, run.decoded))
-    yield Finding(
-        name="same PSNR in any guise",
-        worst=apart,
-        limit=MAX_PSNR_DIFFERENCE,
-        unit="dB",
-        under=under,
-    )
+    yield Finding("same PSNR in any guise", apart, MAX_PSNR_DIFFERENCE, "dB", under)
     allowed = (
         MAX_SIZE_DIFFERENCE_BY_TRIAL
         if run.config.effort >= 2 and run.config.profile == "compact"
         else MAX_SIZE_DIFFERENCE
     )
     yield Finding(
-        name="same size in any guise",
-        worst=abs(size / _size(run) - 1),
-        limit=allowed,
-        unit="of the size",
-        under=under,
+        "same size in any guise", abs(size / _size(run.volume) - 1), allowed, "of the size", under
     )
     bound = run.config.max_error_rel
     if bound is not None:
         worst = float(np.abs(other - values.astype(np.float64)).max()) / (bound * _range(values))
-        yield Finding(
-            name="bound in any guise",
-            worst=worst,
-            limit=1.0 + 1e-12,
-            unit="of the bound",
-            under=under,
-        )
+        yield Finding("bound in any guise", worst, 1.0 + 1e-12, "of the bound", under)
 
 
 def _encoded(run: Run, values: Values, factor: float, **changes: Any) -> tuple[Values, int]:
@@ -540,11 +487,12 @@ def _encoded(run: Run, values: Values, factor: float, **changes: Any) -> tuple[V
         config = replace(config, max_error=config.max_error * factor)
     encode(series(values), run.folder / "guise.fhz", config, force=True)
     with open_volume(run.folder / "guise.fhz") as volume:
-        return as_floats(volume), sum(array["bytes"] for array in volume.info["arrays"].values())
+        return as_floats(volume), _size(volume)
 
 
-def _size(run: Run) -> int:
-    return sum(array["bytes"] for array in run.volume.info["arrays"].values())
+def _size(volume: Volume) -> int:
+    """Bytes of the arrays of a volume."""
+    return sum(array["bytes"] for array in volume.info["arrays"].values())
 
 
 def _range(values: Values) -> float:
@@ -557,9 +505,7 @@ def _quality(values: Values, decoded: Values) -> float:
     return float(-10 * np.log10(np.mean(error**2)))
 
 
-def _make() -> ArraySeries:
-    return series((waves(GUISE_SHAPE) + 0.02 * noise(GUISE_SHAPE)).astype(np.float32))
-
+_make = single(lambda: waves(GUISE_SHAPE) + 0.02 * noise(GUISE_SHAPE))
 
 GUISE_QUICK: Settings = {
     "bound": EncodeConfig(max_error_rel=1e-2, effort=1),
@@ -573,21 +519,21 @@ GUISE_MORE: Settings = {
 
 GUISE_CASES = (
     Case(
-        name="scaled-and-shifted",
-        group="values",
-        about="errors do not depend on the unit or the offset of the values",
-        make=_make,
-        settings=GUISE_QUICK,
-        more=GUISE_MORE,
-        checks=(powers_of_two, affine),
+        "values",
+        "scaled-and-shifted",
+        "errors do not depend on the unit or the offset of the values",
+        _make,
+        GUISE_QUICK,
+        GUISE_MORE,
+        (powers_of_two, affine),
     ),
     Case(
-        name="flipped-and-transposed",
-        group="shapes",
-        about="errors do not depend on signs, directions or the order of axes",
-        make=_make,
-        settings=GUISE_QUICK,
-        more=GUISE_MORE,
-        checks=(guises,),
+        "shapes",
+        "flipped-and-transposed",
+        "errors do not depend on signs, directions or the order of axes",
+        _make,
+        GUISE_QUICK,
+        GUISE_MORE,
+        (guises,),
     ),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.simulation.effects import Array, Bend, Body, Effect, Flow, Place, Surface, Vector
+from fhash_codec.simulation.effects import Array, Bend, Body, Flow, Place, Surface, Vector
 from fhash_codec.simulation.scene import EFFECTS, SimulatedScene, scene_of
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
@@ -57,47 +58,37 @@ class Terms:
         return not self.flows or (len(self.flows) == 1 and self.flows[0][1].exact)
 
 
-def spacing_of(scene: SimulatedScene) -> Vector:
-    """Metres between vertices along z, y and x, 0 along an axis of one vertex."""
-    z, y, x = (
-        length / count if count > 1 else 0.0
-        for length, count in zip(scene.size, scene.shape, strict=True)
-    )
-    return z, y, x
-
-
 def terms_of(scene: SimulatedScene, seed: int) -> Terms:
     """Make the terms of a scene.
 
     An effect draws its random numbers from the seed, its kind and its number among the effects of
     this kind that are computed. So an effect of strength 0 changes those of no other.
     """
-    terms = Terms(spacing=spacing_of(scene))
+    z, y, x = (
+        length / count if count > 1 else 0.0
+        for length, count in zip(scene.size, scene.shape, strict=True)
+    )
+    terms = Terms(spacing=(z, y, x))
     bodies = any(effect.role == "body" and not effect.idle for effect in scene.effects)
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for number, effect in enumerate(scene.effects):
         reason = effect.idle or ("" if bodies else "the scene has no body, so nothing shows it")
         if reason:
             terms.idle[number] = reason
             continue
-        counts[effect.kind] = counts.get(effect.kind, 0) + 1
+        counts[effect.kind] += 1
         key = [seed, zlib.crc32(effect.kind.encode()), counts[effect.kind]]
-        _add(terms, number, effect, np.random.default_rng(key))
+        term = effect.term(np.random.default_rng(key), terms.spacing)
+        if isinstance(term, Flow):
+            terms.flows.append((number, term))
+        elif isinstance(term, Body):
+            terms.bodies.append((number, term))
+        elif isinstance(term, float):
+            terms.diffusivity += term
+            terms.spreads.append(number)
+        else:
+            terms.bends.append((number, term))
     return terms
-
-
-def _add(terms: Terms, number: int, effect: Effect, generator: np.random.Generator) -> None:
-    """Make the term of one effect."""
-    term = effect.term(generator, terms.spacing)
-    if isinstance(term, Flow):
-        terms.flows.append((number, term))
-    elif isinstance(term, Body):
-        terms.bodies.append((number, term))
-    elif isinstance(term, float):
-        terms.diffusivity += term
-        terms.spreads.append(number)
-    else:
-        terms.bends.append((number, term))
 
 
 Block = tuple[slice, slice, slice]
@@ -135,12 +126,8 @@ class Counters:
     vertices: int = 0
     places: int = 0
     parts: int = 0
-    evaluations: dict[int, int] = field(default_factory=dict)
+    evaluations: Counter[int] = field(default_factory=Counter)
     stretches: int = 0
-
-    def add(self, number: int, count: int) -> None:
-        """Count places for which the effect of a number was computed."""
-        self.evaluations[number] = self.evaluations.get(number, 0) + count
 
 
 class Simulation(Series):
@@ -213,8 +200,7 @@ class Simulation(Series):
         for counters in done:
             self.counters.places += counters.places
             self.counters.stretches += counters.stretches
-            for number, count in counters.evaluations.items():
-                self.counters.add(number, count)
+            self.counters.evaluations += counters.evaluations
 
     def _values(self, block: Block, time: float, counters: Counters) -> Array:
         """The values of a block; a last layer beside it shows how distances change."""
@@ -236,7 +222,7 @@ class Simulation(Series):
         shifts: Shifts = {}
         for number, body in terms.bodies:
             surface = body.surface(place, time)
-            counters.add(number, surface.distance.size)
+            counters.evaluations[number] += surface.distance.size
             distance = self._bent(surface, body, time, shifts, counters)
             widths = stretch
             if terms.bends:
@@ -265,7 +251,7 @@ class Simulation(Series):
             start, stop = time * (part - 1) / parts, time * part / parts
             for number, flow in reversed(self.terms.flows):
                 place = flow.carry(place, start, stop)
-                counters.add(number, max(axis.size for axis in place))
+                counters.evaluations[number] += max(axis.size for axis in place)
         return place
 
     def _bent(
@@ -280,7 +266,7 @@ class Simulation(Series):
             key = number, body.middle
             if key not in shifts:
                 shifts[key] = bend(surface.waves(), body.middle is not None, time)
-                counters.add(number, shifts[key].size)
+                counters.evaluations[number] += shifts[key].size
             distance = distance - shifts[key] * np.float32(surface.scale)
         return distance
 
@@ -331,7 +317,7 @@ class Simulation(Series):
         spread, vertex = 4 * self.terms.diffusivity * time, VERTEX_WIDTH**2
         if spread:
             for number in self.terms.spreads:
-                counters.add(number, 1 if stretch is None else stretch[0].size)
+                counters.evaluations[number] += 1 if stretch is None else stretch[0].size
         if stretch is None:
             return min(vertex * max(self.terms.spacing) ** 2 + spread, MAX_WIDENING)
         change, steepest = stretch
@@ -439,7 +425,7 @@ def counts(simulation: Simulation) -> dict[str, Any]:
     kinds = {kind: {"made": 0, "places": 0} for kind in EFFECTS}
     for number, effect in enumerate(simulation.scene.effects):
         kinds[effect.kind]["made"] += number not in terms.idle
-        kinds[effect.kind]["places"] += counters.evaluations.get(number, 0)
+        kinds[effect.kind]["places"] += counters.evaluations[number]
     return {
         "frames": counters.frames,
         "vertices": counters.vertices,

@@ -214,3 +214,112 @@ def waves(shape: tuple[int, ...] = (20, 17, 30), pace: float = 1.0) -> np.ndarra
     z, y, x = np.meshgrid(*(np.linspace(0, pace, size) for size in shape), indexing="ij")
     values = 0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)
     return values.astype(np.float32)
+
+
+CENTRAL: dict[str, Any] = {
+    "effects": {
+        "shading": {"light": [1, 2, 3], "gradient": "central"},
+        "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        "buffers": ["depth", "normal"],
+    }
+}
+"""A scene with gradients by central differences."""
+
+SCENES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "shaded": {"effects": {"shading": {"light": [1, 2, 3]}}},
+    "surfaces": {
+        "effects": {
+            "isosurfaces": [{"value": 3, "opacity": 0.4}, {"value": 6}],
+            "buffers": ["depth", "normal"],
+        }
+    },
+    "surfaces alone": {
+        "transfer_function": {"nothing": True},
+        "effects": {"isosurfaces": [{"value": 5}]},
+    },
+    "maximum": {"effects": {"maximum_intensity": True, "buffers": ["depth"]}},
+    "maximum and surface": {
+        "effects": {"maximum_intensity": True, "isosurfaces": [{"value": 5, "opacity": 0.5}]}
+    },
+    "minimum": {"effects": {"minimum_intensity": True, "buffers": ["depth"]}},
+    "average": {"effects": {"average_intensity": True, "buffers": ["depth"]}},
+    "attenuated": {"effects": {"attenuated_maximum_intensity": {"attenuation": 0.3}}},
+    "average and surface": {
+        "effects": {"average_intensity": True, "isosurfaces": [{"value": 5, "opacity": 0.5}]}
+    },
+    "graded": {"transfer_function": {"gradient_opacity": [[0.02, 0], [0.15, 1]]}},
+    "graded and lit": {
+        "transfer_function": {"gradient_opacity": [[0, 1], [0.1, 0.2]]},
+        "effects": {
+            "shadows": True,
+            "ambient_occlusion": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        },
+    },
+    "graded by central differences": {
+        "transfer_function": {"gradient_opacity": [[0, 0.1], [0.05, 1], [0.1, 0]]},
+        "effects": {"shading": {"gradient": "central"}},
+    },
+    "clipped": {
+        "effects": {
+            "clip": {"x": [4.3, 20], "z": [None, 11]},
+            "shading": True,
+            "buffers": ["depth", "normal"],
+        }
+    },
+    "clipped by planes": {
+        "effects": {
+            "clip": {
+                "planes": [
+                    {"normal": [1, 1, 0.5], "point": [12, 10, 9]},
+                    {"normal": [0, -1, 0], "offset": -17.5},
+                ]
+            },
+            "shadows": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        }
+    },
+    "jitter": {"effects": {"jitter": True, "antialiasing": 2}},
+    "narrow": {
+        "transfer_function": {"opacity": [[4, 0], [4.5, 0.9], [5, 0]]},
+        "effects": {"buffers": ["depth", "normal"]},
+    },
+    "opaque": {"transfer_function": {"opacity": [[2, 0], [4, 1]]}},
+    "inside": {"camera": {"position": [9, 10, 9], "focal_point": [20, 14, 12]}},
+    "shadows": {"effects": {"shadows": True}},
+    "all light": {
+        "effects": {
+            "shadows": True,
+            "ambient_occlusion": True,
+            "shading": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        }
+    },
+    "parallel": {"camera": {"view": "xy", "projection": "parallel"}, "effects": {"shading": True}},
+    "between": {"step": 0.5},
+    "zoomed": {"camera": {"zoom": 8}},
+    "unskipped": {"march": {"skipping": False}},
+    "long steps": {"march": {"step": 20}, "effects": {"isosurfaces": [{"value": 5}]}},
+    "central": CENTRAL,
+}
+"""Scenes by name: one for each thing that a march may do differently."""
+
+NETWORK_SCENES: dict[str, dict[str, Any]] = {
+    **{name: SCENES[name] for name in ("plain", "maximum", "minimum", "average", "unskipped")},
+    "between": {"step": 0.7, "effects": {"shading": True, "buffers": ["depth", "normal"]}},
+    "surfaces": {
+        "effects": {
+            "isosurfaces": [{"value": 5, "opacity": 0.5}, {"value": 7}],
+            "antialiasing": 2,
+            "jitter": True,
+        }
+    },
+    "attenuated": {"effects": {"attenuated_maximum_intensity": True}},
+    "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
+    "clipped": {
+        "effects": {"clip": {"x": [4.3, 20], "planes": [{"normal": [0, 1, 1], "offset": 20}]}}
+    },
+    "central": CENTRAL,
+}
+"""Scenes of a network."""

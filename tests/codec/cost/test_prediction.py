@@ -47,7 +47,6 @@ from fhash_codec.cost.prediction import (
     Prediction,
     Predictor,
     choose,
-    predict,
 )
 from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
 from fhash_codec.cost.results import CostReport, Encoded, advise, bytes_text, told
@@ -138,26 +137,25 @@ def waves(shape: tuple[int, int, int, int] = (6, 8, 24, 24)) -> npt.NDArray[np.f
     return (np.sin(0.3 * x + 0.2 * y + 0.1 * t) * np.cos(0.2 * z)).astype(np.float32)
 
 
+def predicted(values: npt.NDArray[np.generic], *configs: EncodeConfig) -> list[Prediction]:
+    with time_budget.predictor(ArraySeries(values)) as one:
+        return [one.predict(config) for config in configs]
+
+
 def only(values: npt.NDArray[np.generic], **settings: object) -> Prediction:
-    (prediction,) = predict(ArraySeries(values), [EncodeConfig.from_dict(settings)])
+    (prediction,) = predicted(values, EncodeConfig.from_dict(settings))
     return prediction
 
 
 def test_each_setting_has_a_prediction() -> None:
     configs = [EncodeConfig(psnr=psnr, effort=effort) for psnr in (40.0, 60.0) for effort in (1, 2)]
-    told: list[tuple[int, int]] = []
-    predictions = predict(
-        ArraySeries(waves()),
-        configs,
-        progress=lambda _, done, total, __: told.append((done, total)),
-    )
+    predictions = predicted(waves(), *configs)
     coarse, _, fine, _ = predictions
     assert coarse.bytes is not None
     assert fine.bytes is not None
     assert 0 < coarse.bytes < fine.bytes
     assert fine.psnr is not None
     assert fine.psnr >= 60
-    assert told == [(n, 4) for n in range(5)]
     for prediction in predictions:
         assert prediction.seconds == pytest.approx(sum(prediction.stages.values()))
         assert prediction.basis

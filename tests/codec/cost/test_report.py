@@ -66,13 +66,9 @@ def test_curves_of_their_own_keep_their_style_and_differ() -> None:
 
 
 def test_a_plot_with_one_curve() -> None:
-    empty = Panel(
-        key="a", section="read", title="b", x=Axis(label="step"), y=Axis(label="dB"), traces=()
-    )
-    panel = single(empty, [0.0, 1.0], [40.0, 41.5])
+    panel = single(Panel("a", "read", "b", Axis("step"), Axis("dB")), [0.0, 1.0], [40.0, 41.5])
     assert [trace.y for trace in panel.traces] == [(40.0, 41.5)]
     assert panel.traces[0].text == ("0: 40", "1: 41.5")
-    assert panel.to_dict()["x"] == {"label": "step", "unit": "", "log": False, "reversed": False}
 
 
 def test_every_plot_has_points_a_label_and_its_own_key(report: CostReport) -> None:

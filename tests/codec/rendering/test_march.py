@@ -340,12 +340,6 @@ def test_threads_make_the_same_picture() -> None:
     assert by_one.counters == by_four.counters
 
 
-@pytest.mark.parametrize("step", [0.0, -1.0, float("nan")])
-def test_a_step_of_no_length_is_refused(step: float) -> None:
-    with pytest.raises(InputError, match="above 0"):
-        march(frame_of(np.zeros((3, 3, 3))), task_of((3, 3, 3), None, step=step))
-
-
 def test_too_many_surfaces_are_refused() -> None:
     surfaces = tuple(Surface(value=float(n), colour=WHITE, opacity=0.5) for n in range(65))
     with pytest.raises(InputError, match="64"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import itertools
 import subprocess
@@ -40,22 +39,7 @@ from fhash_codec.rendering.layout import (
 )
 from fhash_codec.rendering.march_task import Units
 from fhash_codec.rendering.renderer import evolution
-from fhash_codec.rendering.scenes import (
-    Camera,
-    Effects,
-    Evolution,
-    LegendEntry,
-    scene_in_png,
-)
-from fhash_codec.rendering.scenes import (
-    Scene as Scene_evolution,
-)
-from fhash_codec.rendering.scenes import (
-    Scene as Scene_image,
-)
-from fhash_codec.rendering.scenes import (
-    Scene as Scene_layout,
-)
+from fhash_codec.rendering.scenes import Camera, Effects, Evolution, LegendEntry, scene_in_png
 from fhash_codec.rendering.view import edges
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.series import Coordinate
@@ -102,11 +86,8 @@ def test_importing_the_package_loads_no_renderer() -> None:
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-SMALL_RENDERER = {"size": [40, 32]}
-
-
 def scene(**parts: Any) -> Scene:
-    return Scene.from_dict({**SMALL_RENDERER, **parts})
+    return Scene.from_dict({"size": [40, 32], **parts})
 
 
 def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
@@ -304,15 +285,14 @@ def test_nothing_outside_a_clip_is_decoded_or_evaluated(
     assert part.counters["evaluations"] <= part.counters["samples"]
 
 
-SMALL_EVOLUTION = Scene_evolution(size=(20, 14))
+def of_steps(**fields: Any) -> Scene:
+    return Scene(**{"size": (20, 14), **fields})
 
 
 def test_an_evolution_is_a_grid_of_its_steps(volume: Volume, drawing: Any) -> None:
     draw = drawing()
     asked = Evolution(steps=(0.0, 1.0, 2.5, 3.0, 4.0), columns=3)
-    scene = dataclasses.replace(
-        SMALL_EVOLUTION, effects=Effects(colour_bar=True), background="transparent", evolution=asked
-    )
+    scene = of_steps(effects=Effects(colour_bar=True), background="transparent", evolution=asked)
     image = evolution(volume, scene, draw=draw)
     assert image.rgba.shape == (2 * 14 + 1, 3 * 20 + 2, 4)
     for number, step in enumerate([0, 1, 2.5, 3, 4]):
@@ -325,7 +305,7 @@ def test_an_evolution_is_a_grid_of_its_steps(volume: Volume, drawing: Any) -> No
     assert all(each.effects.time_label for each in draw.scenes)
     assert image.counters == {"rays": 5 * 280}
     assert image.seconds == 2.5
-    assert Scene_evolution.from_dict(image.scene) == scene
+    assert Scene.from_dict(image.scene) == scene
 
 
 @pytest.mark.parametrize(
@@ -335,9 +315,7 @@ def test_an_evolution_is_a_grid_of_its_steps(volume: Volume, drawing: Any) -> No
 def test_an_evolution_is_wider_than_high(
     count: int, size: tuple[int, int], columns: int, volume: Volume, drawing: Any
 ) -> None:
-    scene = dataclasses.replace(
-        SMALL_EVOLUTION, size=size, evolution=Evolution(steps=(0.0,) * count)
-    )
+    scene = of_steps(size=size, evolution=Evolution(steps=(0.0,) * count))
     image = evolution(volume, scene, draw=drawing())
     assert image.rgba.shape[1] // size[0] == columns
 
@@ -348,25 +326,16 @@ def test_evolutions_that_cannot_be(volume: Volume, drawing: Any) -> None:
         ([0], 2, (9, 9), "columns"),
         ([0] * 9, 9, (9999, 9), "pixels"),
     ):
+        given = of_steps(size=size, evolution=Evolution(steps=steps, columns=columns))
         with pytest.raises(InputError, match=part):
-            evolution(
-                volume,
-                dataclasses.replace(
-                    SMALL_EVOLUTION, size=size, evolution=Evolution(steps=steps, columns=columns)
-                ),
-                draw=drawing(),
-            )
+            evolution(volume, given, draw=drawing())
     with pytest.raises(InputError, match="at least one"):
-        evolution(volume, SMALL_EVOLUTION, draw=drawing())
-    with pytest.raises(InputError, match="steps of its own"):
-        dataclasses.replace(SMALL_EVOLUTION, step=1.0, evolution=Evolution(steps=(0.0,)))
+        evolution(volume, of_steps(), draw=drawing())
     with pytest.raises(InputError, match="the scene is an evolution"):
-        Renderer(volume).plan(
-            dataclasses.replace(SMALL_EVOLUTION, evolution=Evolution(steps=(0.0,)))
-        )
+        Renderer(volume).plan(of_steps(evolution=Evolution(steps=(0.0,))))
 
 
-SCENE = Scene_image(
+SCENE = Scene(
     size=(3, 2), camera=Camera(view="xz", position=(1.5, 2.0, 3.25)), background="#204060", step=3.5
 )
 
@@ -411,7 +380,7 @@ def test_a_jpeg_holds_the_pixels(tmp_path: Path, suffix: str) -> None:
 def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"written as \.png, \.jpg or \.jpeg"):
         image().save(tmp_path / "view.gif")
-    clear = image(scene=Scene_image(background="transparent").to_dict())
+    clear = image(scene=Scene(background="transparent").to_dict())
     with pytest.raises(InputError, match="JPEG cannot be transparent"):
         clear.save(tmp_path / "view.jpg")
     assert not list(tmp_path.iterdir())
@@ -458,7 +427,7 @@ def drawn(
     **camera: Any,
 ) -> Image:
     rgba = np.zeros((size[1], size[0], 4), dtype=np.float32)
-    scene = Scene_image(background=background, size=size, effects=effects, camera=Camera(**camera))
+    scene = Scene(background=background, size=size, effects=effects, camera=Camera(**camera))
     colours = named_map("plasma").rescaled(-3, 5)
     layout, rays = lay_out(scene, GRID, COORDS, colours, "speed [m/s]")
     left, top, width, height = layout.view
@@ -644,7 +613,7 @@ def laid_out(
     **camera: Any,
 ) -> tuple[Layout, Rays]:
     axes = coords(kind)
-    scene = Scene_layout(size=size, effects=effects, camera=Camera(**camera))
+    scene = Scene(size=size, effects=effects, camera=Camera(**camera))
     colours = named_map("viridis").rescaled(LOW, HIGH)
     return lay_out(scene, Grid.of(axes), axes, colours, quantity)
 

@@ -19,9 +19,9 @@ from fhash_codec.rendering.view import (
     Body,
     edges,
     outer_edges,
-    part_in_view,
-    part_of_body,
     pixel_vertices,
+    region_in_view,
+    region_of_body,
 )
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
@@ -104,13 +104,13 @@ def test_the_region_is_that_of_whole_tiles_around_the_clip(volume: Volume) -> No
     tile = volume.chunks[1:]
     for low, high in ((0, 3), (5, 9), (17.5, 19)):
         body = body_of(grid, z=[low, high])
-        region = part_in_view(rays, volume, body)
-        assert region == part_of_body(volume, body, None)
+        region = region_in_view(rays, volume, body)
+        assert region == region_of_body(volume, body, None)
         assert region.z[0] == low // tile[0] * tile[0]
         assert region.z[1] == min(-(-(int(np.ceil(high)) + 1) // tile[0]) * tile[0], 20)
         assert (region.y, region.x) == ((0, 24), (0, 28))
-    assert part_of_body(volume, None, None) == ((0, 20), (0, 24), (0, 28))
-    wider = part_of_body(volume, body_of(grid, z=[5, 7]), None, margin=20)
+    assert region_of_body(volume, None, None) == ((0, 20), (0, 24), (0, 28))
+    wider = region_of_body(volume, body_of(grid, z=[5, 7]), None, margin=20)
     assert wider.z == (0, 20)
 
 
@@ -121,7 +121,7 @@ def test_only_what_is_in_the_picture_is_decoded(volume: Volume) -> None:
     rays = Rays.of(
         Camera(view="xy", projection="parallel", zoom=12), Grid.of(volume.coords), (64, 64)
     )
-    region = part_in_view(rays, volume)
+    region = region_in_view(rays, volume)
     origins, _ = rays.pixels()
     for axis, (low, high) in zip((1, 0), region[1:], strict=True):
         assert low <= origins[..., axis].min()
@@ -140,7 +140,7 @@ def test_no_ray_meets_the_volume_outside_the_part_in_view(
     rays = Rays.of(
         Camera(projection=projection, zoom=zoom, azimuth=20), Grid.of(volume.coords), (24, 24)
     )
-    region = part_in_view(rays, volume)
+    region = region_in_view(rays, volume)
     origin, direction = rays.pixels()
     along = np.linspace(0, 3 * float(np.linalg.norm(rays.eye)), 4000)[:, None, None, None]
     places = origin + along * direction / np.linalg.norm(
@@ -413,10 +413,15 @@ def eye(camera: Camera, grid: Grid) -> np.ndarray:
     return rays.eye * grid.spacing + grid.origin
 
 
+def path_of(cameras: tuple[Camera, ...], grid: Grid, *at: float) -> CameraPath:
+    """The path through poses, at the two ends unless it is said where."""
+    return CameraPath(at=np.array(at or (0.0, 1.0)), cameras=cameras, grid=grid, size=(40, 30))
+
+
 def test_two_poses_are_joined_at_one_speed(volume: Volume) -> None:
     grid = Grid.of(volume.coords)
     cameras = (Camera(view="xz"), Camera(view="yz"))
-    path = CameraPath(at=np.array([0.0, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
+    path = path_of(cameras, grid)
     middle = grid.corners.mean(axis=1)
     directions = [eye(path.camera(share), grid) - middle for share in np.linspace(0, 1, 7)]
     lengths = np.linalg.norm(directions, axis=1)
@@ -437,17 +442,12 @@ def test_cameras_with_the_same_above_them_stay_upright(volume: Volume) -> None:
         Camera(position=(30.0, 2.0, 4.0)),
         Camera(view="yz", azimuth=160.0, elevation=-40.0),
     )
-    path = CameraPath(at=np.array([0.0, 0.5, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
+    path = path_of(cameras, grid, 0.0, 0.5, 1.0)
     for share in np.linspace(0, 1, 21):
         rays = Rays.of(path.camera(share), grid, (40, 30))
         assert (rays.right * grid.spacing)[2] == pytest.approx(0.0, abs=1e-9)
         assert (rays.up * grid.spacing)[2] > 0
-    above = CameraPath(
-        at=np.array([0.0, 1.0]),
-        cameras=(Camera(view="iso"), Camera(view="xz", elevation=90.0)),
-        grid=grid,
-        size=(40, 30),
-    )
+    above = path_of((Camera(view="iso"), Camera(view="xz", elevation=90.0)), grid)
     for share in (0.5, 0.999):
         assert np.isfinite(eye(above.camera(share), grid)).all()
 
@@ -455,7 +455,7 @@ def test_cameras_with_the_same_above_them_stay_upright(volume: Volume) -> None:
 def test_angles_are_followed_as_given(volume: Volume) -> None:
     grid = Grid.of(volume.coords)
     cameras = (Camera(azimuth=0.0), Camera(azimuth=720.0, elevation=40.0))
-    path = CameraPath(at=np.array([0.0, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
+    path = path_of(cameras, grid)
     assert path.camera(0.25) == Camera(azimuth=180.0, elevation=10.0)
 
 
@@ -467,7 +467,7 @@ def test_a_way_through_poses_is_smooth(volume: Volume) -> None:
         Camera(view="xy", zoom=2.0),
         Camera(view="zx", elevation=20.0),
     )
-    path = CameraPath(at=np.array([0.0, 0.2, 0.7, 1.0]), cameras=cameras, grid=grid, size=(40, 30))
+    path = path_of(cameras, grid, 0.0, 0.2, 0.7, 1.0)
     for share, camera in zip(path.at, cameras, strict=True):
         for near in (max(share - 1e-7, 0), min(share + 1e-7, 1)):
             np.testing.assert_allclose(eye(path.camera(near), grid), eye(camera, grid), atol=1e-3)
@@ -557,21 +557,10 @@ def test_what_ascends_downwards(attributes: dict[str, str], down: bool) -> None:
     assert downward(coordinate([0, 1], **attributes)) is down
 
 
-def grid_grid(scale: tuple[float, float, float] | None = None, **axes: Any) -> Grid:
-    values = {"x": range(11), "y": range(11), "z": range(11), **axes}
-    given = {
-        axis: at
-        if isinstance(at, Coordinate)
-        else Coordinate(name=axis, values=np.array(list(at), dtype=np.float64))
-        for axis, at in values.items()
-    }
-    return Grid.of(given, scale)
-
-
 def test_an_uneven_axis_keeps_its_ends_and_needs_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        uneven = grid_grid(x=np.arange(11) ** 2, y=-(np.arange(11.0) ** 1.5))
+        uneven = grid(x=np.arange(11) ** 2, y=-(np.arange(11.0) ** 1.5))
     assert uneven.counts == (101, 33, 11)
     assert uneven.series_counts == (11, 11, 11)
     np.testing.assert_allclose(uneven.corners, [[0, 100], [0, -(10**1.5)], [0, 10]])
@@ -582,5 +571,5 @@ def test_an_uneven_axis_keeps_its_ends_and_needs_no_warning() -> None:
     assert uneven.coarseness[2] == 1
     # Opacities are of vertices of the series: the finer ones change nothing.
     assert uneven.series_spacing == pytest.approx((10 * 10**0.5 * 1) ** (1 / 3))
-    assert grid_grid().warp is None
-    assert grid_grid().series_spacing == grid_grid().vertex_spacing
+    assert grid().warp is None
+    assert grid().series_spacing == grid().vertex_spacing

@@ -95,7 +95,7 @@ def figure() -> Callable[[float], Check]:
 
     def make(worst: float) -> Check:
         def check(run: Run) -> list[Finding]:
-            return [Finding(name="planted", worst=worst, limit=1.0, unit="a|b")]
+            return [Finding("planted", worst, 1.0, "a|b")]
 
         return check
 

@@ -9,17 +9,17 @@ import signal
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from fhash_codec import EncodeConfig, Renderer, Volume, encode_dataset
-from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering import film as film_module
 from fhash_codec.rendering.film import Animated, Target, film, rendered_by_workers
 from fhash_codec.rendering.grid import Grid
-from fhash_codec.rendering.image import Draw, Image
+from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.scenes import (
     Camera,
     Effects,
@@ -47,16 +47,19 @@ SMALL = Scene(size=(20, 14))
 
 def animate(
     volume: Volume,
-    scene: Scene,
-    animation: Animation,
     output: Path,
+    words: str = "steps",
     *,
-    progress: Progress = silent,
-    draw: Draw | None = None,
+    scene: Scene = SMALL,
+    draw: Any = None,
     **how: Any,
 ) -> Animated:
-    target = Target(output=output, **how)
-    return film_module.animate(volume, scene, animation, target, progress=progress, draw=draw)
+    """Draw an animation by a function in place of a renderer, if one is given."""
+    animation, target = Animation.parse(words, volume), Target(output=output, **how)
+    with pytest.MonkeyPatch.context() as patch:
+        if draw is not None:
+            patch.setattr(film_module, "Renderer", lambda _: SimpleNamespace(render=draw))
+        return film_module.animate(volume, scene, animation, target)
 
 
 def read_film(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -81,9 +84,7 @@ def read_film(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 def test_a_film_shows_the_pictures_in_order(volume: Volume, tmp_path: Path, drawing: Any) -> None:
     scene = dataclasses.replace(SMALL, size=(41, 27))
-    done = animate(
-        volume, scene, Animation.parse("steps", volume), tmp_path / "a.mp4", draw=drawing()
-    )
+    done = animate(volume, tmp_path / "a.mp4", scene=scene, draw=drawing())
     assert [path.name for path in done.paths] == ["a.mp4"]
     frames = read_film(tmp_path / "a.mp4", (42, 28))
     assert len(frames) == 5
@@ -91,19 +92,17 @@ def test_a_film_shows_the_pictures_in_order(volume: Volume, tmp_path: Path, draw
 
 
 def test_a_film_of_kept_pictures_is_the_same(volume: Volume, tmp_path: Path, drawing: Any) -> None:
-    animation = Animation.parse("steps", volume)
-    scene = dataclasses.replace(SMALL, background="transparent")
-    first = animate(
-        volume, scene, animation, tmp_path / "a.mp4", pictures=tmp_path / "p.png", draw=drawing()
-    )
+    more = {
+        "scene": dataclasses.replace(SMALL, background="transparent"),
+        "pictures": tmp_path / "p.png",
+    }
+    first = animate(volume, tmp_path / "a.mp4", **more, draw=drawing())
     assert [path.name for path in first.paths] == [
         *(f"p.000{number}.png" for number in range(5)),
         "a.mp4",
     ]
     draw = drawing()
-    second = animate(
-        volume, scene, animation, tmp_path / "b.mp4", pictures=tmp_path / "p.png", draw=draw
-    )
+    second = animate(volume, tmp_path / "b.mp4", **more, draw=draw)
     assert (second.kept, draw.scenes) == (5, [])
     np.testing.assert_array_equal(
         read_film(tmp_path / "a.mp4", (20, 14)), read_film(tmp_path / "b.mp4", (20, 14))
@@ -118,7 +117,7 @@ def test_an_interrupted_film_leaves_nothing(volume: Volume, tmp_path: Path, draw
 
     for name in ("a.mp4", "a.gif"):
         with pytest.raises(KeyboardInterrupt):
-            animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / name, draw=draw)
+            animate(volume, tmp_path / name, draw=draw)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -130,7 +129,7 @@ def test_without_the_package_an_mp4_says_what_to_install(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     draw = drawing()
     with pytest.raises(MissingDependencyError, match=r"fhash\[video\]"):
-        animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / "a.mp4", draw=draw)
+        animate(volume, tmp_path / "a.mp4", draw=draw)
     assert draw.scenes == []
 
 
@@ -143,29 +142,21 @@ def test_an_encoder_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
-def test_processes_write_the_files_of_one(volume: Volume, tmp_path: Path, drawing: Any) -> None:
-    animation = Animation.parse("steps=0:4:2,orbit=60", volume)
-    (tmp_path / "b").mkdir()
-    one = animate(volume, SMALL, animation, tmp_path / "a.gif", pictures=tmp_path / "a.png")
+def test_processes_write_the_files_of_one(volume: Volume, tmp_path: Path) -> None:
+    words, there = "steps=0:4:2,orbit=60", tmp_path / "b"
+    there.mkdir()
+    one = animate(volume, tmp_path / "a.gif", words, pictures=tmp_path / "a.png")
     first = one.paths[0]
     # A picture that is there already is kept.
-    (tmp_path / "b" / first.name).write_bytes(first.read_bytes())
-    two = animate(
-        volume,
-        SMALL,
-        animation,
-        tmp_path / "b" / "a.gif",
-        pictures=tmp_path / "b" / "a.png",
-        processes=2,
-    )
+    (there / first.name).write_bytes(first.read_bytes())
+    two = animate(volume, there / "a.gif", words, pictures=there / "a.png", processes=2)
     assert (one.rendered, two.rendered, two.kept) == (3, 2, 1)
     for before, after in zip(one.paths, two.paths, strict=True):
         assert before.name == after.name
         assert before.read_bytes() == after.read_bytes()
     assert not multiprocessing.active_children()
-    for processes, draw in ((0, None), (2, drawing())):
-        with pytest.raises(InputError, match=f"processes is {processes}"):
-            animate(volume, SMALL, animation, tmp_path / "c.gif", processes=processes, draw=draw)
+    with pytest.raises(InputError, match="processes is 0"):
+        animate(volume, tmp_path / "c.gif", words, processes=0)
 
 
 def test_a_process_opens_the_same_variable(tmp_path: Path) -> None:
@@ -208,7 +199,7 @@ def test_pictures_that_are_not_right_are_replaced_only_by_force(
     spoil: str, volume: Volume, tmp_path: Path, drawing: Any
 ) -> None:
     animation, output = Animation.parse("steps", volume), tmp_path / "a.png"
-    paths = animate(volume, SMALL, animation, output, draw=drawing()).paths
+    paths = animate(volume, output, draw=drawing()).paths
     scene = SMALL
     if spoil == "cut":
         paths[2].write_bytes(paths[2].read_bytes()[:-20])
@@ -225,9 +216,9 @@ def test_pictures_that_are_not_right_are_replaced_only_by_force(
         )
     draw = drawing()
     with pytest.raises(OutputExistsError, match=r"a\.000"):
-        animate(volume, scene, animation, output, draw=draw)
+        animate(volume, output, scene=scene, draw=draw)
     assert draw.scenes == []
-    done = animate(volume, scene, animation, output, force=True, draw=draw)
+    done = animate(volume, output, scene=scene, force=True, draw=draw)
     assert done.rendered == (5 if spoil == "scene" else 1)
     assert [scene_in_png(path) for path in paths] == animation.scenes(scene, volume)
 
@@ -240,28 +231,26 @@ def test_pictures_with_buffers_are_kept_only_with_them(
     def draw(each: Scene, *, upcoming: Scene | None = None) -> Image:
         return dataclasses.replace(drawing()(each), depth=np.ones((14, 20), dtype=np.float32))
 
-    animation, output = Animation.parse("steps=0:1", volume), tmp_path / "a.png"
-    animate(volume, scene, animation, output, draw=draw)
-    assert animate(volume, scene, animation, output, draw=draw).kept == 2
+    given, more = (volume, tmp_path / "a.png", "steps=0:1"), {"scene": scene, "draw": draw}
+    animate(*given, **more)
+    assert animate(*given, **more).kept == 2
     (tmp_path / "a.0001.depth.npy").unlink()
-    assert animate(volume, scene, animation, output, draw=draw, force=True).kept == 1
+    assert animate(*given, **more, force=True).kept == 1
 
 
 def test_longer_animations_of_the_name_are_mentioned(
     volume: Volume, tmp_path: Path, drawing: Any
 ) -> None:
-    animate(volume, SMALL, Animation.parse("steps", volume), tmp_path / "a.png", draw=drawing())
+    animate(volume, tmp_path / "a.png", draw=drawing())
     with pytest.warns(FhashWarning, match=r"a\.0003\.png and 1 more"):
-        animate(
-            volume, SMALL, Animation.parse("steps=0:2", volume), tmp_path / "a.png", draw=drawing()
-        )
+        animate(volume, tmp_path / "a.png", "steps=0:2", draw=drawing())
 
 
 def test_outputs_of_other_kinds_are_refused(volume: Volume, tmp_path: Path, drawing: Any) -> None:
-    animation, draw = Animation.parse("steps", volume), drawing()
+    draw = drawing()
     for output, pictures in (("a.avi", None), ("a.png", "b.png"), ("a.gif", "b.jpg")):
         with pytest.raises(InputError, match="use such a name"):
-            animate(volume, SMALL, animation, tmp_path / output, pictures=pictures, draw=draw)
+            animate(volume, tmp_path / output, pictures=pictures, draw=draw)
     assert draw.scenes == []
     assert list(tmp_path.iterdir()) == []
 

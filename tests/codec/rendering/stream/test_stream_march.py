@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from frame_field import FrameField
+from frame_field import CENTRAL, NETWORK_SCENES, SCENES, FrameField
 
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
@@ -148,6 +148,7 @@ def frame_picture(planned: Planned, volume: Volume) -> Callable[[str, dict[str, 
     return of
 
 
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_three_ways_make_one_picture(frame_picture: FramePicture, scene: dict[str, Any]) -> None:
     cache, streamed, adaptive = (frame_picture(mode, scene) for mode in ("cache", "stream", "arm"))
     assert cache.rgba[..., 3].max() > 0.05
@@ -215,25 +216,16 @@ NETWORK: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("step", [0.0, 0.7])
-def test_both_ways_make_the_same_picture_of_a_network(files: dict[str, Path], step: float) -> None:
-    with fhash_codec.open(files["paper"]) as network:
-        streamed, adaptive = (
-            picture(Renderer(network), mode, {**NETWORK, "step": step})
-            for mode in ("stream", "arm")
-        )
-    assert streamed.rgba[..., 3].max() > 0.05
-    np.testing.assert_array_equal(streamed.rgba, adaptive.rgba)
-
-
-@pytest.mark.parametrize("step", [0.0, 0.7])
-def test_the_picture_of_a_network_is_near_that_of_its_vertices(
+def test_both_ways_make_one_picture_of_a_network_near_that_of_its_vertices(
     files: dict[str, Path], step: float
 ) -> None:
     with fhash_codec.open(files["paper"]) as network:
-        cache, streamed = (
+        cache, streamed, adaptive = (
             picture(Renderer(network), mode, {**NETWORK, "step": step}).rgba
-            for mode in ("cache", "stream")
+            for mode in ("cache", "stream", "arm")
         )
+    assert streamed[..., 3].max() > 0.05
+    np.testing.assert_array_equal(streamed, adaptive)
     assert np.isfinite(streamed).all()
     # Between vertices the network has values of its own: they make all the difference.
     assert np.mean(np.abs(streamed - cache)) < 0.02
@@ -252,6 +244,7 @@ def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> No
     assert alike == here.counters
 
 
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_torch_makes_the_picture_of_numpy(
     planned: Planned, volume: Volume, tensors: Arrays, scene: dict[str, Any], adaptive: bool
@@ -309,18 +302,18 @@ def test_nothing_leaves_the_device_before_the_picture(
     assert sorted(taken) == [rays, 3 * rays, 4 * rays]
 
 
+@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
 def test_torch_marches_through_a_network_as_numpy_does(
-    planned: Planned, files: dict[str, Path], tensors: Arrays, network_scene: dict[str, Any]
+    planned: Planned, files: dict[str, Path], tensors: Arrays, scene: dict[str, Any]
 ) -> None:
     with fhash_codec.open(files["paper"]) as network:
         here, there = (
-            stream(*planned(network, network_scene, arrays), adaptive=True)
-            for arrays in (NUMPY, tensors)
+            stream(*planned(network, scene, arrays), adaptive=True) for arrays in (NUMPY, tensors)
         )
     assert here.rgba[..., 3].max() > 0.05
     np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
     assert there.counters["evaluations"] > 0
-    assert_same_work(here, there, network_scene)
+    assert_same_work(here, there, scene)
     if here.normal is not None:
         assert here.normal.any()
         np.testing.assert_allclose(there.depth, here.depth, atol=1e-3)
@@ -329,7 +322,7 @@ def test_torch_marches_through_a_network_as_numpy_does(
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])
 def test_cuda_makes_the_picture_of_numpy(
-    files: dict[str, Path], planned: Planned, central_scene: dict[str, Any], kind: str
+    files: dict[str, Path], planned: Planned, kind: str
 ) -> None:
     import torch
 
@@ -337,7 +330,7 @@ def test_cuda_makes_the_picture_of_numpy(
         pytest.skip("no CUDA device")
     with fhash_codec.open(files[kind]) as opened:
         here, there = (
-            stream(*planned(opened, central_scene, arrays_on(device)), adaptive=True)
+            stream(*planned(opened, CENTRAL, arrays_on(device)), adaptive=True)
             for device in ("cpu", "cuda")
         )
     assert here.rgba[..., 3].max() > 0.05

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from frame_field import FrameField
+from frame_field import NETWORK_SCENES, SCENES, FrameField
 from pretended_cuda import CUDA, MixedDevices, pretended_cuda
 
 import fhash_codec
@@ -33,35 +33,8 @@ WAITS = 8
 """Waits that a pass may take."""
 WAITS_WITH_SURFACES = 14
 """Waits that a pass may take with surfaces, whose search ends when all of a pass are found."""
-FRAMES: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "surfaces and buffers": {
-        "effects": {"isosurfaces": [{"value": 3, "opacity": 0.4}], "buffers": ["depth", "normal"]}
-    },
-    "maximum": {"effects": {"maximum_intensity": True, "buffers": ["depth"]}},
-    "graded": {"transfer_function": {"gradient_opacity": [[0.02, 0], [0.15, 1]]}},
-    "all light": {
-        "effects": {
-            "shadows": True,
-            "ambient_occlusion": True,
-            "shading": True,
-            "isosurfaces": [{"value": 5, "opacity": 0.5}],
-        }
-    },
-}
-"""Scenes of a decoded frame."""
-
-
-NETWORKS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "shaded": {"step": 0.7, "effects": {"shading": True, "buffers": ["depth", "normal"]}},
-    "central": {"effects": {"shading": {"gradient": "central"}}},
-    "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
-    "surfaces": {"effects": {"isosurfaces": [{"value": 5, "opacity": 0.5}, {"value": 7}]}},
-    "attenuated": {"effects": {"attenuated_maximum_intensity": True}},
-    "unskipped": {"march": {"skipping": False}},
-}
-"""Scenes of a network for the fused kernels."""
+FRAMES = ("plain", "surfaces", "maximum", "graded", "all light")
+NETWORKS = ("plain", "between", "central", "graded", "surfaces", "attenuated", "unskipped")
 
 
 def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, Any]) -> None:
@@ -85,7 +58,7 @@ def assert_a_pass_waits_little(planned: Planned, path: Path, scene: dict[str, An
 def test_a_pass_through_a_frame_waits_little(
     planned: Planned, files: dict[str, Path], scene: str
 ) -> None:
-    assert_a_pass_waits_little(planned, files["compact"], FRAMES[scene])
+    assert_a_pass_waits_little(planned, files["compact"], SCENES[scene])
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +93,7 @@ def test_a_pass_through_fused_kernels_waits_little(
             return plain(self, places)
 
         monkeypatch.setattr(FusedPoints, name, watched)
-    assert_a_pass_waits_little(planned, files["paper"], NETWORKS[scene])
+    assert_a_pass_waits_little(planned, files["paper"], NETWORK_SCENES[scene])
     assert "values" in used
 
 
