@@ -197,7 +197,8 @@ def _stored_in(arrays: Mapping[str, zarr.Array[Any]], group: str) -> Sequence[tu
             continue
         stored = Stored(
             dimensions=tuple(
-                name or f"{own}_dim_{number}" for number, name in enumerate(dimension_names(array))
+                f"{own}_dim_{number}" if name is None else name
+                for number, name in enumerate(dimension_names(array))
             ),
             shape=array.shape,
             dtype=np.dtype(array.dtype),
