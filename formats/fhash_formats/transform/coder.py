@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.values import Integers, Mask
 
 Table = npt.NDArray[np.int32]
 """Bands in the order in which they are coded, int32 of shape (bands, COLUMNS)."""
@@ -196,8 +197,6 @@ NO_MEMORY = -2
 NO_TRELLIS = -3
 """Code of an encoder that met an integer which its quantiser does not have, as in
 native/coder_contexts.hpp."""
-
-Integers = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -454,8 +453,6 @@ class MaskLevels:
         checked(code)
         return first, second
 
-
-Mask = npt.NDArray[np.bool_]
 
 MASK_LEVELS = 32
 """Levels of a vertex; each has a set of mixing weights."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.threads import in_threads
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.coder import decode_integers, single_band
 from fhash_formats.transform.lifting import Transform, band_table
 from fhash_formats.transform.predict import Predictor, decode_predicted, values_of
@@ -42,9 +43,6 @@ from fhash_formats.transform.values import (
     dequantise,
 )
 
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
 Decoded = tuple[Values, Mask | None]
 """Values in the type of the source, and which are occupied; None for a stream without a mask."""
 

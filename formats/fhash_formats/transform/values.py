@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
+from fhash_formats.support.values import Integers, Mask, Values
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""
@@ -22,7 +23,6 @@ Plain rounding adds 0.5. Less makes smaller integers near zero, which take fewer
 LARGEST = 1_000_000_000.0
 """Largest magnitude of an integer; larger ones are clipped."""
 
-Values = npt.NDArray[Any]
 Offsets = tuple[int, ...]
 """Six reconstruction offsets by magnitude, in 1/OFFSET_UNIT step; see `dequantise`."""
 
@@ -78,9 +78,6 @@ def dequantise(
     )
     return result
 
-
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
 
 _INT64 = np.iinfo(np.int64)
 

@@ -177,7 +177,7 @@ def test_shards_need_the_feature(tmp_path, samples) -> None:
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         for name, array in samples.arrays(header).items():
             writer.add_whole(name, array)
-        writer.add_sharded(
+        writer.add_array(
             NAME,
             shape=(2,),
             dtype="uint8",

@@ -307,7 +307,7 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
             "chunk_shape": tile.shape,
             "shard_shape": (steps, 64, 64, 128),
         }
-        writer.add_sharded(
+        writer.add_array(
             "tables/level_1",
             dtype=tile.dtype,
             chunks=[tile] * 8,
