@@ -285,7 +285,7 @@ class Sharding:
         """Bytes of the index of a shard with its CRC-32C."""
         return prod(self.counts) * ENTRY_BYTES + _CRC.size
 
-    def place(self, index: Index) -> tuple[Index, int]:
+    def locate(self, index: Index) -> tuple[Index, int]:
         """The shard in which the inner chunk `index` of an array lies, and its number there."""
         places = [divmod(i, count) for i, count in zip(index, self.counts, strict=True)]
         number = 0
@@ -293,7 +293,7 @@ class Sharding:
             number = number * count + local
         return tuple(shard for shard, _ in places), number
 
-    def parts(self, spans: Sequence[range]) -> Iterator[tuple[Index, list[range]]]:
+    def by_shard(self, spans: Sequence[range]) -> Iterator[tuple[Index, list[range]]]:
         """The shards of some inner chunks of an array, and the inner chunks in each, by axis.
 
         spans: of inner chunks along each axis.
@@ -322,7 +322,7 @@ class Sharding:
     def present(self, shard: Index, shape: Sequence[int]) -> npt.NDArray[np.bool_]:
         """A mask (chunks of the shard,) of those that are present: they hold a vertex of the array.
 
-        `shape` is that of the array; the numbers of the inner chunks are those of `place`.
+        `shape` is that of the array; the numbers of the inner chunks are those of `locate`.
         """
         present = np.ones(1, dtype=bool)
         for s, count, chunk, n in zip(shard, self.counts, self.chunk_shape, shape, strict=True):

@@ -180,8 +180,8 @@ class RemoteSource(Source):
             if mine:
                 with suppress(ValueError):
                     self._waiting.remove(fetch)
-            if fetch.request.place in self._kept:
-                self._kept.move_to_end(fetch.request.place)
+            if fetch.request.span in self._kept:
+                self._kept.move_to_end(fetch.request.span)
         self._begin_more()
         if mine:
             self._run(fetch)
@@ -220,9 +220,9 @@ class RemoteSource(Source):
             return
         with self._lock:
             announced = self._fetches.get(request.ranges[0]) is fetch
-            if announced and request.place not in self._kept:
-                self._kept[request.place] = fetch
-                insort(self._kept_places, request.place)
+            if announced and request.span not in self._kept:
+                self._kept[request.span] = fetch
+                insort(self._kept_places, request.span)
                 self._kept_bytes += request.size
                 while self._kept_bytes > KEPT_BYTES:
                     place, dropped = self._kept.popitem(last=False)

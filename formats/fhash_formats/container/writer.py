@@ -34,9 +34,9 @@ from fhash_formats.container.hierarchy import (
     SHARES,
     SHOWN_ATTRIBUTES,
     VARIABLES,
+    array_path,
     consolidated,
     free_node,
-    part_place,
     shows_values,
 )
 from fhash_formats.container.reader import Container
@@ -662,7 +662,7 @@ class ContainerWriter:
             return self._node_of(name.removeprefix(COORDINATES))
         variable = self._current()
         return (
-            variable.node if name == TABLE and variable.shown else part_place(variable.number, name)
+            variable.node if name == TABLE and variable.shown else array_path(variable.number, name)
         )
 
     def _add(self, name: str, key: str, parts: Sequence[bytes]) -> None:

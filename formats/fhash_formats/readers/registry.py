@@ -280,10 +280,10 @@ def open_whole(path: str | Path, request: Request) -> Series:
         if pages is not None:
             warn_of_gaps(text, files)
             return pages.as_asked(request)
-    return JoinedSeries(text, files, lambda file: _open_part(file, request))
+    return JoinedSeries(text, files, lambda file: _open_of_pattern(file, request))
 
 
-def _open_part(path: Path, request: Request) -> FileSeries:
+def _open_of_pattern(path: Path, request: Request) -> FileSeries:
     """Open one file of a pattern."""
     part = _open_one(path, replace(request, digested=False))
     if isinstance(part, FileSeries):

@@ -326,7 +326,7 @@ class ZarrTree(FileOfArrays):
 
     def _stated(self, variable: Variable) -> list[Dimension]:
         path, array = variable.handle
-        columns = self._places(path)
+        columns = self._near_columns(path)
         stored = zip(dimension_names(array), array.shape, strict=True)
         return [
             *(_dimension(columns, name, length) for name, length in stored),
@@ -347,7 +347,7 @@ class ZarrTree(FileOfArrays):
 
     def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes: those along a dimension by its name, else by their own name."""
-        columns = self._places(variable.handle[0])
+        columns = self._near_columns(variable.handle[0])
         lower = [{name.lower(): column for name, column in place.items()} for place in columns]
         certain = self.request.axes is not None or all(
             dimension.role is not None for dimension in layout.kept
@@ -381,7 +381,7 @@ class ZarrTree(FileOfArrays):
             coords |= {} if written is None else {"t": written}
         return coords
 
-    def _places(self, path: str) -> list[dict[str, Column]]:
+    def _near_columns(self, path: str) -> list[dict[str, Column]]:
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]

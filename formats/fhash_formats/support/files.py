@@ -440,7 +440,7 @@ def replacing_all(
         # own; then all can be undone.
         with signals_held():
             for output in outputs:
-                output.place(force, directory)
+                output.take_name(force, directory)
         for folder in {output.target.parent for output in outputs}:
             sync_folder(folder)
     except BaseException as error:
@@ -495,7 +495,7 @@ class _Output:
         self.old = self.target.with_name(stem + OLD)
         self.placed = False
 
-    def place(self, force: bool, directory: bool) -> None:
+    def take_name(self, force: bool, directory: bool) -> None:
         """Give the temporary its final name.
 
         An older output stays under the name `old` until `forget_old` or `undo`.

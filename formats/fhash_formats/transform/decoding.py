@@ -395,7 +395,7 @@ Part = tuple[slice, ...]
 def uncorrected(
     data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: TileSettings, part: Part
 ) -> Values | None:
-    """The values of a tile before its head, where nothing but `corrected_part` is left to do.
+    """The values of a tile before its head, where nothing but `corrected_region` is left to do.
 
     They are less the origin of the settings. None for other tiles, and where the part is a large
     one.
@@ -414,7 +414,7 @@ def uncorrected(
     return table_about_origin(stream, shape, dtype, settings)[0]
 
 
-def corrected_part(
+def corrected_region(
     table: Values, part: Part, dtype: npt.DTypeLike, settings: TileSettings
 ) -> Values:
     """A part of the values of a tile, as `decode_tile` gives them, in a new array.

@@ -498,9 +498,9 @@ def test_the_parts_of_shards_hold_each_chunk_once() -> None:
     sharding = Sharding(shard_shape=(4, 6), chunk_shape=(2, 2), codecs=())
     spans = [range(1, 5), range(2, 4)]
     chunks = []
-    for shard, in_shard in sharding.parts(spans):
+    for shard, in_shard in sharding.by_shard(spans):
         for index in product(*in_shard):
-            assert sharding.place(index)[0] == shard
+            assert sharding.locate(index)[0] == shard
             chunks.append(index)
     assert sorted(chunks) == list(product(*spans))
 

@@ -43,7 +43,7 @@ from fhash_formats.container.hierarchy import (
     NODE,
     SHARES,
     VARIABLES,
-    part_place,
+    array_path,
     read_variables,
 )
 from fhash_formats.container.record import MAX_DEPTH, dumps, loads
@@ -659,7 +659,7 @@ def test_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
 
 
 def test_paths_are_those_of_the_document(tmp_path) -> None:
-    assert f"`{part_place(0, 'mlp/weight_1')}` is `mlp/weight_1`" in DOCUMENT
+    assert f"`{array_path(0, 'mlp/weight_1')}` is `mlp/weight_1`" in DOCUMENT
     assert f"`{NODE.pattern}`" in DOCUMENT
 
 

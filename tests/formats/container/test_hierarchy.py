@@ -26,7 +26,7 @@ from fhash_formats.container import (
     record as strict_json,
 )
 from fhash_formats.container.array import ArrayMetadata, plain_codecs, with_crc32c
-from fhash_formats.container.hierarchy import free_node, part_place, shows_values
+from fhash_formats.container.hierarchy import array_path, free_node, shows_values
 from fhash_formats.container.source_entry import MAX_BYTES, MAX_INLINE, check_source, read_metadata
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.series import Coordinate, SourceMetadata, SourceVariable, index_coordinate
@@ -168,8 +168,8 @@ def test_names_at_the_root(wish, taken, node) -> None:
 
 
 def test_places_of_parts_are_told_apart() -> None:
-    assert part_place(0, "mlp/weight_1") == "parts/0.mlp.weight_1"
-    places = [part_place(7, name) for name in ("a/b.c", "a.b/c", "a/b/c", "a.b.c")]
+    assert array_path(0, "mlp/weight_1") == "parts/0.mlp.weight_1"
+    places = [array_path(7, name) for name in ("a/b.c", "a.b/c", "a/b/c", "a.b.c")]
     assert places == ["parts/7.a.b..c", "parts/7.a..b.c", "parts/7.a.b.c", "parts/7.a..b..c"]
 
 

@@ -40,7 +40,7 @@ from fhash_formats.transform.coder import (
     single_band,
 )
 from fhash_formats.transform.decoding import (
-    corrected_part,
+    corrected_region,
     decode_tile,
     decode_tile_mask,
     transform_for,
@@ -520,11 +520,11 @@ def test_a_part_has_the_bits_of_the_whole(name: str, cross: bool, dtype: str) ->
     table = uncorrected(data, SHAPE, dtype, settings, part)
     assert table is not None
     before = table.copy()
-    found = corrected_part(table, part, dtype, settings)
+    found = corrected_region(table, part, dtype, settings)
     assert found.dtype == whole.dtype
     assert found.tobytes() == whole[part].tobytes()
     everything = tuple(slice(0, n) for n in SHAPE)
-    assert corrected_part(table, everything, dtype, settings).tobytes() == whole.tobytes()
+    assert corrected_region(table, everything, dtype, settings).tobytes() == whole.tobytes()
     assert table.tobytes() == before.tobytes()
     assert (table[part] != whole[part]).any() or dtype == "int16"  # otherwise nothing is tested
 

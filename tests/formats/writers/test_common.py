@@ -346,7 +346,7 @@ def test_frames_go_where_the_dimensions_say() -> None:
     assert outline.ordered((1, 5, 6, 7)) == (7, 1, 1, 6)
     values = np.zeros(outline.shape)
     for step, frame in enumerate(VALUES):
-        place, ordered = outline.place(step, frame)
+        place, ordered = outline.slab(step, frame)
         values[place] = ordered
     np.testing.assert_array_equal(values[:, 0], VALUES[:, 0].transpose(2, 0, 1))
 

@@ -54,7 +54,7 @@ class FlatArray:
             if part != slice(0, length)
         ]
         if len(parts) > 1:
-            return self._read_parts(ranges, parts[0])
+            return self._read_box(ranges, parts[0])
         place = parts[0] if parts else 0
         part = ranges[place]
         rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
@@ -63,7 +63,7 @@ class FlatArray:
             self._fill(file, result, self.shape[place] * inner, part.start * inner)
         return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
 
-    def _read_parts(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
+    def _read_box(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
         """Values in ranges of which several are parts; `place` is the slowest of these.
 
         Whatever lies behind an index along it is an array of its own.
