@@ -50,7 +50,8 @@ def file_name(place: str | os.PathLike[str]) -> str:
     """The last name of a place: "run.fhz" of "https://host/a/run.fhz?signature=1"."""
     if not is_url(place):
         return Path(place).name
-    return PurePosixPath(without_secrets(place).partition("::")[0].partition("://")[2]).name
+    urls = without_secrets(place).split("::")  # the first may be a cache alone, without a path
+    return PurePosixPath(next(url for url in urls if "://" in url).partition("://")[2]).name
 
 
 def without_secrets(place: str | os.PathLike[str]) -> str:

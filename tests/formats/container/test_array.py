@@ -23,7 +23,6 @@ from fhash_formats.container.array import (
     SINGLE_SHARD_CHUNKS,
     ArrayMetadata,
     PlainCoder,
-    Sharding,
     chunk_coder,
     plain_codecs,
     sharding_codecs,
@@ -215,12 +214,6 @@ def test_a_lack_of_memory_is_no_damage(monkeypatch) -> None:
         coder.decode(data)
 
 
-def test_unknown_codecs_are_refused(sample, samples) -> None:
-    codecs = [{"name": "test.negative"}, {"name": "crc32c"}]
-    with pytest.raises(UnsupportedFileError, match=r"codecs 'test[.]negative, crc32c'"):
-        chunk_coder(codecs, np.dtype(np.uint8), (4,))
-
-
 def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
     codecs = [{"name": "fhash.transform", "configuration": {}}]
     with pytest.raises(
@@ -379,13 +372,6 @@ def test_hostile_indices(line, samples) -> None:
         refused_shard(path, samples, hostile, f"member {PATH}/c/0: .*{message}")
 
 
-def test_index_with_a_wrong_checksum(line, samples) -> None:
-    path, parts, at = line
-    name, data = parts[at]
-    parts[at] = name, data[:-1] + bytes([data[-1] ^ 1])
-    refused_shard(path, samples, parts, f"member {PATH}/c/0: the CRC-32C of the shard's index")
-
-
 @pytest.mark.parametrize("data", [b"", b"x" * 67])
 def test_shard_shorter_than_its_index(line, samples, data) -> None:
     path, parts, at = line
@@ -492,17 +478,6 @@ def test_a_large_array_has_a_shard_for_each_layer(grid, shards) -> None:
     assert all(n % chunk == 0 for n, chunk in zip(shape, chunk_shape, strict=True))
     lengths = [n * chunk for n, chunk in zip(grid, chunk_shape, strict=True)]
     assert tuple(-(-n // shard) for n, shard in zip(lengths, shape, strict=True)) == shards
-
-
-def test_the_parts_of_shards_hold_each_chunk_once() -> None:
-    sharding = Sharding(shard_shape=(4, 6), chunk_shape=(2, 2), codecs=())
-    spans = [range(1, 5), range(2, 4)]
-    chunks = []
-    for shard, in_shard in sharding.by_shard(spans):
-        for index in product(*in_shard):
-            assert sharding.locate(index)[0] == shard
-            chunks.append(index)
-    assert sorted(chunks) == list(product(*spans))
 
 
 @pytest.mark.parametrize(

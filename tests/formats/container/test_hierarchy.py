@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile_files import DOCUMENT, ROOT, edited, read_everything, refused, replaced
+from hostile_files import DOCUMENT, ROOT, edited, refused, replaced
 from numcodecs.zstd import compress
 from several_files import write_several
 from table_files import PLAIN, table_parts, write_table
@@ -336,32 +336,12 @@ def test_arrays_that_belong_to_no_variable(tmp_path, samples, name, message) -> 
     refused(path, data, message)
 
 
-def test_an_array_of_another_name_is_ignored(tmp_path, samples) -> None:
-    path = write_several(tmp_path / "a.fhz", samples, paper=False)
-    parts = samples.unpack(path.read_bytes())
-    copies = [(n.replace("time/", "extra/"), data) for n, data in parts if n.startswith("time/")]
-    root = json.loads(parts[-1][1])
-    del root["consolidated_metadata"]
-    path.write_bytes(samples.pack([*copies, *parts[:-1], (ROOT, json.dumps(root).encode())]))
-    assert "extra" in read_everything(path)[1]
-
-
 def test_a_missing_chunk_of_any_variable_is_refused(tmp_path, samples) -> None:
     path = write_several(tmp_path / "a.fhz", samples)
     parts = samples.unpack(path.read_bytes())
     for missing in ("w/c/0/0/0/0", "parts/0.auxiliary.area/c/0/0", "parts/3.key_frames/c/0"):
         data = samples.pack([part for part in parts if part[0] != missing])
         refused(path, data, "chunks|is missing")
-
-
-def test_an_unknown_feature_of_one_variable_is_told(tmp_path, samples) -> None:
-    path = write_several(tmp_path / "a.fhz", samples, paper=False)
-
-    def newer(root) -> None:
-        header = root["attributes"]["fhash"]
-        header["required_features"].append("teleport")
-
-    refused(path, edited(path, samples, ROOT, newer), "teleport", UnsupportedFileError)
 
 
 SHAPE_SOURCE_ENTRY = [2, 1, 3, 4]

@@ -436,15 +436,6 @@ def test_descending_axes_come_back_ascending(tmp_path: Path, suffix: str) -> Non
         np.testing.assert_array_equal(np.stack(list(series.frames())), values[:, :, ::-1])
 
 
-def test_numbered_files_come_back_by_a_pattern(tmp_path: Path) -> None:
-    described = region(EVEN, "f4")
-    values = np.random.default_rng(0).normal(size=described.shape).astype("f4")
-    save_region(tmp_path / "out.vti", described, values)
-    with open_series(tmp_path / "out_*.vti") as series:
-        np.testing.assert_array_equal(np.stack(list(series.frames())), values)
-        np.testing.assert_array_equal(series.coords["t"].values, EVEN["t"])
-
-
 def test_vtk_takes_the_time_and_its_units(tmp_path: Path) -> None:
     xml = pytest.importorskip("vtkmodules.vtkIOXML")
     described = region({**EVEN, "t": [4.0]}, "f4")

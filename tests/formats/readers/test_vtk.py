@@ -510,13 +510,6 @@ def test_files_that_do_not_fit(tmp_path: Path, options: dict[str, Any], message:
     assert str(path) in str(caught.value)
 
 
-def test_cut_files_are_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.vtkhdf", {"PointData/u": VALUES_VTKHDF}, times=[0, 1, 2])
-    path.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(InputError, match=r"a\.vtkhdf cannot be read"):
-        open_series(path)
-
-
 SIX = np.arange(6, dtype="<f4")
 
 

@@ -34,8 +34,6 @@ from tiles import (
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.transform.coder import (
     MaskLevels,
-    Table,
-    decode_integers,
     encode_integers,
     single_band,
 )
@@ -73,16 +71,6 @@ from fhash_formats.transform.tile_format import (
 from fhash_formats.transform.values import LARGEST
 
 TRELLIS = replace(SETTINGS_ENCODING, trellis=True, offsets=(17, -10, -5, -3, -2, -1))
-SHAPES = [(1, 1, 1, 1), (3, 5, 7, 11), (4, 6, 17, 33), (1, 1, 30, 40), (9, 1, 1, 5), (1, 2, 3, 300)]
-
-
-def table_of(shape: tuple[int, ...], depth: int) -> Table:
-    def axis(length: int) -> AxisTransform:
-        kept = min(depth, (length - 1).bit_length())
-        return AxisTransform(kind="9/7", depth=kept) if kept else AxisTransform(kind="none")
-
-    t, z, y, x = (axis(length) for length in shape)
-    return band_table(TransformSpec(axes=(t, z, y, x)), shape)
 
 
 def coefficients(shape: tuple[int, ...], spread: float, dtype: Any) -> Any:
@@ -90,24 +78,6 @@ def coefficients(shape: tuple[int, ...], spread: float, dtype: Any) -> Any:
     values = random.laplace(size=shape) * spread * np.exp(random.normal(size=shape))
     values[:, :, : shape[2] // 2] *= 0.05  # rows of zeros
     return np.clip(values, -9e8, 9e8).astype(dtype)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("spread", [0.3, 4.0])
-def test_the_coder_takes_every_path(shape: tuple[int, ...], spread: float) -> None:
-    table = table_of(shape, 2)
-    levels = choose_levels(coefficients(shape, spread, np.float32), table, 0.27)
-    data = encode_integers(levels, table, trellis=True).data
-    decoded = decode_integers(data, shape, table, trellis=True)
-    assert decoded.tobytes() == levels.tobytes()
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_coefficients_are_near_their_integers(dtype: Any) -> None:
-    # A quantiser has every second integer, and the search takes one of the two around.
-    scaled = np.array([3.2, -1e3, 0.1, 5e6 + 0.5, -9.9e8, 7.0], dtype).reshape(1, 1, 1, 6)
-    levels = choose_levels(scaled, single_band(scaled.shape), 0.0)
-    assert np.abs(levels - scaled.astype(np.float64)).max() <= 2
 
 
 def test_a_path_errs_less_than_any_of_the_two_quantisers() -> None:
@@ -155,17 +125,6 @@ def test_the_encoder_knows_what_is_decoded(
     assert same(decode_tile(coded.data, SHAPE_ENCODING, dtype, known), coded.decoded)
     difference = np.abs(coded.decoded.astype(float) - values.astype(float)).max()
     assert difference <= (0.4 if coding.error is None else coding.error)
-
-
-def test_values_that_are_not_finite_come_back_as_they_were() -> None:
-    values = wave()
-    values[0, 1, 2, 3:6] = [np.nan, np.inf, -np.inf]
-    values[1, 0] = np.nan
-    data = encode_tile(values, SETTINGS_ENCODING, Coding(error=0.04)).data
-    decoded = decode_tile(data, SHAPE_ENCODING, np.float32, SETTINGS_ENCODING)
-    finite = np.isfinite(values)
-    assert same(decoded[~finite], values[~finite])
-    assert np.abs(decoded[finite] - values[finite]).max() <= 0.04
 
 
 def test_values_outside_the_coreset_cost_little_and_leave_the_bound() -> None:
@@ -369,13 +328,6 @@ def test_large_integers_of_the_trellis_are_near() -> None:
     integers = choose_integers(coefficients, settings, 0.27)
     assert integers is not None
     assert np.abs(integers - coefficients).max() <= 2
-
-
-def test_reduced_resolution_is_the_low_band() -> None:
-    coded = encode_tile(np.full(SHAPE_DECODING, 2.25, np.float32), SETTINGS_DECODING)
-    coarse = decode_tile(coded.data, SHAPE_DECODING, np.float32, SETTINGS_DECODING, lod=1)
-    assert coarse.shape == (2, 2, 4, 5)
-    assert np.abs(coarse - 2.25).max() < 0.1
 
 
 @pytest.mark.parametrize("name", list(streams()))
@@ -637,16 +589,6 @@ def test_what_is_not_finite_is_not_occupied_and_comes_back() -> None:
     np.testing.assert_array_equal(np.isnan(dropped), ~(care & np.isfinite(values)))
 
 
-@pytest.mark.parametrize("dtype", ["f4", "u1"])
-def test_an_exact_tile_says_it_as_well(dtype: str) -> None:
-    values, care = tile(dtype)
-    decoded, mask = decode_tile_mask(
-        exact_tile(values, occupied=care).data, SHAPE_MASKED, dtype, SETTINGS
-    )
-    np.testing.assert_array_equal(mask, care)
-    np.testing.assert_array_equal(decoded[care], values[care])
-
-
 def test_less_detail_needs_no_mask() -> None:
     coded = coded_with(tile()[1])
     coarse = decode_tile(coded.data, SHAPE_MASKED, "f4", SETTINGS, lod=1)
@@ -657,20 +599,3 @@ def test_less_detail_needs_no_mask() -> None:
 def test_a_mask_needs_settings_that_know_of_it() -> None:
     with pytest.raises(DamagedFileError, match="no mask levels"):
         decode_tile(coded_with(tile()[1]).data, SHAPE_MASKED, "f4", replace(SETTINGS, mask=None))
-
-
-@pytest.mark.parametrize("name", ["mask", "exact", "empty"])
-def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
-    values, care = tile()
-    small = (1, 2, 6, 9)
-    part = tuple(slice(0, n) for n in small)
-    values, care = values[part].copy(), care[part]
-    own = Coding(own_settings=True)
-    data = {
-        "mask": encode_tile(values, SETTINGS, own, in_coreset=care).data,
-        "exact": exact_tile(values, occupied=care).data,
-        "empty": encode_tile(values, SETTINGS, own, in_coreset=np.zeros(small, bool)).data,
-    }[name]
-    for other in damaged_copies(data):
-        with pytest.raises(DamagedFileError):
-            decode_tile_mask(other, small, "f4")
