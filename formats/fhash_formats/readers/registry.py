@@ -393,13 +393,13 @@ class Mask:
         self._values.close()
 
 
-def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) -> Mask:
+def open_mask(path: str | Path, shape: Sequence[int]) -> Mask:
     """Open a mask for a series of `shape` (t, z, y, x).
 
     The file holds booleans or numbers of that shape, or of (z, y, x) for all steps alike, in any
     format that `open_series` reads. Raises InputError for another shape.
     """
-    values = open_whole(path, Request(var=var, booleans=True, asked=False))
+    values = open_whole(path, Request(booleans=True, asked=False))
     if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
         values.close()
         raise InputError(

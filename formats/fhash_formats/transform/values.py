@@ -28,14 +28,13 @@ Offsets = tuple[int, ...]
 
 
 def quantise(
-    coefficients: Values, step: float, rounding: float = ROUNDING
+    coefficients: Values, step: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """The integers sign(c) floor(|c| / step + rounding), int32, and c / step, float32.
+    """The integers sign(c) floor(|c| / step + ROUNDING), int32, and c / step, float32.
 
     Args:
         coefficients: coefficients c, float32 or float64.
         step: quantiser step, in units of the coefficients.
-        rounding: fraction of a step added before rounding down.
     """
     width, scale = coefficients.dtype.itemsize * 8, 1.0 / step
     integers = np.empty(coefficients.shape, np.int32)
@@ -44,7 +43,7 @@ def quantise(
     getattr(native.library(), f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
-        *(ctypes.c_double(number) for number in (scale, rounding, LARGEST)),
+        *(ctypes.c_double(number) for number in (scale, ROUNDING, LARGEST)),
         ctypes.c_void_p(integers.ctypes.data),
         ctypes.c_void_p(scaled.ctypes.data),
     )

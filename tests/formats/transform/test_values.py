@@ -250,7 +250,7 @@ def test_clipping_keeps_the_signs_of_zeros_and_reaches_every_view() -> None:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_magnitudes_are_rounded_down_after_the_rounding_is_added(dtype: Any) -> None:
     coefficients = np.array([0.0, 0.25, -0.375, 0.5, -1.0, 3e12], dtype)
-    integers, scaled = quantise(coefficients, 0.5, rounding=0.375)
+    integers, scaled = quantise(coefficients, 0.5)
     assert integers.tolist() == [0, 0, -1, 1, -2, 10**9]
     assert scaled.tolist() == [0.0, 0.5, -0.75, 1.0, -2.0, float(np.float32(6e12))]
 
