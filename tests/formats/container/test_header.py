@@ -310,6 +310,7 @@ BAD = [
     ("feature_bounding_box", [[0, 3], [1, 5], [0.0, 6]]),
     ("feature_bounding_box", [[0, 3], [1, 5], 6]),
     ("feature_bounding_box", None),
+    ("features", []),
     ("features", "all"),
     ("features", [None]),
     ("dilation", -1),
@@ -353,7 +354,6 @@ BAD = [
     ("quality.bulk", {"psnr": 40}),
     ("quality.bulk", {"psnr": "40", "range": [0, 1]}),
     ("quality.bulk", {"range": [1, 0]}),
-    ("history", {}),
     ("history", [1]),
     ("history", [{"seconds": "1"}]),
 ]
@@ -379,7 +379,6 @@ def test_wrong_key_is_named(samples, path, value) -> None:
         ("value_range", [1, 1]),
         ("background", -3),
         ("encoder.seed", 2**63 - 1),
-        ("features", []),
         ("quality", {}),
         ("quality.psnr", None),
         ("quality.bulk", None),
