@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from stored_series import frames
 
 from fhash_formats.container.zip_file import ending
 from fhash_formats.errors import (
@@ -176,8 +177,6 @@ def test_a_container_is_to_be_decoded(tmp_path: Path) -> None:
 
 
 def test_a_raw_layout_is_for_files(tmp_path: Path) -> None:
-    import zarr
-
     zarr.create_array(tmp_path / "a.zarr", shape=(2, 2, 2), dtype="f4")
     with pytest.raises(InputError, match="given for raw files only"):
         open_series(tmp_path / "a.zarr", raw=RawLayout(dtype="f4"))
@@ -279,8 +278,6 @@ def test_a_raw_layout_is_not_for_files_of_another_format(
 def test_what_may_not_be_looked_into(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
-    import zarr
-
     zarr.create_array(tmp_path / "a.zarr", shape=(2, 2, 2), dtype="f4")
 
     def denied(*_: Any, **__: Any) -> bool:  # the tests may run as root, whom no mode stops
@@ -306,8 +303,6 @@ def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -
         elif name.endswith(".npy"):
             np.save(part, frame)
         else:
-            import zarr
-
             zarr.create_array(tmp_path / "a.zarr", data=frame)
             (tmp_path / "a.zarr").rename(part)
     with open_series(tmp_path / name) as series:
@@ -508,12 +503,6 @@ def test_files_without_a_time_get_one(tmp_path: Path) -> None:
 VALUES_JOINED = np.random.default_rng(0).normal(size=(12, 3, 5, 6)).astype(np.float32)
 
 
-def stacked(pattern: Path, **options: Any) -> np.ndarray:
-    with open_series(pattern, **options) as series:
-        assert series.shape[0] == len(series.coords["t"].values)
-        return np.stack(list(series.frames()))
-
-
 def h5(path: Path, values: np.ndarray, **beside: Any) -> None:
     with h5py.File(path, "w") as file:
         file["v"] = values
@@ -547,7 +536,7 @@ def test_one_step_per_file_in_the_order_of_numbers(tmp_path: Path, kind: str) ->
         else:
             h5(tmp_path / f"frame_{step}.h5", frame)
     layout = RawLayout({"x": 6, "y": 5, "z": 3}, "f4") if kind == "layout" else None
-    np.testing.assert_array_equal(stacked(tmp_path / "frame_*", raw=layout), VALUES_JOINED)
+    np.testing.assert_array_equal(frames(tmp_path / "frame_*", raw=layout), VALUES_JOINED)
     with open_series(tmp_path / "frame_*", raw=layout, steps=slice(10, 2, -4)) as series:
         assert series.name == ("v" if kind == "h5" else "frame")
         assert series.source == str(tmp_path / "frame_*")
@@ -563,13 +552,13 @@ def test_several_steps_per_file_and_character_classes(tmp_path: Path) -> None:
         ("b1", VALUES_JOINED),
     ):
         np.save(tmp_path / f"{name}.npy", part)
-    np.testing.assert_array_equal(stacked(tmp_path / "a*.npy"), VALUES_JOINED)
-    np.testing.assert_array_equal(stacked(tmp_path / "[a]?.npy"), VALUES_JOINED[:6])
+    np.testing.assert_array_equal(frames(tmp_path / "a*.npy"), VALUES_JOINED)
+    np.testing.assert_array_equal(frames(tmp_path / "[a]?.npy"), VALUES_JOINED[:6])
 
 
 def test_a_name_with_brackets_is_a_file(tmp_path: Path) -> None:
     np.save(tmp_path / "a[1].npy", VALUES_JOINED)
-    np.testing.assert_array_equal(stacked(tmp_path / "a[1].npy"), VALUES_JOINED)
+    np.testing.assert_array_equal(frames(tmp_path / "a[1].npy"), VALUES_JOINED)
 
 
 def test_times_of_the_files(tmp_path: Path) -> None:
