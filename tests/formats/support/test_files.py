@@ -19,8 +19,7 @@ import pytest
 from folders import listing, store
 
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
-from fhash_formats.support import files as interrupts
-from fhash_formats.support import files as leftovers
+from fhash_formats.support import files
 from fhash_formats.support.files import (
     OTHERS,
     check_output,
@@ -403,7 +402,7 @@ def test_an_ignored_signal_asks_for_nothing() -> None:
 def test_a_signal_while_handlers_are_put_back_leaves_none_replaced(
     monkeypatch: pytest.MonkeyPatch, block: Callable[[], Any]
 ) -> None:
-    before = {number: signal.getsignal(number) for number in interrupts.STOP_SIGNALS}
+    before = {number: signal.getsignal(number) for number in files.STOP_SIGNALS}
     put_back, set_handler = [], signal.signal
 
     def interrupted(number: int, handler: Any) -> Any:
@@ -415,13 +414,13 @@ def test_a_signal_while_handlers_are_put_back_leaves_none_replaced(
 
     def run() -> None:
         with block():
-            monkeypatch.setattr(interrupts.signal, "signal", interrupted)
+            monkeypatch.setattr(files.signal, "signal", interrupted)
 
     with pytest.raises(KeyboardInterrupt):
         run()
     monkeypatch.undo()
     assert put_back == [signal.SIGINT]
-    assert {number: signal.getsignal(number) for number in interrupts.STOP_SIGNALS} == before
+    assert {number: signal.getsignal(number) for number in files.STOP_SIGNALS} == before
 
 
 @pytest.fixture
@@ -479,7 +478,7 @@ def test_nothing_of_a_living_writer_is_touched(
             leftover(target, process.pid, ".old"),
         ]
         foreign = leftover(target, gone)
-        elsewhere = foreign.with_name(foreign.name.replace(leftovers._machine(), "0123abcd"))
+        elsewhere = foreign.with_name(foreign.name.replace(files._machine(), "0123abcd"))
         foreign.rename(elsewhere)
         clear_leftovers([target])
         assert names(tmp_path) == sorted(path.name for path in [*kept, elsewhere, target])

@@ -10,20 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import tiles
 from specs import spec_of
-from tiles import (
-    SETTINGS,
-    Four,
-    predictor_of,
-    random_head,
-    resealed,
-    same,
-    streams,
-    wave,
-)
-from tiles import (
-    SHAPE as SHAPE_TILE_FORMAT,
-)
+from tiles import SETTINGS, Four, predictor_of, random_head, resealed, same, streams, wave
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
@@ -528,7 +517,7 @@ def test_missing_values_come_back_into_floating_values_only() -> None:
     finite = np.where(np.isfinite(values), values, np.float32(0))
     assert same(restore_missing(finite, missing), values)
     with pytest.raises(DamagedFileError, match="integers has missing values"):
-        restore_missing(np.zeros(SHAPE_TILE_FORMAT, np.int16), missing)
+        restore_missing(np.zeros(tiles.SHAPE, np.int16), missing)
 
 
 CHANGES: list[dict[str, Any]] = [
@@ -540,7 +529,7 @@ CHANGES: list[dict[str, Any]] = [
     {"trellis": True, "offsets": (-5, -1, 0, 0, 1, -127)},
     {"head": random_head((3, 4), cross=True)},
     {"predictor": predictor_of((1, 2, 2, 2), (0, 3, 1, 2), 1, step=0.25)},
-    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), SHAPE_TILE_FORMAT, 0.1)},
+    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), tiles.SHAPE, 0.1)},
     {"origin": -(1 << 63), "low": -(1 << 62), "high": (1 << 62) + 1},
     {"origin": (1 << 64) - 1, "low": 0.0, "high": 5.0},
     {"low": -(1 << 63), "high": (1 << 63) - 1},
