@@ -70,11 +70,13 @@ def edited_header(header: dict[str, Any], path: str, value: object) -> dict[str,
 
 
 def put_at(values: Any, path: str, value: object) -> None:
-    """Replace the value at "a.0.b" in place, or remove it where it is `...`."""
+    """Replace the value at "a.0.b" in place, or remove it where it is `...`; "a.+" appends."""
     *parents, key = (int(word) if word.isdecimal() else word for word in path.split("."))
     for parent in parents:
         values = values[parent]
-    if value is ...:
+    if key == "+":
+        values.append(value)
+    elif value is ...:
         del values[key]
     else:
         values[key] = value

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile_files import ROOT, edited, edited_header, read_everything, refused
+from hostile_files import ROOT, edited, edited_header, put_at, read_everything, refused
 
 from fhash_formats.container import (
     Container,
@@ -457,38 +457,34 @@ def test_allowed_in_the_profile_compact(samples, path, value) -> None:
 
 ROOTS = {
     "newer major": (
-        lambda v: v.update(format_version=[3, 1]),
+        ("format_version", [3, 1]),
         "the file is of format 3.1; this fhash reads format 2.x: upgrade",
         UnsupportedFileError,
     ),
     "older major": (
-        lambda v: v.update(format_version=[1, 8]),
+        ("format_version", [1, 8]),
         "the file is of format 1.8; this fhash reads format 2.x: encode the source again",
         UnsupportedFileError,
     ),
     "feature": (
-        lambda v: v.update(required_features=["teleport"]),
+        ("required_features", ["teleport"]),
         "feature 'teleport'",
         UnsupportedFileError,
     ),
     "profile": (
-        lambda v: v["variables"][0]["model"].update(profile="magic"),
+        ("variables.0.model.profile", "magic"),
         "profile is 'magic'",
         UnsupportedFileError,
     ),
-    "another format": (lambda v: v.update(format="zhash"), "format is 'zhash'", DamagedFileError),
+    "another format": (("format", "zhash"), "format is 'zhash'", DamagedFileError),
 }
 
 
 @pytest.mark.parametrize("case", ROOTS)
 def test_root(sample, samples, case) -> None:
     change, message, kind = ROOTS[case]
-    refused(
-        sample,
-        edited(sample, samples, ROOT, lambda v: change(v["attributes"]["fhash"])),
-        message,
-        kind,
-    )
+    data = edited(sample, samples, ROOT, lambda v: put_at(v["attributes"]["fhash"], *change))
+    refused(sample, data, message, kind)
 
 
 def test_newer_minor_is_read(sample, samples) -> None:

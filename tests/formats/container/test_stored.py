@@ -17,15 +17,8 @@ import zarr
 from sharded_files import NAME, PATH, random_values, write_sharded
 from table_files import HEAD, PLAIN
 
-from fhash_formats.container import (
-    FORMAT_VERSION,
-    Container,
-    ContainerWriter,
-    validate_header,
-)
-from fhash_formats.container import (
-    array as coding,
-)
+from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter, validate_header
+from fhash_formats.container import array as coding
 from fhash_formats.container.array import ABSENT, transform_codecs
 from fhash_formats.container.header import COUNTS, SPARSE_FEATURE
 from fhash_formats.container.remote import TAIL_BYTES
@@ -118,19 +111,20 @@ def regions(shape, count):
         yield tuple(slice(int(a), int(b)) for a, b in ends)
 
 
-def test_region_touches_only_its_chunks_and_once(sample, monkeypatch) -> None:
+def reads_of(container: Container) -> list[tuple[int, int]]:
+    """Offsets and sizes of what is read from now on."""
+    reads, read = [], container._source.read
+    container._source.read = lambda offset, size: reads.append((offset, size)) or read(offset, size)
+    return reads
+
+
+def test_region_touches_only_its_chunks_and_once(sample) -> None:
     with Container.open(sample) as container:
-        reads = []
-        read = container._source.read
-        monkeypatch.setattr(
-            container._source,
-            "read",
-            lambda offset, size: reads.append(offset) or read(offset, size),
-        )
+        reads = reads_of(container)
         table = container.arrays["tables/level_1"]
         region = (slice(0, 1), slice(1, 3), slice(0, 3), slice(0, 6), slice(0, 2))
         table.read(region)
-        assert sorted(reads) == sorted(
+        assert sorted(offset for offset, _ in reads) == sorted(
             table.chunks[index].offset for index in [(0, 0, 0, 0, 0), (0, 1, 0, 0, 0)]
         )
         table.read(region)
@@ -493,11 +487,7 @@ def test_region_reads_only_the_index_and_its_inner_chunks(sharded_file) -> None:
     with Container.open(path) as container:
         array = container.arrays[NAME]
         before = container.bytes_read
-        reads = []
-        read = container._source.read
-        container._source.read = lambda offset, size: (
-            reads.append((offset, size)) or read(offset, size)
-        )
+        reads = reads_of(container)
         np.testing.assert_array_equal(array.read((slice(2, 4), slice(3, 5))), values[2:4, 3:5])
         member = array.chunks[0, 0]
         index_bytes = 4 * 16 + 4
@@ -519,10 +509,7 @@ def test_of_a_large_index_only_the_entries_that_are_needed_are_read(tmp_path, sa
     with Container.open(path) as container:
         array = container.arrays[NAME]
         member = array.chunks[0, 0]
-        start, reads, read = member.end - 4 - 40 * 16, [], container._source.read
-        container._source.read = lambda offset, size: (
-            reads.append((offset, size)) or read(offset, size)
-        )
+        start, reads = member.end - 4 - 40 * 16, reads_of(container)
         np.testing.assert_array_equal(array.read((slice(3, 5), slice(0, 2))), values[3:5, :2])
         entries = [at for at in reads if at[0] >= start]
         assert entries == [(start + 2 * 16, 16), (start + 4 * 16, 16)]
