@@ -644,11 +644,7 @@ class ContainerWriter:
         return b"".join([*tail, ending(members)])
 
     def _check_name(self, name: str) -> None:
-        if (
-            not NAME.fullmatch(name)
-            or len(name) > MAX_NAME // 2
-            or name.rpartition("/")[2] == DOCUMENT
-        ):
+        if not NAME.fullmatch(name) or len(name) > MAX_NAME // 2:
             raise InputError(
                 f"array name {name[:80]!a} is not allowed; "
                 f"allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
