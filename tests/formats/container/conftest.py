@@ -153,13 +153,19 @@ def unpack(data: bytes) -> Parts:
     return parts
 
 
-def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:
-    """A container's ZIP of any members, with sound checksums."""
+def pack(
+    parts: Iterable[tuple[str, bytes]], stored: Mapping[str, tuple[bytes, int, int]] | None = None
+) -> bytes:
+    """A container's ZIP of any members, with sound checksums.
+
+    stored: by name the bytes in the file, and the full size and CRC-32 that are declared.
+    """
     members, chunks, position = [], [], 0
     for name, data in parts:
-        member = Member(name=name, offset=position, size=len(data), crc=zlib.crc32(data))
+        held, full, crc = (stored or {}).get(name, (data, None, zlib.crc32(data)))
+        member = Member(name=name, offset=position, size=len(held), crc=crc, full_size=full)
         members.append(member)
-        chunks += [local_header(member), data]
+        chunks += [local_header(member), held]
         position = member.end
     return b"".join([*chunks, ending(members)])
 

@@ -50,6 +50,19 @@ def links(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
         monkeypatch.setattr(os, "link", no_links)
 
 
+def save(
+    path: Path,
+    *,
+    force: bool = True,
+    directory: bool = False,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> None:
+    """Write "new"; something happens before it takes its name."""
+    with replacing(path, force=force, directory=directory) as temporary:
+        store(temporary, "new") if directory else temporary.write_text("new")
+        meanwhile()
+
+
 @pytest.mark.usefixtures("links")
 @pytest.mark.parametrize("old", [None, "old"])
 def test_a_file_takes_its_name(
@@ -76,8 +89,7 @@ def test_a_directory_takes_its_name(tmp_path: Path) -> None:
         "out.zarr/c/0": b"new",
         "out.zarr/zarr.json": b"{}",
     }
-    with replacing(tmp_path / "second.zarr", force=False, directory=True) as temporary:
-        store(temporary, "new")
+    save(tmp_path / "second.zarr", force=False, directory=True)
     assert (tmp_path / "second.zarr" / "c" / "0").read_text() == "new"
 
 
@@ -123,13 +135,9 @@ def test_a_disk_that_fills_up_at_the_end_changes_nothing(
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def save() -> None:
-        with replacing(path, force=True) as temporary:
-            temporary.write_text("new")
-
     monkeypatch.setattr(os, step, full)
     with pytest.raises(OutputError, match=r"no space left on .*make room") as caught:
-        save()
+        save(path)
     assert "\n" not in str(caught.value)
     # os.replace also undoes; the old file is then still under its own name
     assert listing(tmp_path)["out.npy"] == b"old"
@@ -137,18 +145,10 @@ def test_a_disk_that_fills_up_at_the_end_changes_nothing(
 
 
 @pytest.mark.usefixtures("links")
-def test_a_file_that_appears_meanwhile_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "out.npy"
-
-    def save() -> None:
-        with replacing(path, force=False) as temporary:
-            temporary.write_text("new")
-            path.write_text("somebody else's")
-
     with pytest.raises(OutputExistsError, match=r"appeared meanwhile.*--force"):
-        save()
+        save(path, force=False, meanwhile=lambda: path.write_text("somebody else's"))
     assert listing(tmp_path) == {"out.npy": b"somebody else's"}
 
 
@@ -158,14 +158,12 @@ def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(
 ) -> None:
     path = tmp_path / "out.zarr"
 
-    def save() -> None:
-        with replacing(path, force=True, directory=directory) as temporary:
-            store(temporary) if directory else temporary.write_text("new")
-            path.mkdir()
-            (path / "notes.txt").write_text("somebody else's")
+    def appears() -> None:
+        path.mkdir()
+        (path / "notes.txt").write_text("somebody else's")
 
     with pytest.raises(OutputError, match="is a directory"):
-        save()
+        save(path, directory=directory, meanwhile=appears)
     assert listing(tmp_path) == {"out.zarr": None, "out.zarr/notes.txt": b"somebody else's"}
 
 
@@ -176,7 +174,7 @@ def test_of_several_outputs_all_or_none_take_their_names(
     paths = [tmp_path / name for name in ("a", "b", "c")]
     paths[0].write_text("old a")
 
-    def save() -> None:
+    def save_all() -> None:
         with replacing_all(paths, force=True) as temporaries:
             for temporary in temporaries:
                 temporary.write_text("new")
@@ -191,10 +189,10 @@ def test_of_several_outputs_all_or_none_take_their_names(
 
     monkeypatch.setattr(os, "replace", third_fails)
     with pytest.raises(OutputError, match="cannot be written: Input/output error"):
-        save()
+        save_all()
     assert listing(tmp_path) == {"a": b"old a"}
     monkeypatch.setattr(os, "replace", replace)
-    save()
+    save_all()
     assert listing(tmp_path) == {"a": b"new", "b": b"new", "c": b"new"}
 
 
@@ -218,16 +216,9 @@ def test_another_writer_between_moving_aside_and_replacing_is_kept(
         os.rename(source, target)
 
     monkeypatch.setattr(os, "replace", refuse)
-
-    def save() -> None:
-        with replacing(path, force=True, directory=directory) as temporary:
-            store(temporary, "new") if directory else temporary.write_text("new")
-
-    with pytest.raises(
-        OutputError,
-        match="another process wrote it meanwhile" if directory else "Input/output error",
-    ):
-        save()
+    told = "another process wrote it meanwhile" if directory else "Input/output error"
+    with pytest.raises(OutputError, match=told):
+        save(path, directory=directory)
     assert [entry.name for entry in tmp_path.iterdir()] == ["out.zarr"]
     assert (path / "c" / "0" if directory else path).read_text() == "somebody else's"
 
@@ -241,13 +232,13 @@ def test_a_folder_that_appears_at_the_last_moment_is_kept(
         store(path, "somebody else's")
         rename(source, target)
 
-    def save() -> None:
-        with replacing(path, force=False, directory=True) as temporary:
-            store(temporary, "new")
-            monkeypatch.setattr(os, "rename", late)
-
     with pytest.raises(OutputExistsError, match="appeared meanwhile"):
-        save()
+        save(
+            path,
+            force=False,
+            directory=True,
+            meanwhile=lambda: monkeypatch.setattr(os, "rename", late),
+        )
     assert [entry.name for entry in tmp_path.iterdir()] == ["out.zarr"]
     assert (path / "c" / "0").read_text() == "somebody else's"
 
@@ -284,8 +275,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
 
 def test_a_name_as_long_as_the_file_system_takes(tmp_path: Path) -> None:
     path = tmp_path / ("\u00e9" * 125 + ".npy")
-    with replacing(path, force=False) as temporary:
-        temporary.write_text("new")
+    save(path, force=False)
     assert path.read_text() == "new"
     with pytest.raises(OutputError, match="cannot be written: File name too long"):
         check_output(tmp_path / ("n" * 300), False)
@@ -295,16 +285,11 @@ def test_an_old_output_that_cannot_be_deleted_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = store(tmp_path / "out.zarr")
-
-    def save() -> None:
-        with replacing(path, force=True, directory=True) as temporary:
-            store(temporary, "new")
-
     monkeypatch.setattr(shutil, "rmtree", no_links)
     with pytest.raises(
         OutputError, match=r"is written, but the older one could not be deleted; delete .*\.old"
     ):
-        save()
+        save(path, directory=True)
     assert (path / "c" / "0").read_text() == "new"
 
 
@@ -316,8 +301,7 @@ def test_the_permissions_of_what_is_replaced_are_kept(
     path = tmp_path / "out.npy"
     path.write_text("old")
     path.chmod(mode)
-    with replacing(path, force=True) as temporary:
-        temporary.write_text("new")
+    save(path)
     assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", mode)
 
 
