@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
-import struct
 import warnings
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +20,7 @@ from fhash_formats.readers.common.cf import (
     Column,
     Packing,
     beside,
+    number_of_text,
     only_counts,
     packing,
     real_time,
@@ -217,25 +215,14 @@ def _attributes(array: zarr.Array[Any]) -> dict[str, Any]:
         fill = array.fill_value if fill is None else fill
     dtype = np.dtype(array.dtype)
     if isinstance(fill, str) and dtype.kind == "f":
-        fill = _decoded(fill)
+        number = number_of_text(fill)
+        fill = fill if number is None else number
     if fill is not None:
         try:
             found[FILL] = dtype.type(fill) if dtype.kind in "iuf" else fill
         except (ValueError, OverflowError, TypeError):
             found[FILL] = fill
     return found
-
-
-def _decoded(text: str) -> Any:
-    """A fill value of floats: a number as text, or base64 of a float64, as xarray writes it."""
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return struct.unpack("<d", base64.standard_b64decode(text))[0]
-    except (struct.error, binascii.Error):
-        return text
 
 
 def _values(array: zarr.Array[Any], places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
