@@ -636,7 +636,7 @@ def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None
     for component, (settings, mixing) in enumerate(
         zip(coding.settings, coding.mixing, strict=True)
     ):
-        writer.add_sharded(
+        writer.add_array(
             component_name(level, component + 1),
             shape=table.shape[:4],
             dtype=np.float32,

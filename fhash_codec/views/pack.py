@@ -398,18 +398,16 @@ class _Job:
         tiles = Tiles(array, series.source, fill_absent=self.absent == "fill")
         total = len(tiles)
         self.progress("packing", 0, total, note)
-        table: dict[str, Any] = {
-            "shape": array.shape,
-            "dtype": array.dtype,
-            "chunk_shape": array.tile,
-            "dimension_names": ("t", "z", "y", "x"),
-            "codecs": tiles.codecs,
-            "chunks": tiles.streams(lambda done: self.progress("packing", done, total, note)),
-        }
-        if tiles.shard is None:
-            writer.add_array(TABLE, **table)
-        else:
-            writer.add_sharded(TABLE, shard_shape=tiles.shard, **table)
+        writer.add_array(
+            TABLE,
+            shape=array.shape,
+            dtype=array.dtype,
+            chunk_shape=array.tile,
+            shard_shape=tiles.shard,
+            chunks=tiles.streams(lambda done: self.progress("packing", done, total, note)),
+            dimension_names=("t", "z", "y", "x"),
+            codecs=tiles.codecs,
+        )
         tiles.check_against_store()
         series.check()
         facts = tiles.facts

@@ -242,7 +242,6 @@ def test_full_disk_while_encoding(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(ContainerWriter, "add_array", full)
-    monkeypatch.setattr(ContainerWriter, "add_sharded", full)
     for words in (SMALL, PAPER):
         assert "no space left" in refused(1, "encode", data, "-o", tmp_path / "out.fhz", *words)
 

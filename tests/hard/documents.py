@@ -14,7 +14,7 @@ from containers import Parts, with_crc
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.header import POSITIONS, TABLE
-from fhash_formats.container.hierarchy import part_place
+from fhash_formats.container.hierarchy import array_path
 
 DOCUMENT = "zarr.json"
 """End of the names of metadata documents; alone, the name of the root's."""
@@ -229,7 +229,7 @@ def header_of(parts: Parts) -> Any:
 def path_of(header: dict[str, Any], name: str) -> str:
     """Return the path of an array of the first variable in a sound file."""
     if name == TABLE:
-        return str(header.get("array", part_place(0, name)))
+        return str(header.get("array", array_path(0, name)))
     if name.startswith("coords/"):
         return str(header["dimensions"][POSITIONS.index(name.removeprefix("coords/"))])
-    return part_place(0, name)
+    return array_path(0, name)

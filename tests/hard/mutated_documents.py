@@ -37,7 +37,7 @@ from documents import (
 from mutated_tiles import coding, tile_of
 
 from fhash_formats.container.header import KNOWN_FEATURES
-from fhash_formats.container.hierarchy import part_place
+from fhash_formats.container.hierarchy import array_path
 from fhash_formats.support.values import DTYPES
 
 AXES = ("time", "z", "y", "x")
@@ -350,7 +350,7 @@ def _part(chance: random.Random, parts: Parts) -> Parts:
         name = f"whole/{chance.choice(WHOLE)}"
         shape = [chance.choice((1, 3, 1 << 20, 1 << 22))]
         kind = chance.choice(("float64", "uint8", "int64"))
-        return added(parts, array_of_zeros(name, shape, kind, part_place(0, name)))
+        return added(parts, array_of_zeros(name, shape, kind, array_path(0, name)))
     put(chance, file.header, PART)
     return file.packed()
 

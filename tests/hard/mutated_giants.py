@@ -28,7 +28,7 @@ from documents import (
 from mutated_tiles import CODED_FEATURES, PLAIN, is_coded, settings_of, shard_of
 
 from fhash_formats.container.array import Sharding
-from fhash_formats.container.hierarchy import part_place
+from fhash_formats.container.hierarchy import array_path
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.tile_format import (
     EMPTY,
@@ -220,7 +220,7 @@ def _source(chance: random.Random, parts: Parts) -> Parts:
             ]
         for header in headers[1:]:
             header["shares"] = {"auxiliary/long": number}
-        path = part_place(number, "auxiliary/long")
+        path = array_path(number, "auxiliary/long")
         new = array_of_zeros("auxiliary/long", [length], "float64", path)
         return added(parts, [(f"parts/{DOCUMENT}", GROUP), *new], file.root)
     return file.packed()

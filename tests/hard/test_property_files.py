@@ -174,7 +174,7 @@ def test_any_shards_come_back(values: np.ndarray, data: Draw) -> None:
     ]
 
     def extra(writer: ContainerWriter) -> None:
-        writer.add_sharded(
+        writer.add_array(
             "extra/v",
             shape=values.shape,
             dtype=values.dtype,

@@ -23,7 +23,8 @@ The tests prove that the zarr library reads every array equal.
     writer        ContainerWriter: a file for writing
     growing       GrowingContainer: a file that is complete after each layer
 
-Only `array` and `growing` know of the codec of tiles in `transform`. No reader of other formats and
+Only `array` and `growing` know of the codec of tiles in `transform`, and `header` and `reader` of
+the shape of its head. No reader of other formats and
 no writer of regions is imported here.
 """
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import DTYPES
 
 if TYPE_CHECKING:
+    from fhash_formats.transform.stream import TransformCoder
     from fhash_formats.transform.tile_format import TileSettings
 
 Codec = Mapping[str, Any]
@@ -38,57 +39,6 @@ CRC32C: Codec = {"name": "crc32c"}
 _CRC = struct.Struct("<I")
 _ZSTD_MARK = 0xFD2FB528
 _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
-
-
-class ChunkCoder(Protocol):
-    """A coder of chunks of one number type and full shape. All methods raise DamagedFileError for
-    bytes that do not fit, before they allocate for them.
-    """
-
-    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
-        """The bytes of a full chunk."""
-
-    def check(self, data: memoryview) -> None:
-        """Raises DamagedFileError where the bytes of a chunk differ from their checksum."""
-
-    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk at a level of detail, in native byte order; it may be read-only.
-
-        Raises InputError for a level of detail other than 0 of a coder that has none.
-        """
-
-
-class TileCoder(ChunkCoder, Protocol):
-    """The coder of `fhash.transform`, whose chunks are tiles.
-
-    Attributes:
-        settings: settings that all chunks share (`TileSettings`); None where each has its own.
-        axes: axes of tiles along which the array is coded (`ArrayAxes`); None for the usual ones.
-        masked: whether the chunks say which of their values are occupied.
-        parted: whether a part of a chunk may be had sooner than all of it, by the last two methods.
-    """
-
-    settings: Any
-    axes: Any
-    masked: bool
-    parted: bool
-
-    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk before it is corrected."""
-
-    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-        """The full chunk and its mask, of a coder that is `masked`."""
-
-    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
-        """The chunk as `corrected` takes it, of a coder that is `parted`.
-
-        part: slices with explicit ends, of the values that will be wanted. The result is None
-            where they are so many that `decode` takes no longer, and for chunks that are coded
-            otherwise.
-        """
-
-    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """A part of a chunk, with the bits of `decode`. table: what `uncorrected` gave."""
 
 
 class PlainCoder:
@@ -160,7 +110,7 @@ class PlainCoder:
 
 def _transform_coder(
     codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> ChunkCoder:
+) -> TransformCoder:
     """The coder of `fhash.transform`, loaded only for containers that have this codec."""
     from fhash_formats.transform.stream import TransformCoder
 
@@ -168,7 +118,7 @@ def _transform_coder(
 
 
 TRANSFORM = "fhash.transform"
-ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {
+ARRAY_CODECS: dict[str, Callable[..., PlainCoder | TransformCoder]] = {
     "bytes": PlainCoder,
     TRANSFORM: _transform_coder,
 }
@@ -180,7 +130,9 @@ def transform_codecs(settings: TileSettings) -> list[Codec]:
     return [{"name": TRANSFORM, "configuration": {"settings": settings.to_text()}}]
 
 
-def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> ChunkCoder:
+def chunk_coder(
+    codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> PlainCoder | TransformCoder:
     """The coder for chunks of this number type and full shape.
 
     Raises DamagedFileError for a list that is none of codecs, UnsupportedFileError for codecs that
@@ -285,7 +237,7 @@ class Sharding:
         """Bytes of the index of a shard with its CRC-32C."""
         return prod(self.counts) * ENTRY_BYTES + _CRC.size
 
-    def place(self, index: Index) -> tuple[Index, int]:
+    def locate(self, index: Index) -> tuple[Index, int]:
         """The shard in which the inner chunk `index` of an array lies, and its number there."""
         places = [divmod(i, count) for i, count in zip(index, self.counts, strict=True)]
         number = 0
@@ -293,7 +245,7 @@ class Sharding:
             number = number * count + local
         return tuple(shard for shard, _ in places), number
 
-    def parts(self, spans: Sequence[range]) -> Iterator[tuple[Index, list[range]]]:
+    def by_shard(self, spans: Sequence[range]) -> Iterator[tuple[Index, list[range]]]:
         """The shards of some inner chunks of an array, and the inner chunks in each, by axis.
 
         spans: of inner chunks along each axis.
@@ -322,7 +274,7 @@ class Sharding:
     def present(self, shard: Index, shape: Sequence[int]) -> npt.NDArray[np.bool_]:
         """A mask (chunks of the shard,) of those that are present: they hold a vertex of the array.
 
-        `shape` is that of the array; the numbers of the inner chunks are those of `place`.
+        `shape` is that of the array; the numbers of the inner chunks are those of `locate`.
         """
         present = np.ones(1, dtype=bool)
         for s, count, chunk, n in zip(shard, self.counts, self.chunk_shape, shape, strict=True):
@@ -578,15 +530,15 @@ class ArrayMetadata:
         return parse_sharding(self.codecs, self.chunk_shape)
 
     @cached_property
-    def coder(self) -> ChunkCoder:
+    def coder(self) -> PlainCoder | TransformCoder:
         """The coder of full inner chunks."""
         codecs = self.codecs if self.sharding is None else self.sharding.codecs
         return chunk_coder(codecs, self.dtype, self.inner_shape)
 
     @property
-    def tiles(self) -> TileCoder | None:
+    def tiles(self) -> TransformCoder | None:
         """The coder of an array whose chunks are tiles; None for another one."""
-        return cast(TileCoder, self.coder) if self.coding == TRANSFORM else None
+        return None if isinstance(self.coder, PlainCoder) else self.coder
 
     @property
     def coding(self) -> str:

@@ -69,22 +69,23 @@ class TableParts:
 
         A single tile needs no shard, whose index and description would take some 120 bytes.
         """
-        described: dict[str, Any] = {
-            "shape": self.shape,
-            "dtype": self.dtype,
-            "chunk_shape": self.tile,
-            "dimension_names": ("t", "z", "y", "x"),
-            "codecs": transform_codecs(self.settings),
-        }
-        if len(self.streams) == 1:
-            writer.add_array(TABLE, chunks=self.streams, **described)
-            return
-        grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
-        sizes = self.sizes
-        if sizes is None:
-            sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
-        shards = shard_shape(self.tile, grid, sizes)
-        writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(self.streams), **described)
+        shards = None
+        if len(self.streams) > 1:
+            grid = [-(-n // length) for n, length in zip(self.shape, self.tile, strict=True)]
+            sizes = self.sizes
+            if sizes is None:
+                sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
+            shards = shard_shape(self.tile, grid, sizes)
+        writer.add_array(
+            TABLE,
+            shape=self.shape,
+            dtype=self.dtype,
+            chunk_shape=self.tile,
+            shard_shape=shards,
+            chunks=iter(self.streams),
+            dimension_names=("t", "z", "y", "x"),
+            codecs=transform_codecs(self.settings),
+        )
 
 
 PIECE = 8 << 20

@@ -15,6 +15,8 @@ from fhash_formats.container.zip_file import check_major
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.head import MAX_HIDDEN
+from fhash_formats.transform.head import MAX_WIDTH as MAX_HEAD_WIDTH
 
 MAX_LISTED = 1024
 """Positions that are written as a list, also one of `ulps`; a reader takes any number.
@@ -324,14 +326,6 @@ TABLE_TYPES = ("float32", "float16", "uint8", CODED)
 """Values of `model.tables` in the profile paper."""
 PLAIN_TABLE_TYPES = ("float32", "float64")
 """Values of `model.tables` in a plain file of the profile compact."""
-HEAD_INPUTS = 28
-"""Inputs of the first layer of a head."""
-HEAD_CROSS = 9
-"""Vertices at which the second layer of a head with a cross sees the first one's outputs."""
-MAX_HEAD_LAYERS = 3
-"""Hidden layers of a head."""
-MAX_HEAD_WIDTH = 64
-"""Outputs of a hidden layer of a head."""
 MAX_LEVEL = 2**31 - 1
 """Hundredths of a dB that a figure of a step may lie below or above the range."""
 MAX_LEVELS = 64
@@ -681,7 +675,7 @@ def _check_plain(model: Record) -> None:
     head = model.record("head")
     hidden = head.get("hidden")
     count = len(hidden) if isinstance(hidden, list) else 0
-    head.need(1 <= count <= MAX_HEAD_LAYERS, "hidden", f"1 to {MAX_HEAD_LAYERS} widths")
+    head.need(1 <= count <= MAX_HIDDEN, "hidden", f"1 to {MAX_HIDDEN} widths")
     head.integers("hidden", count, 1, MAX_HEAD_WIDTH)
     for key in ("sigma", "low", "high"):
         head.number(key)

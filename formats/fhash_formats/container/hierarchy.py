@@ -56,7 +56,7 @@ class VariablePlaces:
     own: Sequence[str]
 
 
-def part_place(number: int, name: str) -> str:
+def array_path(number: int, name: str) -> str:
     """The path of a variable's array in the group of parts: "parts/0.mlp.weight_1".
 
     Args:
@@ -113,16 +113,16 @@ def read_variables(
     others = []
     for array in arrays:
         if array in nodes:
-            _place(places[nodes[array]], TABLE, array)
+            _add_path(places[nodes[array]], TABLE, array)
         elif array.startswith(f"{PARTS}/"):
             number, _, part = array.removeprefix(f"{PARTS}/").partition(".")
             name = re.sub(r"\.\.|\.", lambda dots: "." if len(dots[0]) == 2 else "/", part)
             owner = int(number) if _NUMBER.fullmatch(number) else len(names)
-            if owner >= len(names) or part_place(owner, name) != array or not name:
+            if owner >= len(names) or array_path(owner, name) != array or not name:
                 raise DamagedFileError(f"array {array} belongs to no variable")
             if name.startswith(COORDINATES):
                 raise DamagedFileError(f"array {array} is a coordinate, which lies at the root")
-            _place(places[names[owner]], name, array)
+            _add_path(places[names[owner]], name, array)
         else:
             others.append(array)
     shared = set()
@@ -131,8 +131,8 @@ def read_variables(
     for name, header in headers.items():
         for part, number in header.get(SHARES, {}).items():
             if part not in own[names[number]]:
-                raise DamagedFileError(f"array {part_place(number, part)} is missing")
-            _place(places[name], part, places[names[number]][part])
+                raise DamagedFileError(f"array {array_path(number, part)} is missing")
+            _add_path(places[name], part, places[names[number]][part])
         for axis, dimension in zip(POSITIONS, header[DIMENSIONS], strict=True):
             if dimension in free:
                 places[name][f"{COORDINATES}{axis}"] = dimension
@@ -214,7 +214,7 @@ def _check_shares(header: Record, count: int) -> None:
         header.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the number of a variable")
 
 
-def _place(places: dict[str, str], name: str, array: str) -> None:
+def _add_path(places: dict[str, str], name: str, array: str) -> None:
     """Note the place of a variable's array; raises DamagedFileError where it has another."""
     if name in places:
         raise DamagedFileError(f"array {array} is {name}, which {places[name]} is already")
@@ -292,7 +292,7 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     return Hierarchy(
         header=header,
         arrays={path: arrays[path] for path in documents},
-        chunks=_place_chunks(arrays, chunk_members),
+        chunks=_chunks_by_index(arrays, chunk_members),
         variables=tuple(variables),
         attributes={name: value for name, value in groups[""].items() if name != "fhash"},
     )
@@ -352,7 +352,7 @@ def member_named(name: str) -> Iterator[None]:
         raise type(error)(f"member {name}: {error}") from error
 
 
-def _place_chunks(
+def _chunks_by_index(
     arrays: Mapping[str, ArrayMetadata], members: list[tuple[str, str, Member]]
 ) -> dict[str, dict[tuple[int, ...], Member]]:
     """The members of chunks by name of the array and index of the chunk.

@@ -21,8 +21,6 @@ from fhash_formats.container.header import (
     CODED,
     COMPACT,
     COUNTS,
-    HEAD_CROSS,
-    HEAD_INPUTS,
     LOWEST,
     MASK_ARRAY,
     MASK_FEATURES,
@@ -64,6 +62,7 @@ from fhash_formats.container.zip_file import (
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.series import Coordinate, meant
 from fhash_formats.support.files import is_url, local_path
+from fhash_formats.transform.head import layer_inputs
 
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
 """Name, shape and allowed number types of an array."""
@@ -135,23 +134,17 @@ def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
 def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
     """(outputs, inputs) of each layer of the network or the head, from the header's `model`."""
     if model.get("profile") == COMPACT:
-        return _head_shapes(model["head"])
+        head = model["head"]
+        if head is None:
+            return []
+        inputs = layer_inputs(head["hidden"], head["cross"])
+        return list(zip([*head["hidden"], 1], inputs, strict=True))
     widths = [
         len(model["levels"]) * model["embedding_size"],
         *[model["width"]] * model["hidden_layers"],
         1,
     ]
     return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
-
-
-def _head_shapes(head: Mapping[str, Any] | None) -> list[tuple[int, int]]:
-    """(outputs, inputs) of each layer of a head; none without a head."""
-    if head is None:
-        return []
-    inputs = [HEAD_INPUTS, *head["hidden"]]
-    if head["cross"]:
-        inputs[1] *= HEAD_CROSS
-    return list(zip([*head["hidden"], 1], inputs, strict=True))
 
 
 def _required_arrays(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from fhash_formats.errors import DamagedFileError, InputError
@@ -130,15 +130,19 @@ class Record:
 
     def records(self, key: str) -> list[Record]:
         """The value of `key`, a list of objects."""
-        values = self.get(key)
-        self.need(
-            isinstance(values, list) and all(isinstance(value, Mapping) for value in values),
-            key,
-            "a list of objects",
-        )
+        values = self._all(key, lambda value: isinstance(value, Mapping), "a list of objects")
         return [
             Record(value, f"{self._prefix}{key}.{number}.") for number, value in enumerate(values)
         ]
+
+    def _all(
+        self, key: str, fits: Callable[[Any], bool], allowed: str, count: int | None = None
+    ) -> list[Any]:
+        """The value of `key`, a list of `count` values, or of any number, that all fit."""
+        values = self.get(key)
+        good = isinstance(values, list) and count in (None, len(values)) and all(map(fits, values))
+        self.need(good, key, allowed)
+        return list(values)
 
     def text(self, key: str) -> str:
         """The value of `key`, a string."""
@@ -148,13 +152,7 @@ class Record:
 
     def texts(self, key: str) -> list[str]:
         """The value of `key`, a list of strings."""
-        values = self.get(key)
-        self.need(
-            isinstance(values, list) and all(isinstance(value, str) for value in values),
-            key,
-            "a list of strings",
-        )
-        return list(values)
+        return self._all(key, lambda value: isinstance(value, str), "a list of strings")
 
     def choice(self, key: str, allowed: tuple[str, ...]) -> str:
         """The value of `key`, one of the strings `allowed`."""
@@ -172,14 +170,8 @@ class Record:
 
     def integers(self, key: str, count: int, low: int, high: int) -> list[int]:
         """The value of `key`, a list of `count` whole numbers from `low` to `high`."""
-        values = self.get(key)
-        fits = (
-            isinstance(values, list)
-            and len(values) == count
-            and all(type(n) is int and low <= n <= high for n in values)
-        )
-        self.need(fits, key, f"{count} whole numbers from {low} to {high}")
-        return list(values)
+        allowed = f"{count} whole numbers from {low} to {high}"
+        return self._all(key, lambda n: type(n) is int and low <= n <= high, allowed, count)
 
     def number(self, key: str) -> float:
         """The value of `key`, a finite number."""
@@ -193,24 +185,13 @@ class Record:
 
     def numbers_or_null(self, key: str, count: int) -> None:
         """Refuse the value of `key` unless it is a list of `count` finite numbers or null."""
-        values = self.get(key)
-        fits = (
-            isinstance(values, list)
-            and len(values) == count
-            and all(value is None or _is_finite(value) for value in values)
-        )
-        self.need(fits, key, f"{count} finite numbers or null")
+        allowed = f"{count} finite numbers or null"
+        self._all(key, lambda value: value is None or _is_finite(value), allowed, count)
 
     def numbers(self, key: str, count: int) -> list[float]:
         """The value of `key`, a list of `count` finite numbers; integers beyond 2^53 stay such."""
-        values = self.get(key)
-        fits = (
-            isinstance(values, list)
-            and len(values) == count
-            and all(_is_finite(value) for value in values)
-        )
-        self.need(fits, key, f"{count} finite numbers")
-        return [exact_number(value) for value in values]
+        found = self._all(key, _is_finite, f"{count} finite numbers", count)
+        return [exact_number(value) for value in found]
 
 
 def _is_finite(value: object) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
 from itertools import count
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from fhash_formats.container.zip_file import CHANGED, Range, Request, Source, check_range, merged
 from fhash_formats.errors import (
@@ -43,26 +43,6 @@ CONNECTIONS = 8
 """Requests at once. Further ones rarely are faster, and servers refuse clients with many."""
 
 
-class RemoteFile(Protocol):
-    """A file elsewhere; several threads may call its methods.
-
-    Attributes:
-        size: number of bytes.
-        connections: requests at once that it allows.
-    """
-
-    size: int
-    connections: int
-
-    def fetch(self, start: int, stop: int) -> bytes:
-        """The bytes [start, stop), by one request; raises InputError where it fails for good."""
-        ...
-
-    def changed(self) -> bool:
-        """Whether another file is there now."""
-        ...
-
-
 class _Fetch:
     """A request, its bytes once they came, and whether anybody began to fetch and to read them."""
 
@@ -78,8 +58,8 @@ class RemoteSource(Source):
 
     gap = GAP
 
-    def __init__(self, file: RemoteFile) -> None:
-        """Read the end of a file. Raises what `RemoteFile.fetch` raises."""
+    def __init__(self, file: FsspecFile) -> None:
+        """Read the end of a file. Raises what `FsspecFile.fetch` raises."""
         self._file = file
         self.size = file.size
         self._tail_start = max(0, self.size - TAIL_BYTES)
@@ -180,8 +160,8 @@ class RemoteSource(Source):
             if mine:
                 with suppress(ValueError):
                     self._waiting.remove(fetch)
-            if fetch.request.place in self._kept:
-                self._kept.move_to_end(fetch.request.place)
+            if fetch.request.span in self._kept:
+                self._kept.move_to_end(fetch.request.span)
         self._begin_more()
         if mine:
             self._run(fetch)
@@ -220,9 +200,9 @@ class RemoteSource(Source):
             return
         with self._lock:
             announced = self._fetches.get(request.ranges[0]) is fetch
-            if announced and request.place not in self._kept:
-                self._kept[request.place] = fetch
-                insort(self._kept_places, request.place)
+            if announced and request.span not in self._kept:
+                self._kept[request.span] = fetch
+                insort(self._kept_places, request.span)
                 self._kept_bytes += request.size
                 while self._kept_bytes > KEPT_BYTES:
                     place, dropped = self._kept.popitem(last=False)
@@ -271,7 +251,7 @@ Result = TypeVar("Result")
 
 
 class FsspecFile:
-    """A file of an fsspec file system (`RemoteFile`); several threads may call its methods.
+    """A file of an fsspec file system; several threads may call its methods.
 
     Attributes:
         size: number of bytes.

@@ -40,8 +40,6 @@ from fhash_formats.support.values import (
     typed_attribute,
 )
 
-__all__ = ["AUXILIARY", "SOURCE", "check_source", "describe_metadata", "narrowed", "read_metadata"]
-
 SOURCE = "source"
 """Key of the header."""
 AUXILIARY = "auxiliary/"
@@ -104,13 +102,8 @@ class _Room:
 
 def check_source(header: Mapping[str, Any], arrays: Mapping[str, Readable]) -> None:
     """Check the header's `source` and its arrays; raises DamagedFileError that names the key."""
-    if has_source(header):
+    if SOURCE in header:
         _parsed(header, arrays, _Room())
-
-
-def has_source(header: Mapping[str, Any]) -> bool:
-    """Whether a header describes its source."""
-    return SOURCE in header
 
 
 def read_metadata(
@@ -120,7 +113,7 @@ def read_metadata(
 
     arrays: StoredArray by name. coords: those of the container.
     """
-    if not has_source(header):
+    if SOURCE not in header:
         return None
     room = _Room()
     dimensions, entries = _parsed(header, arrays, room)
@@ -144,11 +137,11 @@ def read_metadata(
         )
     return SourceMetadata(
         dimensions=dimensions,
-        variable_attributes=_attributes(
-            entry, "variable", header["variable"]["attributes"], _Room()
+        variable_attributes=_changed(
+            entry.get("variable", {}), header["variable"]["attributes"], _Room()
         ),
         variables=tuple(variables),
-        attributes=_attributes(entry, "attributes", {}, _Room()),
+        attributes=_changed(entry.get("attributes", {}), {}, _Room()),
         stored=entry.get("stored"),
         file=entry.get("file"),
         digest=entry.get("digest"),
@@ -175,8 +168,8 @@ def _parsed(
             top.text(key)
     if top.has("stored"):
         top.choice("stored", tuple(DTYPES))
-    _attributes(header[SOURCE], "variable", header["variable"]["attributes"], room)
-    _attributes(header[SOURCE], "attributes", {}, room)
+    _changed(header[SOURCE].get("variable", {}), header["variable"]["attributes"], room)
+    _changed(header[SOURCE].get("attributes", {}), {}, room)
     records = top.records("variables") if top.has("variables") else []
     top.need(len(records) <= MAX_VARIABLES, "variables", f"at most {MAX_VARIABLES} of them")
     entries: list[_Entry] = []
@@ -322,12 +315,6 @@ def narrowed(positions: npt.NDArray[np.float64], dtype: np.dtype[Any]) -> npt.ND
     """Positions in another type, which holds them where the file is sound."""
     with np.errstate(over="ignore", invalid="ignore"):
         return positions.astype(dtype)
-
-
-def _attributes(
-    entry: Mapping[str, Any], key: str, base: Mapping[str, Any], room: _Room
-) -> dict[str, Any]:
-    return _changed(entry.get(key, {}), base, room)
 
 
 def _changed(changes: object, base: Mapping[str, Any], room: _Room) -> dict[str, Any]:

@@ -146,7 +146,7 @@ SPARSE_SHARE = 4
 """Index entries are read one by one for fewer than one in SPARSE_SHARE inner chunks of a shard."""
 
 
-class ShardPlaces:
+class ShardIndices:
     """Indices of an array's shards, each read once; safe for several threads."""
 
     def __init__(
@@ -170,7 +170,7 @@ class ShardPlaces:
 
         Raises DamagedFileError that names the member.
         """
-        parts = list(self._sharding.parts(spans))
+        parts = list(self._sharding.by_shard(spans))
         if self._source.gap:
             self._source.prefetch(self._unread(parts))
         for shard, in_shard in parts:
@@ -178,14 +178,14 @@ class ShardPlaces:
                 self._index(shard)
             else:
                 for index in product(*in_shard):
-                    self._entry(*self._sharding.place(index))
+                    self._entry(*self._sharding.locate(index))
 
-    def place(self, index: Index) -> tuple[Index, int, int, int]:
+    def locate(self, index: Index) -> tuple[Index, int, int, int]:
         """The shard of an inner chunk, its number there, and its offset in the member and bytes.
 
         Raises DamagedFileError that names the member.
         """
-        shard, number = self._sharding.place(index)
+        shard, number = self._sharding.locate(index)
         return shard, number, *self._entry(shard, number)
 
     def _wholly(self, in_shard: Sequence[range]) -> bool:
@@ -203,12 +203,12 @@ class ShardPlaces:
             member = self._members[shard]
             start = member.data_offset + member.size - self._sharding.index_bytes
             if start < member.data_offset:
-                continue  # damage, which `_index_place` tells
+                continue  # damage, which `_index_span` tells
             if self._wholly(in_shard):
                 yield start, self._sharding.index_bytes
             else:
                 for index in product(*in_shard):
-                    number = self._sharding.place(index)[1]
+                    number = self._sharding.locate(index)[1]
                     yield start + number * ENTRY_BYTES, ENTRY_BYTES
 
     def _entry(self, shard: Index, number: int) -> tuple[int, int]:
@@ -222,7 +222,7 @@ class ShardPlaces:
                 return int(index[number, 0]), int(index[number, 1])
             entry = self._entries.get((shard, number))
             if entry is None:
-                with self._index_place(shard) as (start, data_bytes):
+                with self._index_span(shard) as (start, data_bytes):
                     entry = parse_entry(
                         self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes
                     )
@@ -234,7 +234,7 @@ class ShardPlaces:
         with self._lock:
             if shard in self._indices:
                 return
-            with self._index_place(shard) as (start, data_bytes):
+            with self._index_span(shard) as (start, data_bytes):
                 self._indices[shard] = parse_index(
                     self._source.read(start, self._sharding.index_bytes),
                     self._sharding.present(shard, self._shape),
@@ -242,7 +242,7 @@ class ShardPlaces:
                 )
 
     @contextmanager
-    def _index_place(self, shard: Index) -> Iterator[tuple[int, int]]:
+    def _index_span(self, shard: Index) -> Iterator[tuple[int, int]]:
         """A block that reads a shard's index; its errors name the member.
 
         Yields the offset of the index in the file, and the number of bytes in the shard before it.
@@ -313,7 +313,7 @@ class StoredArray:
         self.nbytes_stored = sum(member.size for member in chunks.values())
         sharding = metadata.sharding
         self._shards = (
-            None if sharding is None else ShardPlaces(sharding, self.shape, chunks, source)
+            None if sharding is None else ShardIndices(sharding, self.shape, chunks, source)
         )
         self._ahead = Ahead()
 
@@ -334,7 +334,7 @@ class StoredArray:
             RegionError: for a region outside the array.
             DamagedFileError: for a damaged chunk.
         """
-        return self._gathered(region, self._part, self.dtype)
+        return self._gathered(region, self._region, self.dtype)
 
     def read_mask(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[np.bool_]:
         """A mask of the occupied values in `region`, which is that of `read`.
@@ -345,7 +345,7 @@ class StoredArray:
         """
         if not self.masked:
             return np.ones([stop - start for start, stop in self._bounds(region)], dtype=bool)
-        return self._gathered(region, self._mask_part, np.dtype(bool))
+        return self._gathered(region, self._mask_region, np.dtype(bool))
 
     def _gathered(
         self,
@@ -464,7 +464,7 @@ class StoredArray:
             self._announce(product(*spans))
             return map(work, product(*spans))
         # The indices are read once for all chunks of a shard, before threads that all need them.
-        self._read_places(spans)
+        self._read_indices(spans)
         indices = list(product(*spans))
         missing = sum(not cached(index) for index in indices)
         after: list[Index] = []
@@ -490,10 +490,10 @@ class StoredArray:
         """
         if self._source.gap:
             with damage_named(self._path, self._source):
-                self._read_places(spans)
+                self._read_indices(spans)
                 self._announce(product(*spans), (self.name, self.name + TABLE), lod)
 
-    def _read_places(self, spans: Sequence[range]) -> None:
+    def _read_indices(self, spans: Sequence[range]) -> None:
         """Read where chunks lie in their shards."""
         if self._shards is not None:
             self._shards.read(spans)
@@ -506,17 +506,17 @@ class StoredArray:
         if self._source.gap:
             names = names or (self.name, self.name + UNCORRECTED)
             self._source.prefetch(
-                self._place(index)
+                self._span(index)
                 for index in indices
                 if all(self._cache.get((name, index, lod)) is None for name in names)
             )
 
-    def _place(self, index: Index) -> tuple[int, int]:
+    def _span(self, index: Index) -> tuple[int, int]:
         """Offset in the file and bytes of what `_stored_chunk` reads of an inner chunk."""
         if self._shards is None:
             member = self.chunks[index]
             return member.offset, member.header_size + member.size
-        shard, _, offset, size = self._shards.place(index)
+        shard, _, offset, size = self._shards.locate(index)
         return self.chunks[shard].data_offset + offset, size
 
     def _chunk(self, index: Index, lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
@@ -524,7 +524,7 @@ class StoredArray:
         cached = self._cache.get((self.name, index, lod))
         return self._decoded(index, lod, keep)[0] if cached is None else cached
 
-    def _part(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+    def _region(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
         """A part of a chunk; of one that was not read before, where it can, without the rest."""
         tiles, places = self._tiles, ((self.name, index, 0), (self.name + UNCORRECTED, index, 0))
         known = any(self._cache.get(place) is not None for place in places)
@@ -538,7 +538,7 @@ class StoredArray:
         self._cache.put(places[table is not None], kept)
         return values[part] if table is None else values
 
-    def _mask_part(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+    def _mask_region(self, index: Index, part: Part, *, keep: bool) -> npt.NDArray[Any]:
         """A part of the mask of a chunk."""
         return self._mask(index, keep=keep)[part]
 
@@ -589,7 +589,7 @@ class StoredArray:
 
     def coded_bytes(self, index: Index) -> int:
         """The number of bytes that `coded` returns, without reading them."""
-        return self.chunks[index].size if self._shards is None else self._place(index)[1]
+        return self.chunks[index].size if self._shards is None else self._span(index)[1]
 
     @contextmanager
     def _stored_chunk(self, index: Index) -> Iterator[memoryview]:
@@ -599,7 +599,7 @@ class StoredArray:
             member, place = self.chunks[index], ""
             data = read_member(self._source, member)
         else:
-            shard, number, offset, size = shards.place(index)
+            shard, number, offset, size = shards.locate(index)
             member, place = self.chunks[shard], f"inner chunk {number}: "
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from fhash_formats.container.array import (
     ArrayMetadata,
     Codec,
-    Sharding,
     pack_index,
     plain_codecs,
     sharding_codecs,
@@ -35,9 +34,9 @@ from fhash_formats.container.hierarchy import (
     SHARES,
     SHOWN_ATTRIBUTES,
     VARIABLES,
+    array_path,
     consolidated,
     free_node,
-    part_place,
     shows_values,
 )
 from fhash_formats.container.reader import Container
@@ -79,55 +78,45 @@ def cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDA
         ]
 
 
-def expect_end(name: str, metadata: ArrayMetadata, chunks: Iterator[Any]) -> None:
-    """Raise InputError if chunks are left that the grid of the array has no place for."""
-    if next(chunks, None) is not None:
-        grid = metadata.inner_grid
-        raise InputError(
-            f"array {name}: more chunks were given than the {prod(grid)} of the grid {grid}"
-        )
-
-
-def shard_parts(
+def member_parts(
     name: str,
     metadata: ArrayMetadata,
-    sharding: Sharding,
-    shard: tuple[int, ...],
+    index: tuple[int, ...],
     chunks: Iterator[Coded | tuple[tuple[int, ...], Coded]],
 ) -> list[bytes]:
-    """The parts of a shard, in the order of the file: its inner chunks in C order, and its index.
+    """The parts of a member, in the order of the file: a chunk, or the inner chunks of a shard in C
+    order, and its index.
 
     Args:
         name: the array's, for messages.
         metadata: the array's.
-        sharding: the array's.
-        shard: index of the shard.
-        chunks: takes the shard's inner chunks from here, each alone (then in C order) or with its
-            index in the array's grid of inner chunks (then in any order).
+        index: of the chunk or the shard.
+        chunks: takes the inner chunks from here, each alone (then in C order) or with its index in
+            the array's grid of inner chunks (then in any order).
 
     Raises:
         InputError: if an inner chunk is missing, given twice, or does not fit.
     """
-    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(
-        sharding.chunks_of(shard, metadata.shape)
-    )
-    for expected in list(coded):
+    sharding = metadata.sharding
+    expected = [index] if sharding is None else sharding.chunks_of(index, metadata.shape)
+    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(expected)
+    for place in list(coded):
         item = next(chunks, None)
         if item is None:
             raise InputError(
-                f"array {name}: chunk {expected} was not given; the grid has {metadata.inner_grid}"
+                f"array {name}: chunk {place} was not given; the grid has {metadata.inner_grid}"
             )
-        index, chunk = item if isinstance(item, tuple) else (expected, item)
-        if coded.get(index, b"") is not None:
+        at, chunk = item if isinstance(item, tuple) else (place, item)
+        if coded.get(at, b"") is not None:
             raise InputError(
-                f"array {name}: chunk {index} is none of shard {shard}, or was given twice"
+                f"array {name}: chunk {at} is none of shard {index}, or was given twice"
             )
-        coded[index] = coded_chunk(name, metadata, index, chunk)
+        coded[at] = coded_chunk(name, metadata, at, chunk)
     inner_chunks = [data for data in coded.values() if data is not None]
-    return [
-        *inner_chunks,
-        pack_index([len(data) for data in inner_chunks], sharding.present(shard, metadata.shape)),
-    ]
+    if sharding is None:
+        return inner_chunks
+    sizes = [len(data) for data in inner_chunks]
+    return [*inner_chunks, pack_index(sizes, sharding.present(index, metadata.shape))]
 
 
 def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
@@ -322,89 +311,50 @@ class ContainerWriter:
         shape: Sequence[int],
         dtype: npt.DTypeLike,
         chunk_shape: Sequence[int],
-        chunks: Iterable[Coded],
+        chunks: Iterable[Coded | tuple[tuple[int, ...], Coded]],
+        shard_shape: Sequence[int] | None = None,
         dimension_names: Sequence[str | None] | None = None,
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array chunk by chunk; never more than one chunk is held.
+        """Write an array; never more than one chunk, or the coded bytes of one shard, is held.
 
         Args:
             name: of the array (FORMAT.md, Arrays).
             shape: length of each axis.
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
-            chunks: the chunks in C order of their grid; those at an end of the array reach as far
-                as the array does. A chunk may also be the bytes that the coder of its first codec
-                made of the full chunk.
+            chunks: the chunks in C order of their grid, or of shards in that of `shard_order`;
+                those at an end of the array reach as far as the array does. A chunk may also be the
+                bytes that the coder of its first codec made of the full chunk. Chunks of shards may
+                come as (index, chunk) with their index in the grid: then shards come in C order,
+                and the chunks of a shard in any order.
+            shard_shape: shape of a shard, a multiple of `chunk_shape`; None for no shards.
             dimension_names: names of the axes.
             attributes: JSON values.
-            codecs: a list as in Zarr's metadata; by default `bytes`, `zstd`, `crc32c`.
+            codecs: of the chunks, a list as in Zarr's metadata; by default `bytes`, `zstd`,
+                `crc32c`.
 
         Raises:
             InputError: for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
         coding = plain_codecs(number_type) if codecs is None else codecs
+        if shard_shape is not None:
+            coding = sharding_codecs([int(n) for n in chunk_shape], coding)
+        member_shape = chunk_shape if shard_shape is None else shard_shape
         metadata = self._begin(
-            name, shape, number_type, chunk_shape, coding, dimension_names, attributes
+            name, shape, number_type, member_shape, coding, dimension_names, attributes
         )
         remaining = iter(chunks)
         for index in product(*(range(n) for n in metadata.grid)):
-            chunk = next(remaining, None)
-            if chunk is None:
-                raise InputError(
-                    f"array {name}: chunk {index} was not given; the grid has {metadata.grid}"
-                )
-            coded = coded_chunk(name, metadata, index, chunk)
-            self._add(name, metadata.chunk_key(index), [coded])
-        expect_end(name, metadata, remaining)
-
-    def add_sharded(
-        self,
-        name: str,
-        *,
-        shape: Sequence[int],
-        dtype: npt.DTypeLike,
-        chunk_shape: Sequence[int],
-        shard_shape: Sequence[int],
-        chunks: Iterable[Coded | tuple[tuple[int, ...], Coded]],
-        dimension_names: Sequence[str | None] | None = None,
-        attributes: Mapping[str, Any] | None = None,
-        codecs: Sequence[Codec] | None = None,
-    ) -> None:
-        """Write an array of shards; the coded bytes of one shard are held at a time.
-
-        Args:
-            name: of the array.
-            shape: length of each axis.
-            dtype: number type of the array.
-            chunk_shape: shape of a full chunk within a shard.
-            shard_shape: shape of a shard, a multiple of `chunk_shape`.
-            chunks: the chunks in the order of `shard_order`. Each may instead come as (index,
-                chunk) with its index in the grid of chunks: then shards come in C order, and the
-                chunks of a shard in any order. A chunk is an array as in `add_array`, or the bytes
-                that its coder made of the full chunk.
-            dimension_names: names of the axes.
-            attributes: JSON values.
-            codecs: of the chunks, as in `add_array`.
-
-        Raises:
-            InputError: for anything that does not fit together.
-        """
-        number_type = np.dtype(dtype).newbyteorder("=")
-        coding = sharding_codecs(
-            [int(n) for n in chunk_shape], plain_codecs(number_type) if codecs is None else codecs
-        )
-        metadata = self._begin(
-            name, shape, number_type, shard_shape, coding, dimension_names, attributes
-        )
-        assert metadata.sharding is not None
-        remaining = iter(chunks)
-        for shard in product(*(range(n) for n in metadata.grid)):
-            parts = shard_parts(name, metadata, metadata.sharding, shard, remaining)
-            self._add(name, metadata.chunk_key(shard), parts)
-        expect_end(name, metadata, remaining)
+            parts = member_parts(name, metadata, index, remaining)
+            self._add(name, metadata.chunk_key(index), parts)
+        if next(remaining, None) is not None:
+            grid = metadata.inner_grid
+            raise InputError(
+                f"array {name}: more chunks were given than the {prod(grid)} of the grid {grid}"
+            )
 
     def add_whole(
         self,
@@ -694,11 +644,7 @@ class ContainerWriter:
         return b"".join([*tail, ending(members)])
 
     def _check_name(self, name: str) -> None:
-        if (
-            not NAME.fullmatch(name)
-            or len(name) > MAX_NAME // 2
-            or name.rpartition("/")[2] == DOCUMENT
-        ):
+        if not NAME.fullmatch(name) or len(name) > MAX_NAME // 2:
             raise InputError(
                 f"array name {name[:80]!a} is not allowed; "
                 f"allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
@@ -712,7 +658,7 @@ class ContainerWriter:
             return self._node_of(name.removeprefix(COORDINATES))
         variable = self._current()
         return (
-            variable.node if name == TABLE and variable.shown else part_place(variable.number, name)
+            variable.node if name == TABLE and variable.shown else array_path(variable.number, name)
         )
 
     def _add(self, name: str, key: str, parts: Sequence[bytes]) -> None:

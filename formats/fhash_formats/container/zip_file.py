@@ -41,7 +41,7 @@ class Request:
     ranges: tuple[Range, ...]
 
     @property
-    def place(self) -> Range:
+    def span(self) -> Range:
         """The range that all others lie in."""
         return self.start, self.size
 

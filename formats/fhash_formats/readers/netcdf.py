@@ -50,12 +50,11 @@ from fhash_formats.readers.common.variables import (
 )
 from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.series import AXES, Coordinate, SourceMetadata, shown_name
-from fhash_formats.support.values import STORED, is_wide_integer, json_attributes, text_of
+from fhash_formats.support.values import STORED, Values, is_wide_integer, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Values = npt.NDArray[Any]
 Exact = Callable[[Values, tuple[slice, ...]], Values]
 
 DEFAULT_FILLS = {

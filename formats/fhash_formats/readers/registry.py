@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -143,18 +144,38 @@ HDF5, since their files are HDF5 too.
 """
 
 
-def open_series(
-    path: str | Path,
-    *,
-    var: str | None = None,
+class Wishes(TypedDict, total=False):
+    """Wishes for a reading, each of which may be left out; `open_series` explains them."""
+
+    var: str | None
+    axes: str | None
+    raw: RawLayout | None
+    missing: Sequence[float]
+    raw_values: bool
+    select: Mapping[str, int | str] | None
+    keep_extremes: bool
+    no_external: bool
+
+
+def _request(
     axes: str | None = None,
-    steps: slice | None = None,
     raw: RawLayout | None = None,
     missing: Sequence[float] = (),
-    raw_values: bool = False,
     select: Mapping[str, int | str] | None = None,
-    keep_extremes: bool = False,
-    no_external: bool = False,
+    **others: Any,
+) -> Request:
+    """The request that wishes make; raises InputError for axes of another form."""
+    return Request(
+        axes=None if axes is None else parse_axes(axes),
+        raw=None if raw == RawLayout() else raw,
+        missing=tuple(missing),
+        select=selection(select),
+        **others,
+    )
+
+
+def open_series(
+    path: str | Path, *, steps: slice | None = None, **wishes: Unpack[Wishes]
 ) -> Series:
     """Open a time-varying volume in any supported format; its frames are read later, one by one.
 
@@ -180,17 +201,7 @@ def open_series(
     MissingInputError, InputError for an unsuitable input, and MissingDependencyError that names
     what to install.
     """
-    request = Request(
-        var=var,
-        axes=None if axes is None else parse_axes(axes),
-        raw=None if raw == RawLayout() else raw,
-        missing=tuple(missing),
-        raw_values=raw_values,
-        select=selection(select),
-        keep_extremes=keep_extremes,
-        no_external=no_external,
-    )
-    series = open_whole(path, request)
+    series = open_whole(path, _request(**wishes))
     if series.remark:
         warnings.warn(f"{path}: {series.remark}", FhashWarning, stacklevel=2)
     try:
@@ -205,16 +216,7 @@ def open_series(
 
 
 def list_variables(
-    path: str | Path,
-    *,
-    var: str | None = None,
-    axes: str | None = None,
-    steps: slice | None = None,
-    raw: RawLayout | None = None,
-    missing: Sequence[float] = (),
-    raw_values: bool = False,
-    select: Mapping[str, int | str] | None = None,
-    no_external: bool = False,
+    path: str | Path, *, steps: slice | None = None, **wishes: Unpack[Wishes]
 ) -> list[Listed]:
     """The variables of anything that `open_series` reads, whether or not they can be encoded.
 
@@ -223,16 +225,7 @@ def list_variables(
     listed. Raises as `open_series` does for a source that cannot be read at all, and where no
     variable has one of the steps.
     """
-    text = str(path)
-    request = Request(
-        var=var,
-        axes=None if axes is None else parse_axes(axes),
-        raw=None if raw == RawLayout() else raw,
-        missing=tuple(missing),
-        raw_values=raw_values,
-        select=selection(select),
-        no_external=no_external,
-    )
+    text, request = str(path), _request(**wishes)
     place = files_of(text)[0] if is_pattern(text) else Path(path)
     found = find_reader(place, request)
     found.refuse_unused(place, request)
@@ -287,10 +280,10 @@ def open_whole(path: str | Path, request: Request) -> Series:
         if pages is not None:
             warn_of_gaps(text, files)
             return pages.as_asked(request)
-    return JoinedSeries(text, files, lambda file: _open_part(file, request))
+    return JoinedSeries(text, files, lambda file: _open_of_pattern(file, request))
 
 
-def _open_part(path: Path, request: Request) -> FileSeries:
+def _open_of_pattern(path: Path, request: Request) -> FileSeries:
     """Open one file of a pattern."""
     part = _open_one(path, replace(request, digested=False))
     if isinstance(part, FileSeries):
@@ -400,13 +393,13 @@ class Mask:
         self._values.close()
 
 
-def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) -> Mask:
+def open_mask(path: str | Path, shape: Sequence[int]) -> Mask:
     """Open a mask for a series of `shape` (t, z, y, x).
 
     The file holds booleans or numbers of that shape, or of (z, y, x) for all steps alike, in any
     format that `open_series` reads. Raises InputError for another shape.
     """
-    values = open_whole(path, Request(var=var, booleans=True, asked=False))
+    values = open_whole(path, Request(booleans=True, asked=False))
     if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
         values.close()
         raise InputError(

@@ -34,7 +34,7 @@ from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, NotStored
-from fhash_formats.support.values import PLUMBING, json_attributes, text_of
+from fhash_formats.support.values import PLUMBING, Values, json_attributes, text_of
 
 XML_SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")
@@ -286,30 +286,38 @@ def _frame(grid: _Grid, array: _Array, component: int) -> npt.NDArray[Any]:
 
 def _positions(grid: _Grid, place: str) -> dict[str, Coordinate]:
     """Coordinates of the points or of the centres of cells, and the time where the file has it."""
-    shape = dict(zip(SPACE, _shape(grid.extent, place), strict=True))
     if grid.element.name.endswith("ImageData"):
-        coords = _even(grid, shape, cells=place == "CellData")
+        # A parallel file may leave out what its pieces say, such as the direction.
+        attributes = {**grid.holders[-2][0].attributes, **grid.element.attributes}
+        origin, spacing, direction = (
+            _numbers(attributes.get(name, default), len(default.split()))
+            for name, default in (
+                ("Origin", "0 0 0"),
+                ("Spacing", "1 1 1"),
+                ("Direction", "1 0 0 0 1 0 0 0 1"),
+            )
+        )
+        coords = _even(grid.extent, place, origin, spacing, direction)
     else:
         coords = _listed(grid, cells=place == "CellData")
     time = _time(grid)
     return coords if time is None else {**coords, "t": time}
 
 
-def _even(grid: _Grid, shape: dict[str, int], *, cells: bool) -> dict[str, Coordinate]:
-    # A parallel file may leave out what its pieces say, such as the direction.
-    own = grid.holders[-2][0].attributes
-    attributes = {**own, **grid.element.attributes}
-    origin, spacing = (
-        _numbers(attributes.get(name, default), 3)
-        for name, default in (("Origin", "0 0 0"), ("Spacing", "1 1 1"))
-    )
-    direction = _numbers(attributes.get("Direction", "1 0 0 0 1 0 0 0 1"), 9)
+def _even(
+    extent: Extent, place: str, origin: Values, spacing: Values, direction: Values
+) -> dict[str, Coordinate]:
+    """Coordinates of an even grid: of its points, or of the centres of its cells.
+
+    origin, spacing: along x, y and z. direction: a matrix (3, 3), row by row.
+    """
     spacing = spacing * axis_steps(direction.reshape(3, 3))
     coords = {}
-    for axis, (first, last) in zip(SPACE, grid.extent, strict=True):
+    lengths = _shape(extent, place)
+    for axis, (first, last), length in zip(SPACE, extent, lengths, strict=True):
         number = "xyz".index(axis)
-        start = first + (0.5 if cells and last > first else 0.0)
-        coords[axis] = lattice(axis, origin[number], spacing[number], shape[axis], first=start)
+        start = first + (0.5 if place == "CellData" and last > first else 0.0)
+        coords[axis] = lattice(axis, origin[number], spacing[number], length, first=start)
     return coords
 
 
@@ -423,7 +431,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     kind = text_of(root.attrs.get("Type", b"")) if isinstance(root, h5py.Group) else "none"
     if kind != "ImageData":
         raise InputError(f"it holds VTKHDF data of the type {kind or '?'}; ImageData can be read")
-    extent = _row(root, "WholeExtent", 6).astype(np.int64).reshape(3, 2)[::-1]
+    extent = _extent(" ".join(f"{end:.0f}" for end in _row(root, "WholeExtent", 6)))
     times = _times(root)
     variables = list(_datasets(root, extent, times))
     variable = choose_component(source, variables, request)
@@ -481,14 +489,8 @@ def _times(root: Any) -> npt.NDArray[np.float64] | None:
     return times
 
 
-def _shape_of_extent(extent: npt.NDArray[np.int64], place: str) -> tuple[int, int, int]:
-    points = extent[:, 1] - extent[:, 0] + 1
-    z, y, x = points if place == "PointData" else np.maximum(points - 1, 1)
-    return int(z), int(y), int(x)
-
-
 def _datasets(
-    root: Any, extent: npt.NDArray[np.int64], times: npt.NDArray[np.float64] | None
+    root: Any, extent: Extent, times: npt.NDArray[np.float64] | None
 ) -> Iterator[Variable]:
     """Arrays of points and cells; the place precedes a name that both have."""
     import h5py
@@ -503,7 +505,7 @@ def _datasets(
     for place, name, dataset in found:
         if not isinstance(dataset, h5py.Dataset):
             continue
-        space = _shape_of_extent(extent, place)
+        space = _shape(extent, place)
         leading = 0 if times is None else 1
         shape: tuple[int, ...] = dataset.shape or ()
         error = ""
@@ -538,20 +540,13 @@ def _entries(
 
 def _coordinates(
     root: Any,
-    extent: npt.NDArray[np.int64],
+    extent: Extent,
     array: _Dataset,
     times: npt.NDArray[np.float64] | None,
 ) -> dict[str, Coordinate]:
     origin, spacing = _row(root, "Origin", 3), _row(root, "Spacing", 3)
     direction = _row(root, "Direction", 9) if "Direction" in root.attrs else np.eye(3).ravel()
-    spacing = spacing * axis_steps(direction.reshape(3, 3))
-    coords = {}
-    for axis, (first, last), count in zip(
-        SPACE, extent, _shape_of_extent(extent, array.place), strict=True
-    ):
-        number = "xyz".index(axis)
-        start = first + (0.5 if array.place == "CellData" and last > first else 0.0)
-        coords[axis] = lattice(axis, origin[number], spacing[number], count, first=start)
+    coords = _even(extent, array.place, origin, spacing, direction)
     stored = root["Steps/Values"] if times is not None else root.get("FieldData/TimeValue")
     if times is None and stored is not None and stored.size == 1:
         times = np.asarray(stored[()], dtype=np.float64).ravel()

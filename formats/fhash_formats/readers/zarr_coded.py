@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from fhash_formats.transform.zarr_codec import TransformCodec
 
-__all__ = ["CodedArray", "coded_names", "open_coded"]
-
 SHARD_INDICES = 64
 """Indices of shards that are kept."""
 ENTRY = 16

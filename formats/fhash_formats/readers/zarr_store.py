@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
-import struct
 import warnings
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +20,7 @@ from fhash_formats.readers.common.cf import (
     Column,
     Packing,
     beside,
+    number_of_text,
     only_counts,
     packing,
     real_time,
@@ -197,7 +195,8 @@ def _stored_in(arrays: Mapping[str, zarr.Array[Any]], group: str) -> Sequence[tu
             continue
         stored = Stored(
             dimensions=tuple(
-                name or f"{own}_dim_{number}" for number, name in enumerate(dimension_names(array))
+                f"{own}_dim_{number}" if name is None else name
+                for number, name in enumerate(dimension_names(array))
             ),
             shape=array.shape,
             dtype=np.dtype(array.dtype),
@@ -216,25 +215,14 @@ def _attributes(array: zarr.Array[Any]) -> dict[str, Any]:
         fill = array.fill_value if fill is None else fill
     dtype = np.dtype(array.dtype)
     if isinstance(fill, str) and dtype.kind == "f":
-        fill = _decoded(fill)
+        number = number_of_text(fill)
+        fill = fill if number is None else number
     if fill is not None:
         try:
             found[FILL] = dtype.type(fill) if dtype.kind in "iuf" else fill
         except (ValueError, OverflowError, TypeError):
             found[FILL] = fill
     return found
-
-
-def _decoded(text: str) -> Any:
-    """A fill value of floats: a number as text, or base64 of a float64, as xarray writes it."""
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return struct.unpack("<d", base64.standard_b64decode(text))[0]
-    except (struct.error, binascii.Error):
-        return text
 
 
 def _values(array: zarr.Array[Any], places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
@@ -325,7 +313,7 @@ class ZarrTree(FileOfArrays):
 
     def _stated(self, variable: Variable) -> list[Dimension]:
         path, array = variable.handle
-        columns = self._places(path)
+        columns = self._near_columns(path)
         stored = zip(dimension_names(array), array.shape, strict=True)
         return [
             *(_dimension(columns, name, length) for name, length in stored),
@@ -346,7 +334,7 @@ class ZarrTree(FileOfArrays):
 
     def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes: those along a dimension by its name, else by their own name."""
-        columns = self._places(variable.handle[0])
+        columns = self._near_columns(variable.handle[0])
         lower = [{name.lower(): column for name, column in place.items()} for place in columns]
         certain = self.request.axes is not None or all(
             dimension.role is not None for dimension in layout.kept
@@ -380,7 +368,7 @@ class ZarrTree(FileOfArrays):
             coords |= {} if written is None else {"t": written}
         return coords
 
-    def _places(self, path: str) -> list[dict[str, Column]]:
+    def _near_columns(self, path: str) -> list[dict[str, Column]]:
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]

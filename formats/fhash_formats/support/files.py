@@ -50,7 +50,8 @@ def file_name(place: str | os.PathLike[str]) -> str:
     """The last name of a place: "run.fhz" of "https://host/a/run.fhz?signature=1"."""
     if not is_url(place):
         return Path(place).name
-    return PurePosixPath(without_secrets(place).partition("::")[0].partition("://")[2]).name
+    urls = without_secrets(place).split("::")  # the first may be a cache alone, without a path
+    return PurePosixPath(next(url for url in urls if "://" in url).partition("://")[2]).name
 
 
 def without_secrets(place: str | os.PathLike[str]) -> str:
@@ -440,7 +441,7 @@ def replacing_all(
         # own; then all can be undone.
         with signals_held():
             for output in outputs:
-                output.place(force, directory)
+                output.take_name(force, directory)
         for folder in {output.target.parent for output in outputs}:
             sync_folder(folder)
     except BaseException as error:
@@ -495,7 +496,7 @@ class _Output:
         self.old = self.target.with_name(stem + OLD)
         self.placed = False
 
-    def place(self, force: bool, directory: bool) -> None:
+    def take_name(self, force: bool, directory: bool) -> None:
         """Give the temporary its final name.
 
         An older output stays under the name `old` until `forget_old` or `undo`.

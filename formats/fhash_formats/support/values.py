@@ -12,6 +12,13 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
 
+Values = npt.NDArray[Any]
+"""An array of numbers of any type."""
+Mask = npt.NDArray[np.bool_]
+"""An array that says of each vertex whether it counts."""
+Integers = npt.NDArray[np.int32]
+"""An array of the integers that are coded."""
+
 
 def is_number(text: str) -> bool:
     """Whether a text is a number as `float` reads it, infinities and NaN included."""
@@ -22,22 +29,8 @@ def is_number(text: str) -> bool:
     return True
 
 
-DTYPES = {
-    name: np.dtype(name)
-    for name in (
-        "int8",
-        "int16",
-        "int32",
-        "int64",
-        "uint8",
-        "uint16",
-        "uint32",
-        "uint64",
-        "float16",
-        "float32",
-        "float64",
-    )
-}
+DTYPE_NAMES = """int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64"""
+DTYPES = {name: np.dtype(name) for name in DTYPE_NAMES.split()}
 """Number types of arrays by the name that Zarr gives them, in native byte order."""
 
 
@@ -355,8 +348,7 @@ def _numbers(listed: list[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any] | None
     """The numbers of a list at once; None where one of them needs a closer look."""
     types = set(map(type, listed))
     if dtype.kind in "iu" and types == {int}:
-        limits = np.iinfo(dtype)
-        inside = limits.min <= min(listed) and max(listed) <= limits.max
+        inside = is_within(min(listed), dtype) and is_within(max(listed), dtype)
         return np.array(listed, dtype=dtype) if inside else None
     if dtype.kind != "f" or not types <= {int, float}:
         return None
@@ -388,10 +380,8 @@ def _stored(value: Any, dtype: np.dtype[Any]) -> Any:
             return value.encode("latin-1")
         except UnicodeEncodeError:
             pass
-    if dtype.kind in "iu" and type(value) is int:
-        limits = np.iinfo(dtype)
-        if limits.min <= value <= limits.max:
-            return value
+    if dtype.kind in "iu" and type(value) is int and is_within(value, dtype):
+        return value
     if dtype.kind == "f":
         if isinstance(value, str) and value in _NOT_FINITE:
             return _NOT_FINITE[value]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.support.values import exact_number, integer_origin
+from fhash_formats.support.values import Mask, Values, exact_number, integer_origin
 from fhash_formats.transform.coder import MAX_LABELS
 from fhash_formats.transform.decoding import decode_tile, transform_for
 from fhash_formats.transform.encoding import (
@@ -70,9 +70,6 @@ def _spec(
     t, z, y, x = (AxisTransform(kind=name, depth=depth) for name, depth in kinds)
     return TransformSpec(axes=(t, z, y, x))
 
-
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
 
 DEFAULT_EFFORT = 2
 """Least effort that makes trials."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.values import Integers, Mask
 
 Table = npt.NDArray[np.int32]
 """Bands in the order in which they are coded, int32 of shape (bands, COLUMNS)."""
@@ -197,8 +198,6 @@ NO_TRELLIS = -3
 """Code of an encoder that met an integer which its quantiser does not have, as in
 native/coder_contexts.hpp."""
 
-Integers = npt.NDArray[np.int32]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
@@ -220,7 +219,6 @@ def encode_integers(
     *,
     scaled: npt.NDArray[np.float32] | None = None,
     weight: float = 0.0,
-    state: State | None = None,
     trellis: bool = False,
 ) -> Encoded:
     """Code integers in the bands of a table; integers outside the bands count as 0.
@@ -232,14 +230,11 @@ def encode_integers(
             anew, from the nearest one, one less and zero: the one with the least squared error, in
             steps, plus `weight` per bit.
         weight: squared steps that a bit is worth.
-        state: state to begin from, which is adapted in place; None begins from the prior.
         trellis: whether the integers are those of two quantisers. Raises InputError
             for integers that are not, and does not go with `scaled`.
     """
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
-    keep = state is not None
-    state = prior_state(trellis) if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
@@ -254,8 +249,8 @@ def encode_integers(
             trellis,
             (ctypes.c_int64 * 4)(*integers.shape),
             *array_arguments(table),
-            *state_arguments(state),
-            keep,
+            *state_arguments(prior_state(trellis)),
+            False,  # the state is not kept
             *array_arguments(buffer),
         )
         if size == NO_TRELLIS:
@@ -455,8 +450,6 @@ class MaskLevels:
         return first, second
 
 
-Mask = npt.NDArray[np.bool_]
-
 MASK_LEVELS = 32
 """Levels of a vertex; each has a set of mixing weights."""
 MASK_CONTEXTS = 10
@@ -489,16 +482,13 @@ def mask_prior_state() -> State:
     return unpack_state(_MASK_PRIOR_FILE.read_bytes(), blank_mask_state()).frozen()
 
 
-def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | None = None) -> bytes:
+def encode_mask(mask: Mask, levels: tuple[Levels, Levels]) -> bytes:
     """Code a mask.
 
     Args:
         mask: bool (t, z, y, x), at least one vertex.
         levels: two levels of each vertex, 0 to 31 and 0 to 15, uint8, from `MaskLevels.levels`.
-        state: state to begin from, which is adapted in place; None begins from the prior.
     """
-    keep = state is not None
-    state = mask_prior_state() if state is None else state
     bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
     capacity = max(4096, mask.size // 8)
     while True:
@@ -506,8 +496,8 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | Non
         size = native.library().fhash_encode_mask(
             *(array.ctypes.data for array in (bits, first, second)),
             (ctypes.c_int64 * 4)(*mask.shape),
-            *state_arguments(state),
-            keep,
+            *state_arguments(mask_prior_state()),
+            False,  # the state is not kept
             *array_arguments(buffer),
         )
         if checked(size) <= capacity:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.threads import in_threads
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.coder import decode_integers, single_band
 from fhash_formats.transform.lifting import Transform, band_table
 from fhash_formats.transform.predict import Predictor, decode_predicted, values_of
@@ -42,9 +43,6 @@ from fhash_formats.transform.values import (
     dequantise,
 )
 
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
 Decoded = tuple[Values, Mask | None]
 """Values in the type of the source, and which are occupied; None for a stream without a mask."""
 
@@ -397,7 +395,7 @@ Part = tuple[slice, ...]
 def uncorrected(
     data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: TileSettings, part: Part
 ) -> Values | None:
-    """The values of a tile before its head, where nothing but `corrected_part` is left to do.
+    """The values of a tile before its head, where nothing but `corrected_region` is left to do.
 
     They are less the origin of the settings. None for other tiles, and where the part is a large
     one.
@@ -416,7 +414,7 @@ def uncorrected(
     return table_about_origin(stream, shape, dtype, settings)[0]
 
 
-def corrected_part(
+def corrected_region(
     table: Values, part: Part, dtype: npt.DTypeLike, settings: TileSettings
 ) -> Values:
     """A part of the values of a tile, as `decode_tile` gives them, in a new array.

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.coder import (
     HIGH,
     LOW,
@@ -70,8 +71,6 @@ NEIGHBOUR_SHARE = 0.3
 """Weight of the counts of the next buckets in those of a bucket."""
 PRIOR_COUNT = 8.0
 """Observations that a geometric distribution of the mean of a bucket stands for."""
-
-Integers = npt.NDArray[np.int32]
 
 
 def choose_levels(
@@ -185,8 +184,6 @@ The choice compares coefficients in float32, which no longer holds their fractio
 the trellis compares them in the type of the arithmetic.
 """
 
-Values = npt.NDArray[Any]
-
 
 def with_trellis(settings: TileSettings) -> TileSettings:
     """The settings with two quantisers in place of the plain one, at about the same error."""
@@ -245,8 +242,6 @@ def code_coefficients(
         coded = encode_integers(chosen, table)
     return coded.data, coded.integers
 
-
-Mask = npt.NDArray[np.bool_]
 
 HIGHEST = 64.0
 """First threshold, in quantiser steps."""

@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
+from fhash_formats.support.values import Integers, Values
 from fhash_formats.transform.coder import COLUMNS, NO_REFERENCE, Table
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
 
@@ -113,9 +114,6 @@ STEPS_97 = (
 )
 """Lifting steps of the wavelet 9/7 (Daubechies and Sweldens 1998, without the final scaling by K):
 whether the odd half changes, and the factor."""
-
-Values = NDArray[Any]
-Integers = NDArray[np.int32]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,8 +28,6 @@ from fhash_formats.transform.chunk import (
 )
 from fhash_formats.transform.spec import TransformSpec
 
-__all__ = ["NumcodecsTransform"]
-
 _MAGIC = b"FHC1"
 """First bytes of a coded array."""
 _TYPES = {b"f2", b"f4", b"f8", b"i1", b"i2", b"i4", b"i8", b"u1", b"u2", b"u4", b"u8"}

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.coder import State, array_arguments, checked, state_arguments
 from fhash_formats.transform.values import pieces
 
@@ -222,10 +223,6 @@ SIZES = (LEVELS * 5, 32 * 27, CLASSES * 24 * 5, 3125, 81 * 5 * 8, 81 * 24, 32 * 
 """Contexts of each of the seven estimates that are mixed; each context has a slot per decision."""
 SIMPLES = 200
 """Simple estimates: of low bits, of the escape code and of rows without a difference."""
-
-Integers = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
-Values = npt.NDArray[Any]
 
 
 @cache

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.transform.decoding import (
-    corrected_part,
+    corrected_region,
     decode_tile,
     decode_tile_mask,
     decode_tile_table,
@@ -214,7 +214,7 @@ class TransformCoder:
     def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
         """A part of the chunk, with the bits of `decode`. table: what `uncorrected` gave."""
         assert self.settings is not None
-        return corrected_part(table, part, self._dtype, self.settings)
+        return corrected_region(table, part, self._dtype, self.settings)
 
     def decode_masked(
         self, data: memoryview | bytes

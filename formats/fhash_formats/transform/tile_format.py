@@ -11,11 +11,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.support.values import is_wide_integer, is_within
+from fhash_formats.support.values import Integers, Mask, Values, is_wide_integer, is_within
 from fhash_formats.transform.coder import (
     MAX_LABELS,
     Levels,
@@ -349,9 +348,6 @@ def _check_finite(name: str, value: Any) -> None:
 
 Shape = tuple[int, int, int, int]
 """Lengths of a tile along (t, z, y, x)."""
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
 
 TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY = range(5)
 """Kinds of streams."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
+from fhash_formats.support.values import Integers, Mask, Values
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""
@@ -22,20 +23,18 @@ Plain rounding adds 0.5. Less makes smaller integers near zero, which take fewer
 LARGEST = 1_000_000_000.0
 """Largest magnitude of an integer; larger ones are clipped."""
 
-Values = npt.NDArray[Any]
 Offsets = tuple[int, ...]
 """Six reconstruction offsets by magnitude, in 1/OFFSET_UNIT step; see `dequantise`."""
 
 
 def quantise(
-    coefficients: Values, step: float, rounding: float = ROUNDING
+    coefficients: Values, step: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """The integers sign(c) floor(|c| / step + rounding), int32, and c / step, float32.
+    """The integers sign(c) floor(|c| / step + ROUNDING), int32, and c / step, float32.
 
     Args:
         coefficients: coefficients c, float32 or float64.
         step: quantiser step, in units of the coefficients.
-        rounding: fraction of a step added before rounding down.
     """
     width, scale = coefficients.dtype.itemsize * 8, 1.0 / step
     integers = np.empty(coefficients.shape, np.int32)
@@ -44,7 +43,7 @@ def quantise(
     getattr(native.library(), f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
-        *(ctypes.c_double(number) for number in (scale, rounding, LARGEST)),
+        *(ctypes.c_double(number) for number in (scale, ROUNDING, LARGEST)),
         ctypes.c_void_p(integers.ctypes.data),
         ctypes.c_void_p(scaled.ctypes.data),
     )
@@ -78,9 +77,6 @@ def dequantise(
     )
     return result
 
-
-Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
 
 _INT64 = np.iinfo(np.int64)
 

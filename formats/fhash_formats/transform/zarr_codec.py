@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from zarr.core.common import JSON
     from zarr.core.dtype.wrapper import TBaseDType, TBaseScalar, ZDType
 
-__all__ = ["NAME", "TransformCodec"]
-
 NAME = "fhash.transform"
 """Name of the codec in Zarr metadata."""
 

@@ -382,7 +382,7 @@ class Outline:
         numbers = dict(zip(AXES, by_axis, strict=True))
         return tuple(numbers.get(axis, 1) for axis in self.dimensions.values())
 
-    def place(self, step: int, frame: npt.NDArray[Any]) -> tuple[Any, npt.NDArray[Any]]:
+    def slab(self, step: int, frame: npt.NDArray[Any]) -> tuple[Any, npt.NDArray[Any]]:
         """The index of a frame (z, y, x) in the variable, and the values that belong there."""
         present = list(self.dimensions.values())
         index = tuple(

@@ -146,7 +146,7 @@ def _open_netcdf(
 
         def put(outline: Outline, values: Any, step: int, frame: Frame) -> None:
             with file.calling():
-                place, ordered = outline.place(step, frame)
+                place, ordered = outline.slab(step, frame)
                 values[place] = ordered.astype(values.dtype, copy=False)
 
         yield [partial(put, *each) for each in zip(outlines, values, strict=True)]
@@ -268,7 +268,7 @@ def _open_zarr(
     flush(memory, folder)
 
     def put(outline: Outline, values: Any, step: int, frame: Frame) -> None:
-        place, ordered = outline.place(step, frame)
+        place, ordered = outline.slab(step, frame)
         values[place] = ordered
         flush(memory, folder)
 

@@ -61,10 +61,7 @@ def _is_even(region: Region) -> bool:
 
 def _check_grid(path: Path, region: Region, suffix: str) -> None:
     """Raise InputError where the coordinates do not fit the format."""
-    if not np.all(np.isfinite(region.coords["t"].values)):
-        raise InputError(
-            f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
-        )
+    _check_times(path, region)
     for axis in SPACE:
         values = region.coords[axis].values
         if suffix == ".vti" and even_spacing(values) is None:
@@ -80,16 +77,19 @@ def _check_grid(path: Path, region: Region, suffix: str) -> None:
             )
 
 
+def _check_times(path: Path, region: Region) -> None:
+    """Raise InputError for times that are not all finite."""
+    if not np.all(np.isfinite(region.coords["t"].values)):
+        raise InputError(
+            f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
+        )
+
+
 @contextmanager
 def _open_vti(
     region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
 ) -> Iterator[Put]:
-    ascending = {
-        axis: values[:: direction(values)]
-        for axis in SPACE
-        for values in [region.coords[axis].values]
-    }
-    turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
+    ascending, turn = _turned(region)
     image = outputs[0].suffix.lower() == ".vti"
 
     def put(step: int, frame: Frame) -> None:
@@ -107,9 +107,16 @@ def _open_vti(
         temporaries[-1].write_text(_collection(region, outputs[:-1]), encoding="utf-8")
 
 
-def direction(values: npt.NDArray[np.float64]) -> int:
-    """1 for ascending coordinates, -1 for descending ones."""
-    return -1 if values[-1] < values[0] else 1
+def _turned(
+    region: Region,
+) -> tuple[dict[str, npt.NDArray[np.float64]], tuple[slice, ...]]:
+    """Positions of each axis of space, ascending, and the slices that turn a frame likewise."""
+    given = {axis: region.coords[axis].values for axis in SPACE}
+    turn = {
+        axis: slice(None, None, -1 if values[-1] < values[0] else 1)
+        for axis, values in given.items()
+    }
+    return {axis: given[axis][turn[axis]] for axis in SPACE}, tuple(turn.values())
 
 
 def _write_grid(
@@ -239,10 +246,7 @@ def needed_by(paths: Sequence[str], steps: int) -> list[str]:
 
 
 def _vtkhdf_outputs(path: Path, region: Region) -> list[Path]:
-    if not np.all(np.isfinite(region.coords["t"].values)):
-        raise InputError(
-            f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
-        )
+    _check_times(path, region)
     for axis in SPACE:
         if not even_spacing(region.coords[axis].values):
             raise InputError(
@@ -259,7 +263,7 @@ def _open_vtkhdf(
     import h5py
 
     steps = region.shape[0]
-    turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
+    turn = _turned(region)[1]
     # Links in the order of their creation, as the reader of VTK demands for composite files and
     # takes for all.
     with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (
@@ -278,11 +282,7 @@ def _open_vtkhdf(
 
 def _create(root: Any, region: Region) -> Any:
     """Create the empty dataset in `root`, with everything that describes it."""
-    ascending = {
-        axis: values[:: direction(values)]
-        for axis in SPACE
-        for values in [region.coords[axis].values]
-    }
+    ascending = _turned(region)[0]
     steps, *size = region.shape
     group = root.create_group("VTKHDF", track_order=True)
     group.attrs["Version"] = np.array(SERIES_VERSION if steps > 1 else SINGLE_VERSION, dtype="<i8")

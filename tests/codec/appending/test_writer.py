@@ -476,7 +476,7 @@ def with_array(run_growing, path, name, values, dimension_names):
     """A copy of a file with another array."""
     with Container.open(run_growing) as container, ContainerWriter(path) as writer:
         table = container.arrays["tables/level_1"]
-        writer.add_sharded(
+        writer.add_array(
             "tables/level_1",
             shape=table.shape,
             dtype=table.dtype,

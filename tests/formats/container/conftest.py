@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import sys
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,21 +110,25 @@ def make_compact_header() -> dict[str, Any]:
     return header
 
 
-def write(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray], **options: Any) -> int:
+def write(
+    path: Path,
+    header: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    attributes: Mapping[str, dict[str, Any]] | None = None,
+    **options: Any,
+) -> int:
     """A container of whole arrays; the finest table in 2 x 2 x 2 chunks, some of them at an end."""
     with ContainerWriter(path, **options) as writer:
         for name, array in arrays.items():
-            chunk = (
-                (1, 2, 3, 6, 2)
-                if name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2)
-                else None
+            table = name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2)
+            quantised = name.startswith("tables/") and array.dtype == np.uint8
+            usual = {"offset": 0.5, "scale": 0.25} if quantised else None
+            writer.add_whole(
+                name,
+                array,
+                chunk_shape=(1, 2, 3, 6, 2) if table else None,
+                attributes=(attributes or {}).get(name, usual),
             )
-            attributes = (
-                {"offset": 0.5, "scale": 0.25}
-                if name.startswith("tables/") and array.dtype == np.uint8
-                else None
-            )
-            writer.add_whole(name, array, chunk_shape=chunk, attributes=attributes)
         return writer.commit(header)
 
 
@@ -149,13 +153,19 @@ def unpack(data: bytes) -> Parts:
     return parts
 
 
-def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:
-    """A container's ZIP of any members, with sound checksums."""
+def pack(
+    parts: Iterable[tuple[str, bytes]], stored: Mapping[str, tuple[bytes, int, int]] | None = None
+) -> bytes:
+    """A container's ZIP of any members, with sound checksums.
+
+    stored: by name the bytes in the file, and the full size and CRC-32 that are declared.
+    """
     members, chunks, position = [], [], 0
     for name, data in parts:
-        member = Member(name=name, offset=position, size=len(data), crc=zlib.crc32(data))
+        held, full, crc = (stored or {}).get(name, (data, None, zlib.crc32(data)))
+        member = Member(name=name, offset=position, size=len(held), crc=crc, full_size=full)
         members.append(member)
-        chunks += [local_header(member), data]
+        chunks += [local_header(member), held]
         position = member.end
     return b"".join([*chunks, ending(members)])
 

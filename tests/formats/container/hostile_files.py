@@ -65,15 +65,21 @@ def replaced(sample: Path, samples: Any, name: str, content: bytes) -> bytes:
 def edited_header(header: dict[str, Any], path: str, value: object) -> dict[str, Any]:
     """A copy with the value at "a.b" replaced, or removed where it is `...`."""
     result = copy.deepcopy(header)
-    *parents, key = path.split(".")
-    inner = result
-    for parent in parents:
-        inner = inner[parent]
-    if value is ...:
-        del inner[key]
-    else:
-        inner[key] = value
+    put_at(result, path, value)
     return result
+
+
+def put_at(values: Any, path: str, value: object) -> None:
+    """Replace the value at "a.0.b" in place, or remove it where it is `...`; "a.+" appends."""
+    *parents, key = (int(word) if word.isdecimal() else word for word in path.split("."))
+    for parent in parents:
+        values = values[parent]
+    if key == "+":
+        values.append(value)
+    elif value is ...:
+        del values[key]
+    else:
+        values[key] = value
 
 
 def frame(content: bytes, *, size: int | None = None) -> bytes:

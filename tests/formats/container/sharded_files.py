@@ -50,6 +50,6 @@ def write_sharded(
             "shard_shape": shard_shape,
             **options,
         }
-        writer.add_sharded(NAME, chunks=chunks, **settings)
+        writer.add_array(NAME, chunks=chunks, **settings)
         writer.commit(header)
     return path

@@ -161,9 +161,8 @@ BAD_ARRAYS = {
         {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
         "crc32c",
     ),
-    "name": ({"name": "../a"}, "not allowed"),
-    "absolute": ({"name": "/a"}, "not allowed"),
-    "document": ({"name": "a/zarr.json"}, "not allowed"),
+    "name": ({"name": "\u00e4"}, "not allowed"),
+    "long name": ({"name": "a" * 300}, "not allowed"),
     "again": ({"name": "key_frames"}, "there already"),
 }
 
@@ -307,7 +306,7 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
             "chunk_shape": tile.shape,
             "shard_shape": (steps, 64, 64, 128),
         }
-        writer.add_sharded(
+        writer.add_array(
             "tables/level_1",
             dtype=tile.dtype,
             chunks=[tile] * 8,

@@ -391,17 +391,10 @@ DEFLATED = {
 def test_deflated_metadata(sample, samples, case) -> None:
     make, declared, message = DEFLATED[case]
     parts = samples.unpack(sample.read_bytes())
-    members, chunks, position = [], [], 0
-    for name, data in parts:
-        stored = make(data) if name == ROOT else data
-        full = None if name != ROOT else declared or len(data)
-        # The CRC is right where the content is what is declared.
-        crc = zlib.crc32(bytes(15 << 20) if case == "bomb" and name == ROOT else data)
-        member = Member(name=name, offset=position, size=len(stored), crc=crc, full_size=full)
-        members.append(member)
-        chunks += [local_header(member), stored]
-        position = member.end
-    container = b"".join([*chunks, ending(members)])
+    data = dict(parts)[ROOT]
+    # The CRC is right where the content is what is declared.
+    crc = zlib.crc32(bytes(15 << 20) if case == "bomb" else data)
+    container = samples.pack(parts, {ROOT: (make(data), declared or len(data), crc)})
     sample.write_bytes(container)
     tracemalloc.start()
     with pytest.raises(DamagedFileError, match=message):
@@ -415,18 +408,9 @@ def test_deflated_metadata(sample, samples, case) -> None:
 
 def test_chunks_are_never_deflated(sample, samples) -> None:
     parts = samples.unpack(sample.read_bytes())
-    name = next(name for name, _ in parts if not name.endswith(ROOT))
-    members, chunks, position = [], [], 0
-    for other, content in parts:
-        packed = deflated(content) if other == name else content
-        full = len(content) if other == name else None
-        member = Member(
-            name=other, offset=position, size=len(packed), crc=zlib.crc32(content), full_size=full
-        )
-        members.append(member)
-        chunks += [local_header(member), packed]
-        position = member.end
-    refused(sample, b"".join([*chunks, ending(members)]), "only metadata may be")
+    name, data = next(part for part in parts if not part[0].endswith(ROOT))
+    packed = samples.pack(parts, {name: (deflated(data), len(data), zlib.crc32(data))})
+    refused(sample, packed, "only metadata may be")
 
 
 @pytest.mark.parametrize(

@@ -253,15 +253,6 @@ def test_a_broken_install_ends_in_one_line_that_names_the_library(
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
-    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
-    with open_series(path) as series:
-        series.read(0)
-        os.utime(path, ns=(1, 1))
-        with pytest.raises(InputError, match="changed while it was being read"):
-            series.read(1)
-
-
 def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_netcdf(
         tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}), encoding={"v": {"zlib": True}}

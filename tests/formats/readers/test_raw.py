@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import shutil
 import sys
@@ -16,8 +15,7 @@ import numpy as np
 import pytest
 import zarr
 from stored_series import VALUES as VALUES_RAW
-from stored_series import assert_frames
-from stored_series import frames as frames_raw
+from stored_series import assert_frames, frames, write_hdf5
 
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.readers.common.file_series import DTYPES, RawLayout
@@ -29,9 +27,9 @@ from fhash_formats.readers.registry import list_variables, open_series
 def test_npy_of_every_type_and_order(tmp_path: Path, dtype: str, fortran: bool) -> None:
     values = (VALUES_RAW * 50).astype(dtype)
     np.save(tmp_path / "a.npy", np.asfortranarray(values) if fortran else values)
-    np.testing.assert_array_equal(frames_raw(tmp_path / "a.npy"), values)
+    np.testing.assert_array_equal(frames(tmp_path / "a.npy"), values)
     np.save(tmp_path / "b.npy", np.asfortranarray(values[0]) if fortran else values[0])
-    np.testing.assert_array_equal(frames_raw(tmp_path / "b.npy"), values[:1])
+    np.testing.assert_array_equal(frames(tmp_path / "b.npy"), values[:1])
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations("tzyx"))[::2])
@@ -39,7 +37,7 @@ def test_npy_of_every_type_and_order(tmp_path: Path, dtype: str, fortran: bool) 
 def test_npy_with_any_order_of_axes(tmp_path: Path, order: tuple[str, ...], fortran: bool) -> None:
     stored = VALUES_RAW.transpose(["tzyx".index(axis) for axis in order])
     np.save(tmp_path / "a.npy", np.array(stored, order="F" if fortran else "C"))
-    np.testing.assert_array_equal(frames_raw(tmp_path / "a.npy", axes=",".join(order)), VALUES_RAW)
+    np.testing.assert_array_equal(frames(tmp_path / "a.npy", axes=",".join(order)), VALUES_RAW)
 
 
 def test_npy_recognised_by_its_magic(tmp_path: Path) -> None:
@@ -219,43 +217,39 @@ def test_raw_layout_from_the_name(tmp_path: Path, name: str, endian: str) -> Non
     path.write_bytes(values.tobytes())
     with open_series(path) as series:
         assert series.name == "my_density"
-    np.testing.assert_array_equal(frames_raw(path), values)
+    np.testing.assert_array_equal(frames(path), values)
 
 
 def test_raw_of_three_dimensions_is_one_step(tmp_path: Path) -> None:
     path = tmp_path / "6x5x3_float32_0007.raw"
     path.write_bytes(VALUES_RAW[0].tobytes())
-    np.testing.assert_array_equal(frames_raw(path), VALUES_RAW[:1])
+    np.testing.assert_array_equal(frames(path), VALUES_RAW[:1])
 
 
 @pytest.mark.parametrize("suffix", [".raw", ".bin", ".dat", ".whatever"])
 def test_raw_layout_from_the_user(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(VALUES_RAW.astype(">f8").tobytes())
-    np.testing.assert_array_equal(
-        frames_raw(path, raw=RawLayout(SHAPE, "float64", "big")), VALUES_RAW
-    )
+    np.testing.assert_array_equal(frames(path, raw=RawLayout(SHAPE, "float64", "big")), VALUES_RAW)
     path.write_bytes(VALUES_RAW[:, 0].tobytes())
     np.testing.assert_array_equal(
-        frames_raw(path, raw=RawLayout({"t": 4, "y": 5, "x": 6}, "f4")), VALUES_RAW[:, :1]
+        frames(path, raw=RawLayout({"t": 4, "y": 5, "x": 6}, "f4")), VALUES_RAW[:, :1]
     )
 
 
 def test_the_user_overrides_the_name(tmp_path: Path) -> None:
     path = tmp_path / "a_6x5x3x4_uint32_le.raw"
     path.write_bytes(VALUES_RAW.astype(">f4").tobytes())
+    np.testing.assert_array_equal(frames(path, raw=RawLayout(dtype="f4", endian="big")), VALUES_RAW)
     np.testing.assert_array_equal(
-        frames_raw(path, raw=RawLayout(dtype="f4", endian="big")), VALUES_RAW
-    )
-    np.testing.assert_array_equal(
-        frames_raw(path, raw=RawLayout())[0], VALUES_RAW.astype(">f4").view("<u4")[0]
+        frames(path, raw=RawLayout())[0], VALUES_RAW.astype(">f4").view("<u4")[0]
     )
 
 
 def test_raw_in_another_order(tmp_path: Path) -> None:
     path = tmp_path / "a_6x5x3x4_f4.raw"
     path.write_bytes(np.ascontiguousarray(VALUES_RAW.transpose(3, 2, 1, 0)).tobytes())
-    np.testing.assert_array_equal(frames_raw(path, axes="x,y,z,t"), VALUES_RAW)
+    np.testing.assert_array_equal(frames(path, axes="x,y,z,t"), VALUES_RAW)
     with pytest.raises(InputError, match="does not name the axes of the raw shape, t,z,y,x"):
         open_series(path, axes="z,y,x")
 
@@ -264,7 +258,7 @@ def test_raw_bytes_that_look_like_another_format(tmp_path: Path) -> None:
     values = np.frombuffer(b"\x89HDF\r\n\x1a\n", np.uint8).reshape(2, 2, 2)
     path = tmp_path / "a_2x2x2_uint8.raw"
     path.write_bytes(values.tobytes())
-    np.testing.assert_array_equal(frames_raw(path)[0], values)
+    np.testing.assert_array_equal(frames(path)[0], values)
 
 
 @pytest.mark.parametrize(
@@ -315,11 +309,6 @@ def write(path: Path, values: np.ndarray, **options: Any) -> Path:
     return path
 
 
-def frames(path: Path, **options: Any) -> np.ndarray:
-    with open_series(path, **options) as series:
-        return np.stack(list(series.frames()))
-
-
 @pytest.mark.parametrize("dtype", ["u1", "u2", "f4"])
 @pytest.mark.parametrize(
     "options", [{}, {"compression": "zlib"}, {"byteorder": ">"}, {"bigtiff": True}]
@@ -331,10 +320,8 @@ def test_pages_are_slices(tmp_path: Path, options: dict[str, Any], dtype: str) -
         assert (series.name, series.shape) == ("a", (1, *values.shape))
         np.testing.assert_array_equal(series.read(0), values)
     np.testing.assert_array_equal(frames(path, axes="t,y,x"), values[:, None])
-
-
-def test_one_page_is_a_plane(tmp_path: Path) -> None:
-    np.testing.assert_array_equal(frames(write(tmp_path / "a.tif", VALUES[0, 0])), VALUES[:1, :1])
+    path = write(tmp_path / "b.tif", values[0], **options)
+    np.testing.assert_array_equal(frames(path), values[None, :1])
 
 
 def test_hyperstacks_of_imagej(tmp_path: Path) -> None:
@@ -424,7 +411,7 @@ def test_tifffile_is_named_where_it_is_missing(
         open_series(path)
 
 
-VALUES_NO_EXTERNAL = np.arange(2 * 3 * 4 * 5, dtype="<f4").reshape(2, 3, 4, 5) + 1
+PLAIN = np.arange(2 * 3 * 4 * 5, dtype="<f4").reshape(2, 3, 4, 5) + 1
 GRID = (
     '<VTKFile type="ImageData"><ImageData WholeExtent="0 4 0 3 0 0"><Piece Extent="0 4 0 3 0 0">'
     '<PointData><DataArray type="Float32" Name="u" format="ascii">{}</DataArray></PointData>'
@@ -439,10 +426,6 @@ def hdf5(path: Path, other: str) -> None:
         file["u"] = h5py.ExternalLink(other, "u")
 
 
-def netcdf(path: Path, other: str) -> None:
-    hdf5(path, other)
-
-
 def deep(path: Path, other: str) -> None:
     """A link in a file inside the folder that a first one refers to."""
     hdf5(path.with_name("inner.h5"), other)
@@ -450,55 +433,31 @@ def deep(path: Path, other: str) -> None:
 
 
 def virtual(path: Path, other: str) -> None:
-    layout = h5py.VirtualLayout(VALUES_NO_EXTERNAL.shape, "f4")
-    layout[...] = h5py.VirtualSource(other, "u", VALUES_NO_EXTERNAL.shape)
+    layout = h5py.VirtualLayout(PLAIN.shape, "f4")
+    layout[...] = h5py.VirtualSource(other, "u", PLAIN.shape)
     with h5py.File(path, "w") as file:
         file.create_virtual_dataset("u", layout)
 
 
 def raw_file(path: Path, other: str) -> None:
     with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "u", VALUES_NO_EXTERNAL.shape, "f4", external=[(other, 0, h5py.h5f.UNLIMITED)]
-        )
+        file.create_dataset("u", PLAIN.shape, "f4", external=[(other, 0, h5py.h5f.UNLIMITED)])
 
 
-def nrrd(path: Path, other: str) -> None:
-    path.write_text(f"{NRRD}data file: {other}\n\n")
+def text(form: str) -> Callable[[Path, str], None]:
+    """A file that names the other where OTHER or, as a pattern of numbers, PATTERN stands."""
+
+    def make(path: Path, other: str) -> None:
+        named = form.replace("OTHER", other).replace("PATTERN", other.replace("0", "%d"))
+        path.write_text(named)
+
+    return make
 
 
-def nrrd_list(path: Path, other: str) -> None:
-    path.write_text(f"{NRRD}data file: LIST\n{other}\n")
-
-
-def nrrd_pattern(path: Path, other: str) -> None:
-    path.write_text(f"{NRRD}data file: {other.replace('0', '%d')} 0 0 1\n\n")
-
-
-def metaimage(path: Path, other: str) -> None:
-    path.write_text(f"{META}ElementDataFile = {other}\n")
-
-
-def metaimage_pattern(path: Path, other: str) -> None:
-    path.write_text(f"{META}ElementDataFile = {other.replace('0', '%d')} 0 0 1\n")
-
-
-def pvti(path: Path, other: str) -> None:
-    path.write_text(
-        '<VTKFile type="PImageData"><PImageData WholeExtent="0 4 0 3 0 0">'
-        f'<Piece Extent="0 4 0 3 0 0" Source="{other}"/></PImageData></VTKFile>'
-    )
-
-
-def pvd(path: Path, other: str) -> None:
-    path.write_text(
-        '<VTKFile type="Collection"><Collection><DataSet timestep="0"'
-        f' file="{other}"/></Collection></VTKFile>'
-    )
-
-
-def listed_json(path: Path, other: str) -> None:
-    path.write_text(json.dumps({"files": [{"name": other, "time": 0}]}))
+PVTI = """<VTKFile type="PImageData"><PImageData WholeExtent="0 4 0 3 0 0">
+<Piece Extent="0 4 0 3 0 0" Source="OTHER"/></PImageData></VTKFile>"""
+PVD = """<VTKFile type="Collection"><Collection><DataSet timestep="0" file="OTHER"/></Collection>
+</VTKFile>"""
 
 
 def symbolic_link(path: Path, other: str) -> None:
@@ -506,8 +465,8 @@ def symbolic_link(path: Path, other: str) -> None:
 
 
 def zarr_link(path: Path, other: str) -> None:
-    made = zarr.create_array(path, data=VALUES_NO_EXTERNAL, chunks=(1, 3, 4, 5))
-    assert made.shape == VALUES_NO_EXTERNAL.shape
+    made = zarr.create_array(path, data=PLAIN, chunks=(1, 3, 4, 5))
+    assert made.shape == PLAIN.shape
     chunk = path / "c" / "0" / "0" / "0" / "0"
     chunk.unlink()
     chunk.symlink_to(path.parent / other)
@@ -515,29 +474,28 @@ def zarr_link(path: Path, other: str) -> None:
 
 CASES: list[tuple[Callable[[Path, str], None], str, str]] = [
     (hdf5, "a.h5", "s0.h5"),
-    (netcdf, "a.nc", "s0.h5"),
+    (hdf5, "a.nc", "s0.h5"),
     (deep, "a.h5", "s0.h5"),
     (virtual, "a.h5", "s0.h5"),
     (raw_file, "a.h5", "s0.bin"),
-    (nrrd, "a.nhdr", "s0.bin"),
-    (nrrd_list, "a.nhdr", "s0.bin"),
-    (nrrd_pattern, "a.nhdr", "s0.bin"),
-    (metaimage, "a.mhd", "s0.bin"),
-    (metaimage_pattern, "a.mhd", "s0.bin"),
-    (pvti, "a.pvti", "s0.vti"),
-    (pvd, "a.pvd", "s0.vti"),
-    (listed_json, "a.vti.series", "s0.vti"),
+    (text(f"{NRRD}data file: OTHER\n\n"), "a.nhdr", "s0.bin"),
+    (text(f"{NRRD}data file: LIST\nOTHER\n"), "a.nhdr", "s0.bin"),
+    (text(f"{NRRD}data file: PATTERN 0 0 1\n\n"), "a.nhdr", "s0.bin"),
+    (text(f"{META}ElementDataFile = OTHER\n"), "a.mhd", "s0.bin"),
+    (text(f"{META}ElementDataFile = PATTERN 0 0 1\n"), "a.mhd", "s0.bin"),
+    (text(PVTI), "a.pvti", "s0.vti"),
+    (text(PVD), "a.pvd", "s0.vti"),
+    (text('{"files": [{"name": "OTHER", "time": 0}]}'), "a.vti.series", "s0.vti"),
     (symbolic_link, "a.npy", "s0.npy"),
 ]
 
 
 def secrets(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
-    with h5py.File(folder / "s0.h5", "w") as file:
-        file["u"] = VALUES_NO_EXTERNAL
-    (folder / "s0.bin").write_bytes(VALUES_NO_EXTERNAL.tobytes())
+    write_hdf5(folder / "s0.h5", u=PLAIN)
+    (folder / "s0.bin").write_bytes(PLAIN.tobytes())
     (folder / "s0.vti").write_text(GRID)
-    np.save(folder / "s0.npy", VALUES_NO_EXTERNAL)
+    np.save(folder / "s0.npy", PLAIN)
 
 
 @pytest.mark.parametrize(("make", "name", "other"), CASES)
@@ -561,10 +519,10 @@ def test_files_outside_the_folder_are_not_read(
     )
     with pytest.raises(FhashError) as caught:
         open_series(path, no_external=True)
-    if form != "here" or make in (hdf5, netcdf, virtual, raw_file):
+    if form != "here" or make in (hdf5, virtual, raw_file):
         assert isinstance(caught.value, InputError)
         assert "outside its folder" in str(caught.value)
-    if make in (hdf5, netcdf, virtual, raw_file):
+    if make in (hdf5, virtual, raw_file):
         with pytest.raises(InputError, match="outside its folder"):
             list_variables(path, no_external=True)
 
@@ -582,18 +540,18 @@ def test_files_inside_the_folder_are_read(
     make(tmp_path / name, other)
     for options in ({}, {"no_external": True}):
         with open_series(tmp_path / name, **options) as series:
-            assert series.read(0).ravel()[-1] in (VALUES_NO_EXTERNAL[0].ravel()[-1], 19)
+            assert series.read(0).ravel()[-1] in (PLAIN[0].ravel()[-1], 19)
 
 
 def test_links_in_a_zarr_folder_are_not_followed(tmp_path: Path) -> None:
     outside, folder = tmp_path / "outside", tmp_path / "upload"
     outside.mkdir()
     folder.mkdir()
-    zarr.create_array(outside / "b.zarr", data=VALUES_NO_EXTERNAL, chunks=(1, 3, 4, 5))
+    zarr.create_array(outside / "b.zarr", data=PLAIN, chunks=(1, 3, 4, 5))
     shutil.copy(outside / "b.zarr" / "c" / "0" / "0" / "0" / "0", outside / "chunk")
     zarr_link(folder / "a.zarr", "../outside/chunk")
     with open_series(folder / "a.zarr") as series:
-        np.testing.assert_array_equal(series.read(0), VALUES_NO_EXTERNAL[0])
+        np.testing.assert_array_equal(series.read(0), PLAIN[0])
     with pytest.raises(InputError, match="outside its folder"):
         open_series(folder / "a.zarr", no_external=True)
     with pytest.raises(InputError, match="outside its folder"):
@@ -602,7 +560,7 @@ def test_links_in_a_zarr_folder_are_not_followed(tmp_path: Path) -> None:
 
 def test_a_url_in_a_header_is_a_name_of_a_file(tmp_path: Path) -> None:
     secrets(tmp_path)
-    nrrd(tmp_path / "a.nhdr", f"file://{tmp_path}/s0.bin")
+    (tmp_path / "a.nhdr").write_text(f"{NRRD}data file: file://{tmp_path}/s0.bin\n\n")
     for no_external in (False, True):
         with pytest.raises(InputError, match=r"is not there|outside"):
             open_series(tmp_path / "a.nhdr", no_external=no_external)

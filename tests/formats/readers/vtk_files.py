@@ -12,18 +12,21 @@ TIME = 12.5
 """Field value of every grid."""
 
 
-def image(arrays: dict[str, np.ndarray], *, cells: bool = False, **options: Any) -> Any:
+def image(
+    arrays: dict[str, np.ndarray],
+    *,
+    cells: bool = False,
+    first_vertex: tuple[int, int, int] = (0, 0, 0),
+) -> Any:
     """A vtkImageData of arrays (z, y, x) or (z, y, x, components) at its points or cells."""
     data_model = pytest.importorskip("vtkmodules.vtkCommonDataModel")
     first = next(iter(arrays.values()))
     z, y, x = (n + (1 if cells and n > 1 else 0) for n in first.shape[:3])
     grid = data_model.vtkImageData()
-    low = options.get("first", (0, 0, 0))
-    grid.SetExtent(low[0], low[0] + x - 1, low[1], low[1] + y - 1, low[2], low[2] + z - 1)
-    grid.SetOrigin(*options.get("origin", (0.5, -1.0, 2.0)))
-    grid.SetSpacing(*options.get("spacing", (0.25, 0.5, 2.0)))
-    if "direction" in options:
-        grid.SetDirectionMatrix(*options["direction"])
+    i, j, k = first_vertex
+    grid.SetExtent(i, i + x - 1, j, j + y - 1, k, k + z - 1)
+    grid.SetOrigin(0.5, -1.0, 2.0)
+    grid.SetSpacing(0.25, 0.5, 2.0)
     fill(grid, arrays, cells=cells)
     return grid
 
@@ -67,7 +70,7 @@ def write(path: Path, grid: Any, **options: Any) -> Path:
         writer.SetCompressorTypeToNone()
     else:
         getattr(writer, f"SetCompressorTypeTo{compressor}")()
-    writer.SetBlockSize(options.get("block", 512))
+    writer.SetBlockSize(512)
     (
         writer.SetHeaderTypeToUInt32
         if options.get("header") == 32

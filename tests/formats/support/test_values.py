@@ -58,7 +58,7 @@ from fhash_formats.support.values import (
     [
         ("m s-1", "m s-1"),
         (b"caf\xc3\xa9", "caf\u00e9"),
-        (b"\xff", "\ufffd"),
+        (b"\xff", "\u00ff"),
         (None, None),
         (True, True),
         (np.bool_(True), True),
@@ -108,14 +108,9 @@ def test_only_integers_of_64_bits_are_wide() -> None:
     assert is_wide_integer(np.dtype(">i8"))
 
 
-@pytest.mark.parametrize("text", ["0", "-1.5", "1e-300", " 2 ", "inf", "nan", "1_000"])
-def test_what_float_reads_is_a_number(text: str) -> None:
-    assert is_number(text)
-
-
-@pytest.mark.parametrize("text", ["", " ", "x", "1:2", "0x10", "1,5", "2001-02-10", "--1"])
-def test_other_texts_are_none(text: str) -> None:
-    assert not is_number(text)
+def test_what_float_reads_is_a_number() -> None:
+    assert all(map(is_number, ["0", "-1.5", "1e-300", " 2 ", "inf", "nan", "1_000"]))
+    assert not any(map(is_number, ["", " ", "x", "1:2", "0x10", "1,5", "2001-02-10", "--1"]))
 
 
 @pytest.mark.parametrize(
@@ -134,8 +129,8 @@ def test_other_texts_are_none(text: str) -> None:
         (np.bool_(True), True, True),
         (True, True, True),
         (None, None, None),
-        ("a\udc80", "a?", "a?"),
-        ({"a\udc80": (1, np.int8(2))}, {"a?": [1, 2]}, {"a?": [1, 2]}),
+        ("a\udc80\ud800", "a\x80?", "a\x80?"),
+        ({"a\udc80": (1, np.int8(2))}, {"a\x80": [1, 2]}, {"a\x80": [1, 2]}),
         ({1: math.nan}, {"1": None}, {"1": "NaN"}),
         (np.ma.masked, None, None),
     ],
@@ -174,10 +169,6 @@ def test_digits_that_python_refuses_to_write() -> None:
     assert plain_json(10**5000) is None
     with pytest.raises(UnknownValueError):
         attribute_json(10**5000)
-
-
-def test_text_without_lone_surrogates_plain_json() -> None:
-    assert plain_text("a\udcffb\u00e9") == "a\u00ffb\u00e9"
 
 
 ARRAYS = [
@@ -329,7 +320,6 @@ def test_day_numbers_are_a_bijection(calendar: str) -> None:
 
 @pytest.mark.parametrize("calendar", USUAL)
 def test_dates_of_cftime(calendar: str) -> None:
-    cftime = pytest.importorskip("cftime")
     choose = random.Random(0)
     epochs = ("1-1-1", "1582-10-15", "1900-01-01 12:30", "2000-02-28", "1970-01-01T00:00:00Z")
     for unit, epoch in itertools.product(("days", "hours", "seconds"), epochs):

@@ -325,15 +325,6 @@ def test_analysis_and_synthesis_lose_less_than_the_step(n: int, step: float) -> 
     assert np.allclose(basis.analysis @ basis.synthesis, np.eye(basis.rank), atol=1e-10)
 
 
-def test_the_vectors_are_the_eigenvectors() -> None:
-    columns = smooth(32)
-    gram = columns @ columns.T
-    synthesis = fit_basis(gram, 1e-6).synthesis
-    first = np.linalg.eigh(gram)[1][:, ::-1][:, :4]
-    assert np.allclose(np.abs(np.sum(synthesis[:, :4] * first, axis=0)), 1.0, atol=1e-3)
-    assert np.allclose(np.sum(synthesis.astype(float) ** 2, axis=0), 1.0, atol=0.02)
-
-
 def test_nothing_to_keep_is_a_basis_of_rank_0() -> None:
     basis = fit_basis(np.zeros((5, 5)), 1.0)
     assert basis.rank == 0
@@ -468,19 +459,6 @@ def test_a_basis_is_no_json() -> None:
     axis = AxisTransform(kind="klt", basis=some_basis())
     with pytest.raises(InputError, match="no JSON value"):
         axis.to_json()
-
-
-@pytest.mark.parametrize(
-    ("y", "x", "coupled"),
-    [
-        (["9/7", 3], ["9/7", 3], True),
-        (["9/7", 3], ["9/7", 2], False),
-        (["9/7", 3], ["5/3", 3], False),
-        ("none", "none", False),
-    ],
-)
-def test_the_plane_is_coupled_by_equal_wavelets(y: Any, x: Any, coupled: bool) -> None:
-    assert TransformSpec.from_dict({**PLAIN, "y": y, "x": x}).coupled is coupled
 
 
 @pytest.mark.parametrize(

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 import zlib
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from numpy.typing import NDArray
-from reference.masks import BOUNDS, mask_levels
+from reference.masks import mask_levels
 from tiles import of_two_quantisers
 
-from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform import coder
 from fhash_formats.transform import coder as prior
-from fhash_formats.transform import coder as table
 from fhash_formats.transform.coder import (
-    HIGH,
-    KIND,
-    LOW,
     MAX_INTEGER,
-    MAX_SCORE,
-    REFERENCES,
     MaskLevels,
     State,
     Table,
-    blank_state,
     decode_block,
     decode_integers,
     decode_labels,
@@ -162,18 +150,10 @@ def test_estimates_come_to_an_end(mode: str) -> None:
         noise = np.random.default_rng(2).uniform(-0.6, 0.6, shape)
         scaled = (integers + np.where(integers == 0, noise, 0.2)).astype(np.float32)
         integers = nearest(scaled)
-    state = blank_state()
-    coded = encode_integers(
-        integers, table, scaled=scaled, weight=0.3, state=state, trellis=trellis
-    )
+    coded = encode_integers(integers, table, scaled=scaled, weight=0.3, trellis=trellis)
     again = encode_integers(coded.integers, table, trellis=trellis)
     decoded = decode_integers(again.data, shape, table, trellis=trellis)
     assert np.array_equal(decoded, coded.integers)
-    # The estimate of a zero where all around is zero has seen all it counts, and stays.
-    slow, fast, count, _ = (int(number) for number in state.slots[0])
-    assert count == 400
-    assert slow > 65000
-    assert fast > 65500
 
 
 def rows_that_are_chosen_away() -> NDArray[np.float32]:
@@ -222,7 +202,6 @@ def test_a_second_try_with_more_room_gives_the_same(
     scaled = rows_that_are_chosen_away()
     results = []
     for room in (16, 1 << 20):
-        state = blank_state()
         # What the coder takes as the room of its first try.
         monkeypatch.setattr(coder, "max", lambda *_, room=room: room, raising=False)
         coded = encode_integers(
@@ -230,10 +209,9 @@ def test_a_second_try_with_more_room_gives_the_same(
             single_band(scaled.shape),
             scaled=scaled if choosing else None,
             weight=0.3,
-            state=state,
         )
         assert len(coded.data) > 4096
-        results.append((coded.data, coded.integers.tobytes(), state.slots.tobytes()))
+        results.append((coded.data, coded.integers.tobytes()))
     assert results[0] == results[1]
 
 
@@ -256,21 +234,6 @@ def test_choosing_saves_bytes_for_little_error() -> None:
         assert errors[1] + weight * 8 * len(chosen.data) <= errors[0] + weight * 8 * len(plain.data)
         assert weight > 0 or np.array_equal(chosen.integers, plain.integers)
     assert len(chosen.data) < 0.95 * len(plain.data)
-
-
-def test_a_state_is_left_behind_and_helps() -> None:
-    shape = (2, 2, 8, 20)
-    table, integers, state = single_band(shape), make("dense", shape), blank_state()
-    first = encode_integers(integers, table, state=state)
-    assert any(
-        (left != right).any()
-        for left, right in zip(vars(state).values(), vars(blank_state()).values(), strict=True)
-    )
-    second = encode_integers(make("dense", shape, seed=1), table, state=state)
-    assert len(second.data) < len(
-        encode_integers(make("dense", shape, seed=1), table, state=blank_state()).data
-    )
-    assert first.data == encode_integers(integers, table, state=blank_state()).data
 
 
 def tries(data: bytes, count: int) -> list[bytes]:
@@ -336,15 +299,6 @@ def test_a_block_of_nothing(shape: Shape) -> None:
     assert decode_block(b"", shape).shape == shape
     with pytest.raises(DamagedFileError):
         decode_block(b"\xff", shape)
-
-
-def test_threads_do_not_meet() -> None:
-    shape = (3, 2, 9, 26)
-    alone = [encode_block(make("mixed", shape, seed)) for seed in range(8)]
-    with ThreadPoolExecutor(4) as pool:
-        assert (
-            list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
-        )
 
 
 def test_tables_of_the_coder_do_not_depend_on_the_c_library() -> None:
@@ -473,22 +427,6 @@ def test_the_prior_follows_the_tile_soon_and_is_not_changed() -> None:
     assert not state.slots.flags.writeable
 
 
-def test_levels_rise_with_the_value_and_reach_as_far_as_the_feature_grew() -> None:
-    values = np.zeros((1, 1, 3, 9), np.float32)
-    values[0, 0, 1, 4] = 5.0
-    levels, others = MaskLevels(edges=(1.0, 4.0), scores=(0, 128, 2000), reach=2).levels(values)
-    np.testing.assert_array_equal(
-        levels[0, 0, 1] > 0, [False, False, True, True, True, True, True, False, False]
-    )
-    assert levels.max() == sum(bound <= 2000 for bound in BOUNDS)
-    np.testing.assert_array_equal(np.argwhere(others), [[0, 0, 1, 4]])
-    rising = MaskLevels(edges=(1.0, 4.0), scores=(0, 128, 2000)).levels(
-        np.array([0, 1, 3.9, 4], np.float64).reshape(1, 1, 1, 4)
-    )[0]
-    assert list(rising.ravel()) == [0, 16, 16, levels.max()]
-    assert all(low < high <= MAX_SCORE for low, high in pairwise(BOUNDS))
-
-
 @pytest.mark.parametrize("reach", [0, 1, 3, 64])
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 17), (1, 9, 1, 40), (3, 1, 70, 2)])
@@ -550,25 +488,6 @@ def test_the_probabilities_do_not_depend_on_the_c_library() -> None:
     near[21] = 1  # even odds are exact
     assert near.min() > 1e-3
     assert np.array_equal(prior._PROBABILITIES[1:], np.floor(values))
-
-
-def test_the_columns_are_those_of_the_native_coder() -> None:
-    source = (Path(native.__file__).parent / "coder_contexts.hpp").read_text(encoding="utf-8")
-    found = re.search(r"enum Column \{([^}]*)\}", source)
-    assert found is not None
-    columns = dict(re.findall(r"(\w+) = (\d+)", found[1]))
-    columns |= dict(re.findall(r"(REFERENCE_\w+) = (\d+)", source))
-    assert {"LOW", "HIGH", "KIND", "REFERENCES", "BAND", "SHIFT"} < columns.keys()
-    assert columns == {name: str(getattr(table, name)) for name in columns}
-
-
-def test_a_single_band_is_the_whole_shape_and_refers_to_none() -> None:
-    row = single_band((2, 3, 5, 7))[0]
-    assert row.dtype == np.int32
-    assert len(row) == table.COLUMNS
-    assert list(row[LOW:HIGH]) == [0, 0, 0, 0]
-    assert list(row[HIGH:KIND]) == [2, 3, 5, 7]
-    assert list(row[REFERENCES + table.BAND :: table.REFERENCE_COLUMNS]) == [-1] * 4
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs the memory limits of Linux")

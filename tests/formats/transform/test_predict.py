@@ -10,21 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import tiles
 from specs import spec_of
-from tiles import (
-    SETTINGS,
-    Four,
-    damaged_copies,
-    predictor_of,
-    random_head,
-    resealed,
-    same,
-    streams,
-    wave,
-)
-from tiles import (
-    SHAPE as SHAPE_TILE_FORMAT,
-)
+from tiles import SETTINGS, Four, predictor_of, random_head, resealed, same, streams, wave
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
@@ -38,9 +26,7 @@ from fhash_formats.transform.predict import (
     decode_predicted,
     encode_predicted,
     integers_of,
-    pass_arrays,
     passes_of,
-    values_of,
 )
 from fhash_formats.transform.tile_format import (
     EMPTY,
@@ -56,7 +42,6 @@ from fhash_formats.transform.tile_format import (
     TileSettings,
     has_regions,
     labelled_stream,
-    pack_mask,
     pack_missing,
     pack_planes,
     parse_stream,
@@ -64,10 +49,8 @@ from fhash_formats.transform.tile_format import (
     restore_missing,
     seal,
     unpack_labelled,
-    unpack_mask,
     unpack_planes,
     varint,
-    zero_levels,
 )
 
 Shape = tuple[int, int, int, int]
@@ -172,19 +155,6 @@ def test_hostile_bytes_give_integers_within_bounds_or_an_error() -> None:
     assert False in refused
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8", "int64"])
-def test_the_nearest_integers_keep_the_bound(dtype: str) -> None:
-    values = (np.random.default_rng(4).random((3, 4, 5, 6)) * 200).astype(dtype)
-    error = 3.0
-    step = 2 * error * (1 - 1e-6) if values.dtype.kind == "f" else 2 * int(error) + 1.0
-    predictor = predictor_of(step=step, origin=100.0)
-    integers = integers_of(values, np.ones(values.shape, bool), predictor)
-    assert integers is not None
-    decoded = values_of(integers, predictor)
-    decoded = decoded.astype(dtype) if values.dtype.kind == "f" else np.rint(decoded)
-    assert np.abs(decoded.astype(np.float64) - values.astype(np.float64)).max() <= error
-
-
 def test_integers_that_are_too_large_are_refused() -> None:
     values = np.array([0.0, 1e30, np.nan, np.inf]).reshape(1, 1, 1, 4)
     predictor = predictor_of()
@@ -237,29 +207,6 @@ def test_threads_that_decode_for_the_first_time_at_once() -> None:
 def test_a_bad_predictor_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         replace(predictor_of(), **change)
-
-
-def test_taps_are_known_when_they_are_needed() -> None:
-    """Within a pass, taps come before the vertex in C order."""
-    settings: list[tuple[Four, Four]] = [
-        ((2, 2, 2, 2), (0, 1, 2, 3)),
-        ((1, 2, 0, 2), (3, 1, 2, 0)),
-    ]
-    for levels, order in settings:
-        for a_pass in passes_of(levels, order, 2):
-            assert len(set(a_pass.taps)) == len(a_pass.taps)
-            for in_pass, *offset in a_pass.taps:
-                assert not in_pass or tuple(offset) < (0, 0, 0, 0)
-                assert in_pass or a_pass.axis >= 0
-
-
-def test_the_arrays_hold_the_taps_of_each_pass() -> None:
-    predictor = predictor_of((1, 2, 0, 2), (3, 1, 2, 0), 1)
-    rows, taps, weights = pass_arrays(predictor)
-    assert len(taps) == len(weights) == len(predictor.weights)
-    for (axis, kind, first, count), a_pass in zip(rows, predictor.passes, strict=True):
-        assert (axis, kind) == (a_pass.axis, a_pass.kind)
-        assert [tuple(tap) for tap in taps[first : first + count].tolist()] == list(a_pass.taps)
 
 
 Values = npt.NDArray[Any]
@@ -353,19 +300,6 @@ def test_a_constant_tile_takes_few_bytes() -> None:
     assert np.abs(decode_tile(coded.data, SHAPE, "float32", settings) - values).max() <= 0.1
 
 
-def test_missing_values_come_back() -> None:
-    values = _values()
-    values[1, 2, 3, 4:9] = np.nan
-    values[0, 0, 0, 0], values[2, 1, 0, 3] = np.inf, -np.inf
-    settings = _settings(values, 1.0)
-    decoded = decode_tile(
-        encode_tile(values, settings, Coding(error=1.0)).data, SHAPE, "float32", settings
-    )
-    finite = np.isfinite(values)
-    np.testing.assert_array_equal(decoded[~finite], values[~finite])
-    assert np.abs(decoded[finite] - values[finite]).max() <= 1.0
-
-
 def test_a_stream_with_its_own_settings_and_a_mask() -> None:
     values = _values()
     in_coreset = np.random.default_rng(5).random(SHAPE) < 0.4
@@ -390,20 +324,6 @@ def test_a_level_of_detail_is_every_other_vertex(lod: int) -> None:
         decode_tile(data, SHAPE, "float32", settings, lod=lod),
         decode_tile(data, SHAPE, "float32", settings)[:, every, every, every],
     )
-
-
-def test_every_flipped_or_cut_byte_is_noticed() -> None:
-    values = _values()
-    settings = _settings(values, 2.0)
-    data = encode_tile(values, settings, Coding(error=2.0)).data
-    generator = np.random.default_rng(6)
-    for at in (*range(8), *generator.integers(8, len(data), 30).tolist()):
-        for changed in (
-            data[:at],
-            data[:at] + bytes([data[at] ^ (1 << int(generator.integers(8)))]) + data[at + 1 :],
-        ):
-            with pytest.raises(DamagedFileError):
-                decode_tile(changed, SHAPE, "float32", settings)
 
 
 def test_settings_without_a_predictor_are_refused() -> None:
@@ -484,15 +404,6 @@ def test_smooth_values_are_not_coded_as_labels() -> None:
     coded = encode_tile(values, settings, Coding(error=0.5))
     assert coded.data[4] & KIND == TRANSFORMED
     np.testing.assert_array_equal(coded.decoded, values)
-
-
-def test_damage_is_an_error() -> None:
-    values = np.ascontiguousarray(regions("i2")[:1, :2])
-    data = labelled_stream(values, None, None)
-    assert data is not None
-    for damaged in damaged_copies(data):
-        with pytest.raises(DamagedFileError):
-            decode_tile(damaged, values.shape, "i2", SETTINGS)
 
 
 @pytest.mark.parametrize("dtype", ["u2", "i4", "u8", "f4", "f8"])
@@ -606,13 +517,7 @@ def test_missing_values_come_back_into_floating_values_only() -> None:
     finite = np.where(np.isfinite(values), values, np.float32(0))
     assert same(restore_missing(finite, missing), values)
     with pytest.raises(DamagedFileError, match="integers has missing values"):
-        restore_missing(np.zeros(SHAPE_TILE_FORMAT, np.int16), missing)
-
-
-def test_a_mask_comes_back() -> None:
-    mask, levels = wave() > 0, zero_levels(SHAPE_TILE_FORMAT)
-    assert np.array_equal(unpack_mask(pack_mask(mask, levels), levels), mask)
-    assert pack_mask(np.ones(SHAPE_TILE_FORMAT, bool), levels) == b""
+        restore_missing(np.zeros(tiles.SHAPE, np.int16), missing)
 
 
 CHANGES: list[dict[str, Any]] = [
@@ -624,7 +529,7 @@ CHANGES: list[dict[str, Any]] = [
     {"trellis": True, "offsets": (-5, -1, 0, 0, 1, -127)},
     {"head": random_head((3, 4), cross=True)},
     {"predictor": predictor_of((1, 2, 2, 2), (0, 3, 1, 2), 1, step=0.25)},
-    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), SHAPE_TILE_FORMAT, 0.1)},
+    {"transform": spec_of(("klt", "none", "5/3", "klt"), (0, 0, 3, 0), tiles.SHAPE, 0.1)},
     {"origin": -(1 << 63), "low": -(1 << 62), "high": (1 << 62) + 1},
     {"origin": (1 << 64) - 1, "low": 0.0, "high": 5.0},
     {"low": -(1 << 63), "high": (1 << 63) - 1},

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from specs import spec_of
 
 from fhash_formats.native import crc32c
-from fhash_formats.transform.coder import Table
+from fhash_formats.transform.coder import MaskLevels, Table
 from fhash_formats.transform.encoding import Coding, encode_tile, exact_tile
 from fhash_formats.transform.head import MAX_WEIGHT, Layer, NeighbourHead, layer_inputs
 from fhash_formats.transform.predict import Predictor, passes_of
@@ -47,6 +47,8 @@ def streams() -> dict[str, tuple[Values, bytes]]:
     integers = (values * 50).astype("i2")
     coarse, fine = replace(SETTINGS, quantum=0.0), replace(SETTINGS, quantum=0.002)
     own, nothing = Coding(own_settings=True), np.zeros(holes.shape, bool)
+    masked, some = replace(coarse, mask=MaskLevels()), values > 0.5
+    predictor = predictor_of((0, 1, 1, 1), step=fine.quantum)
     return {
         "plain": (values, encode_tile(values, coarse, own).data),
         "residual": (values, encode_tile(values, fine, replace(own, error=0.001)).data),
@@ -54,6 +56,17 @@ def streams() -> dict[str, tuple[Values, bytes]]:
         "empty": (holes, encode_tile(holes, coarse, own, in_coreset=nothing).data),
         "exact": (holes, exact_tile(holes).data),
         "integers": (integers, encode_tile(integers, replace(SETTINGS, high=99.0), own).data),
+        "mask": (holes, encode_tile(holes, masked, own, in_coreset=some).data),
+        "exact mask": (values, exact_tile(values, occupied=some).data),
+        "empty mask": (values, encode_tile(values, masked, own, in_coreset=nothing).data),
+        "predicted": (
+            values,
+            encode_tile(values, replace(fine, predictor=predictor), replace(own, error=0.001)).data,
+        ),
+        "labels": (
+            integers,
+            encode_tile(integers // 30, replace(coarse, labels=True), replace(own, error=0.0)).data,
+        ),
     }
 
 

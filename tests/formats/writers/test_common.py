@@ -126,65 +126,24 @@ def test_all_names_of_a_file_differ(names: Any, expected: str) -> None:
 
 
 def test_no_attribute_that_changes_the_values_is_kept() -> None:
-    packing = {
-        name: 1
-        for name in (
-            "scale_factor",
-            "add_offset",
-            "_FillValue",
-            "missing_value",
-            "valid_range",
-            "valid_min",
-            "valid_max",
-        )
-    }
-    references = {
-        name: "x"
-        for name in (
-            "coordinates",
-            "grid_mapping",
-            "bounds",
-            "DIMENSION_LIST",
-            "_Netcdf4Dimid",
-            "CLASS",
-        )
-    }
-    made = region(
-        name="group/wind",
-        units="m s-1",
-        attributes={
-            **packing,
-            **references,
-            "standard_name": "wind_speed",
-            "units": "knots",
-            "": 1,
-        },
-    )
+    packing = "scale_factor add_offset _FillValue missing_value valid_range valid_min valid_max"
+    references = "coordinates grid_mapping bounds DIMENSION_LIST _Netcdf4Dimid CLASS"
+    dropped = {**dict.fromkeys(packing.split(), 1), **dict.fromkeys(references.split(), "x")}
+    told = {"standard_name": "wind_speed", "units": "knots", "": 1}
+    made = region(name="group/wind", units="m s-1", attributes=dropped | told)
     assert variable_attributes(made) == {
         "standard_name": "wind_speed",
         "units": "m s-1",
         "long_name": "group/wind",
     }
-    time = Coordinate(
-        name="t",
-        values=np.zeros(1),
-        attributes={
-            "units": "hours since 1970-01-01",
-            "calendar": "gregorian",
-            "bounds": "time_bnds",
-        },
-    )
-    assert coordinate_attributes("t", time) == {
-        "axis": "T",
-        "units": "hours since 1970-01-01",
-        "calendar": "gregorian",
-    }
-    assert coordinate_attributes(
-        "z", Coordinate(name="z", values=np.zeros(1), attributes={"axis": "z", "positive": "up"})
-    ) == {
-        "axis": "z",
-        "positive": "up",
-    }
+    dated = {"units": "hours since 1970-01-01", "calendar": "gregorian"}
+    upright = {"axis": "z", "positive": "up"}
+    for axis, attributes, kept in (
+        ("t", {**dated, "bounds": "time_bnds"}, {"axis": "T", **dated}),
+        ("z", upright, upright),
+    ):
+        coordinate = Coordinate(name=axis, values=np.zeros(1), attributes=attributes)
+        assert coordinate_attributes(axis, coordinate) == kept
 
 
 def test_attributes_are_json_and_what_cannot_be_is_left_out() -> None:
@@ -247,8 +206,6 @@ def test_a_long_list_fits_into_hdf5(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
 def test_names_that_a_file_cannot_hold(tmp_path: Path, suffix: str) -> None:
-    import xarray
-
     coords = {
         axis: Coordinate(name="gas/density", values=coordinate.values)
         for axis, coordinate in COORDS.items()
@@ -264,13 +221,26 @@ def test_names_that_a_file_cannot_hold(tmp_path: Path, suffix: str) -> None:
             np.testing.assert_array_equal(file["gas_density"], DATA)
             assert file["gas_density"].attrs["long_name"] == "gas/density"
         return
-    with xarray.open_dataset(path, engine="zarr" if suffix == ".zarr" else "h5netcdf") as data:
+    with xr.open_dataset(path, engine="zarr" if suffix == ".zarr" else "h5netcdf") as data:
         assert data["gas_density"].dims == tuple(f"gas_density_{n}" for n in (2, 3, 4, 5))
         np.testing.assert_array_equal(data["gas_density"].values, DATA)
         assert data["gas_density"].attrs == {"units": "K", "long_name": "gas/density"}
 
 
 OUTLINE_SHAPE = (2, 1, 3, 4)
+
+
+def variable(name: str, dimensions: str, values: Any, **changes: Any) -> SourceVariable:
+    found = np.asarray(values)
+    return SourceVariable(
+        **{"name": name, "dimensions": tuple(dimensions.split()), "values": found, **changes}
+    )
+
+
+def position(name: str, dimension: str, values: Any, **attributes: Any) -> SourceVariable:
+    return variable(name, dimension, values, attributes=attributes, is_coordinate=True)
+
+
 METADATA = SourceMetadata(
     dimensions={"lon": "x", "one": "", "time": "t", "y": "y"},
     variable_attributes={
@@ -283,42 +253,19 @@ METADATA = SourceMetadata(
         "tags": ["a", "b"],
     },
     variables=(
-        SourceVariable(
-            name="lon",
-            dimensions=("lon",),
-            values=np.arange(4, dtype="f4"),
-            attributes={"units": "degrees_east"},
-            is_coordinate=True,
+        position("lon", "lon", np.arange(4, dtype="f4"), units="degrees_east"),
+        position("time", "time", [5, 7], units="days since 2000-01-01", bounds="time_bnds"),
+        variable("time_bnds", "time bnds", np.eye(2)),
+        position("name", "time", np.array(["a", "ä"], dtype=object)),
+        position(
+            "depth",
+            "y",
+            np.array([1, -99, 3], "i2"),
+            _FillValue=np.int16(-99),
+            scale_factor=0.5,
         ),
-        SourceVariable(
-            name="time",
-            dimensions=("time",),
-            values=np.array([5, 7]),
-            attributes={"units": "days since 2000-01-01", "bounds": "time_bnds"},
-            is_coordinate=True,
-        ),
-        SourceVariable(name="time_bnds", dimensions=("time", "bnds"), values=np.eye(2)),
-        SourceVariable(
-            name="name",
-            dimensions=("time",),
-            values=np.array(["a", "ä"], dtype=object),
-            is_coordinate=True,
-        ),
-        SourceVariable(
-            name="depth",
-            dimensions=("y",),
-            values=np.array([1, -99, 3], "i2"),
-            attributes={"_FillValue": np.int16(-99), "scale_factor": 0.5},
-            is_coordinate=True,
-        ),
-        SourceVariable(
-            name="slope",
-            dimensions=("y",),
-            values=np.array([1, -9, 3], "f4"),
-            attributes={"_FillValue": np.float32(-9)},
-            is_coordinate=True,
-        ),
-        SourceVariable(name="crs", dimensions=(), values=np.int32(0), attributes={"a": 1.5}),
+        position("slope", "y", np.array([1, -9, 3], "f4"), _FillValue=np.float32(-9)),
+        variable("crs", "", np.int32(0), attributes={"a": 1.5}),
     ),
     attributes={"Conventions": "CF-1.11", "history": "one\ntwo", "NAME": "plumbing"},
 )
@@ -346,7 +293,7 @@ def test_frames_go_where_the_dimensions_say() -> None:
     assert outline.ordered((1, 5, 6, 7)) == (7, 1, 1, 6)
     values = np.zeros(outline.shape)
     for step, frame in enumerate(VALUES):
-        place, ordered = outline.place(step, frame)
+        place, ordered = outline.slab(step, frame)
         values[place] = ordered
     np.testing.assert_array_equal(values[:, 0], VALUES[:, 0].transpose(2, 0, 1))
 
@@ -381,19 +328,11 @@ def test_a_region_without_a_source_has_four_axes() -> None:
 def test_files_give_everything_back(tmp_path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     save_region(path, region_outline(), iter(VALUES))
-    options = {"engine": "zarr"} if suffix == "zarr" else {"engine": "h5netcdf"}
-    with xr.open_dataset(path, decode_coords="all", **options) as found:
+    engine = "zarr" if suffix == "zarr" else "h5netcdf"
+    with xr.open_dataset(path, decode_coords="all", engine=engine) as found:
         assert found["u"].dims == ("lon", "one", "time", "y")
         np.testing.assert_array_equal(found["u"][:, 0], VALUES[:, 0].transpose(2, 0, 1))
-        assert set(found.coords) == {
-            "lon",
-            "time",
-            "time_bnds",
-            "name",
-            "depth",
-            "slope",
-            "crs",
-        }
+        assert set(found.coords) == {each.name for each in METADATA.variables}
         assert found["lon"].dtype == np.float32
         assert found["name"].values.tolist() == ["a", "ä"]
         np.testing.assert_array_equal(found["depth"], [0.5, np.nan, 1.5])
@@ -417,18 +356,10 @@ def test_files_give_everything_back(tmp_path, suffix: str) -> None:
         ({"shape": (2, 4, 5, 6)}, r"coordinate of t is float64 \(3,\); float64 \(2,\) is needed"),
         ({"coords": {}}, r"coordinates of \[\]; exactly those of t, z, y and x"),
         (
-            {
-                "coords": {
-                    **COORDS,
-                    "x": Coordinate(name="x", values=np.arange(6, dtype="f4")),
-                }
-            },
+            {"coords": {**COORDS, "x": Coordinate(name="x", values=np.arange(6, dtype="f4"))}},
             "coordinate of x is float32",
         ),
-        (
-            {"coords": {**COORDS, "w": COORDS["x"]}},
-            r"\['t', 'w', 'x', 'y', 'z'\]",
-        ),
+        ({"coords": {**COORDS, "w": COORDS["x"]}}, r"\['t', 'w', 'x', 'y', 'z'\]"),
     ],
 )
 def test_a_region_that_is_none(changes: dict[str, Any], message: str) -> None:
@@ -532,10 +463,8 @@ def test_hdf5_has_scales_and_attributes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 def test_xarray_sees_labelled_values(tmp_path: Path, suffix: str) -> None:
-    import xarray
-
     (path,) = save_region(tmp_path / f"out{suffix}", labelled_region(), DATA)
-    opened = xarray.open_zarr if suffix == ".zarr" else xarray.open_dataset
+    opened = xr.open_zarr if suffix == ".zarr" else xr.open_dataset
     with opened(path, decode_times=False) as data:
         theta = data["theta"]
         assert theta.dims == ("time", "height", "lat", "lon")
@@ -544,13 +473,8 @@ def test_xarray_sees_labelled_values(tmp_path: Path, suffix: str) -> None:
         np.testing.assert_array_equal(theta.values, DATA)
         assert theta.attrs["units"] == "K"
         assert theta.attrs["standard_name"] == "air_temperature"
-        assert not {
-            "scale_factor",
-            "add_offset",
-            "missing_value",
-            "valid_range",
-            "grid_mapping",
-        } & set(theta.attrs)
+        dropped = {"scale_factor", "add_offset", "missing_value", "valid_range", "grid_mapping"}
+        assert not dropped & set(theta.attrs)
         for axis, coordinate in COORDS.items():
             found = data[coordinate.name]
             assert found.dtype == np.float64

@@ -7,6 +7,7 @@ import math
 import re
 import struct
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -170,25 +171,28 @@ def _single(value: Any) -> Any:
     return value[0] if isinstance(value, list | tuple) and len(value) == 1 else value
 
 
-def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = False) -> Any:
-    """A fill value in the stored type; None if that type cannot hold it, so that it never occurs.
-
-    unsigned: whether the value was written for unsigned numbers that are read as signed.
+def number_of_text(text: str) -> float | None:
+    """A fill value that is stored as text; None where it is no number.
 
     xarray writes the fill value of a float array of zarr format 3 as base64 of a little-endian
     float64; others write a number or "NaN".
     """
+    with suppress(ValueError):
+        return float(text)
+    with suppress(ValueError, struct.error):
+        return float(struct.unpack("<d", base64.standard_b64decode(text))[0])
+    return None
+
+
+def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = False) -> Any:
+    """A fill value in the stored type; None if that type cannot hold it, so that it never occurs.
+
+    unsigned: whether the value was written for unsigned numbers that are read as signed.
+    """
     if isinstance(value, str | bytes):
-        value = text_of(value)
-        try:
-            value = float(value)
-        except ValueError:
-            try:
-                (value,) = struct.unpack("<d", base64.standard_b64decode(value))
-            except (ValueError, struct.error) as error:
-                raise InputError(
-                    f"{source}: the fill value {value!r} is not a number{AS_STORED}"
-                ) from error
+        text = text_of(value)
+        number = number_of_text(text)
+        value = text if number is None else number
     if not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"{source}: the fill value {value!r} is not a number{AS_STORED}")
     if stored.kind == "f":

@@ -332,7 +332,7 @@ def picks(
     """Index along each selected dimension, by place."""
     picked: dict[int, int] = {}
     for key, text in select:
-        place = _place(dimensions, key)
+        place = _number_of(dimensions, key)
         if place is None:
             raise InputError(
                 f"{source}: --select {key}={text}: {name} has no dimension '{key}'; its dimensions"
@@ -347,7 +347,7 @@ def picks(
     return picked
 
 
-def _place(dimensions: Sequence[Dimension], key: str) -> int | None:
+def _number_of(dimensions: Sequence[Dimension], key: str) -> int | None:
     """Place of a dimension called by its name, as "dim3" or as "3" or "-1"."""
     for place, dimension in enumerate(dimensions):
         if dimension.name == key:

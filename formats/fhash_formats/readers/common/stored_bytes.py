@@ -54,7 +54,7 @@ class FlatArray:
             if part != slice(0, length)
         ]
         if len(parts) > 1:
-            return self._read_parts(ranges, parts[0])
+            return self._read_box(ranges, parts[0])
         place = parts[0] if parts else 0
         part = ranges[place]
         rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
@@ -63,7 +63,7 @@ class FlatArray:
             self._fill(file, result, self.shape[place] * inner, part.start * inner)
         return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
 
-    def _read_parts(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
+    def _read_box(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
         """Values in ranges of which several are parts; `place` is the slowest of these.
 
         Whatever lies behind an index along it is an array of its own.
@@ -100,15 +100,17 @@ class FlatArray:
 
     def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
         file.seek(self.offset + start * self.dtype.itemsize)
-        view = into.view(np.uint8).data
-        done = 0
-        while done < len(view):
-            count = file.readinto(view[done:])  # type: ignore[attr-defined]
-            if not count:
-                raise InputError(
-                    f"{self.path} ends after {file.tell()} bytes, {self.end} are needed"
-                )
-            done += count
+        _read_whole(self.path, file, into.view(np.uint8).data, f", {self.end} are needed")
+
+
+def _read_whole(path: Path, file: BinaryIO, view: memoryview, told: str) -> None:
+    """Fill a view from a file; raises InputError, with more that is told, where it ends."""
+    done = 0
+    while done < len(view):
+        count = file.readinto(view[done:])  # type: ignore[attr-defined]
+        if not count:
+            raise InputError(f"{path} ends after {file.tell()} bytes{told}")
+        done += count
 
 
 def _lengths(ranges: tuple[slice, ...]) -> list[int]:
@@ -168,12 +170,7 @@ class PlainFile:
         """Fill a view with the bytes from `place` on."""
         with self.path.open("rb") as file:
             file.seek(self.start + place)
-            done = 0
-            while done < len(view):
-                count = file.readinto(view[done:])
-                if not count:
-                    raise InputError(f"{self.path} ends after {file.tell()} bytes; it is cut")
-                done += count
+            _read_whole(self.path, file, view, "; it is cut")
 
     def close(self) -> None:
         """Close nothing: each read opens the file for itself."""

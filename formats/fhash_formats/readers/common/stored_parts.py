@@ -29,17 +29,6 @@ from fhash_formats.support.values import text_of
 if TYPE_CHECKING:
     import zarr
 
-__all__ = [
-    "Hdf5Sources",
-    "StoredParts",
-    "hdf5_parts",
-    "labelled_parts",
-    "not_stored",
-    "require_inside",
-    "warn_of_column",
-    "zarr_parts",
-]
-
 MAX_BOXES = 1 << 24
 """Boxes of a grid that are told apart; of a finer one only the share of the whole is known."""
 

@@ -36,19 +36,6 @@ from fhash_formats.series import (
 )
 from fhash_formats.support.values import PLUMBING, UnknownValueError, stored_type, typed_attribute
 
-__all__ = [
-    "MAX_ARRAYS",
-    "Arranged",
-    "Stored",
-    "Wanted",
-    "digest_of",
-    "kept_dimensions",
-    "metadata_of",
-    "named_dimensions",
-    "surroundings",
-    "warn_left_out",
-]
-
 MAX_ONE = 16 << 20
 """Bytes of one array beside the data: latitudes of 1400^2 vertices as float64."""
 MAX_ALL = 64 << 20

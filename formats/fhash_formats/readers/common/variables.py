@@ -301,7 +301,7 @@ Attributes = Callable[[str], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class _Place:
+class _StepPath:
     """The part of a path that counts steps: the path with `*` for it, and the number."""
 
     template: str
@@ -310,7 +310,7 @@ class _Place:
     plain: bool
 
 
-def _place(path: str) -> _Place | None:
+def _step_path(path: str) -> _StepPath | None:
     """The part of a path that counts steps, None without one; the array's own name is none."""
     parts = path.split("/")
     for depth, part in enumerate(parts[:-1]):
@@ -321,7 +321,7 @@ def _place(path: str) -> _Place | None:
         if word and word not in STEPS:
             continue
         stem = part[: match.start("number")]
-        return _Place(
+        return _StepPath(
             template="/".join([*parts[:depth], f"{stem}*", *parts[depth + 1 :]]),
             number=float(match["number"]),
             group="/".join(parts[: depth + 1]),
@@ -339,9 +339,9 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
 
     attributes: attributes of a group by its path.
     """
-    kinds: dict[str, list[tuple[_Place, Variable]]] = {}
+    kinds: dict[str, list[tuple[_StepPath, Variable]]] = {}
     for variable in variables:
-        place = None if variable.error or len(variable.shape) < 2 else _place(variable.name)
+        place = None if variable.error or len(variable.shape) < 2 else _step_path(variable.name)
         if place is not None and not variable.auxiliary:
             kinds.setdefault(place.template, []).append((place, variable))
     broken = _broken(variables)
@@ -382,7 +382,7 @@ def _broken(variables: Sequence[Variable]) -> list[tuple[str, str]]:
     for variable in variables if any(each.error for each in variables) else ():
         if not variable.error:
             continue
-        own, group = _place(variable.name), _place(f"{variable.name}/")
+        own, group = _step_path(variable.name), _step_path(f"{variable.name}/")
         if own is not None:
             found.append((own.template, f"{variable.name} is {variable.error}"))
         elif group is not None:
@@ -426,7 +426,7 @@ def times(
     attributes: of a group or array by its path. scalar: value and unit of a number by its path,
     None if there is no number.
     """
-    places = [(_place(member.name), member.name) for member in members]
+    places = [(_step_path(member.name), member.name) for member in members]
     found = []
     numbers = []
     for place, name in places:

@@ -50,9 +50,10 @@ def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:
     create_zarr(tmp_path / "a.zarr", VALUES, attributes={"scale_factor": "two"})
     with pytest.raises(InputError, match="scale_factor is 'two', not a number"):
         open_series(tmp_path / "a.zarr")
-    create_zarr(tmp_path / "b.zarr", VALUES, attributes={"_FillValue": "?"})
-    with pytest.raises(InputError, match=r"fill value '\?' is not a number"):
-        open_series(tmp_path / "b.zarr")
+    for text in ("?", "\u00e9"):
+        create_zarr(tmp_path / f"{text}.zarr", VALUES, name="v", attributes={"_FillValue": text})
+        with pytest.raises(InputError, match=r"fill value '.' is not a number"):
+            open_series(tmp_path / f"{text}.zarr")
 
 
 @pytest.mark.parametrize(
@@ -510,23 +511,6 @@ def test_a_chunk_of_many_steps_is_kept_as_far_as_it_fits(
         assert series._slab is None or series._slab[1].shape[0] == held
 
 
-def test_a_chunk_of_many_steps_is_decompressed_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("v", data=VALUES, chunks=(3, 3, 5, 6), compression="gzip")
-    asked = []
-    original = h5py.Dataset.__getitem__
-    monkeypatch.setattr(
-        h5py.Dataset, "__getitem__", lambda self, args: asked.append(args) or original(self, args)
-    )
-    with open_series(tmp_path / "a.h5") as series:
-        asked.clear()
-        frames = list(series.frames())
-    assert [ranges[0] for ranges in asked] == [slice(0, 3), slice(3, 4)]
-    np.testing.assert_array_equal(np.stack(frames), VALUES)
-
-
 def test_time_as_the_fastest_axis_reads_many_steps_at_once(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.ascontiguousarray(VALUES.transpose(1, 2, 3, 0)))
     with open_series(tmp_path / "a.npy", axes="z,y,x,t") as series:
@@ -568,10 +552,6 @@ def test_parse_shape_refuses(text: str) -> None:
 def test_axes_that_mean_nothing(axes: str) -> None:
     with pytest.raises(InputError, match="name the file's dimensions in their order"):
         parse_axes(axes)
-
-
-def test_axes_in_any_case() -> None:
-    assert parse_axes("T,Z,y, X") == ("t", "z", "y", "x")
 
 
 @pytest.mark.parametrize(("name", "short"), DTYPES.items())

@@ -16,14 +16,15 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stored_series import VALUES as VALUES_STORED_BYTES
+from stored_series import VALUES as PLAIN
+from stored_series import save_netcdf, write_hdf5
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common import stored_bytes
-from fhash_formats.readers.common import stored_bytes as flat
 from fhash_formats.readers.common.stored_bytes import (
     CompressedFile,
     FlatArray,
@@ -67,8 +68,8 @@ def test_a_part_of_a_flat_array_is_that_part(
         slice(start, stop) if at == place else slice(0, length) for at, length in enumerate(shape)
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flat, "BLOCK_BYTES", block)
-        patch.setattr(flat, "SHORTEST_RUN", run)
+        patch.setattr(stored_bytes, "BLOCK_BYTES", block)
+        patch.setattr(stored_bytes, "SHORTEST_RUN", run)
         np.testing.assert_array_equal(
             FlatArray(path, tuple(shape), values.dtype, offset=4).read(ranges), values[ranges]
         )
@@ -76,13 +77,21 @@ def test_a_part_of_a_flat_array_is_that_part(
 
 @pytest.mark.parametrize("kind", ["npy", "raw"])
 def test_a_variable_cannot_be_named(tmp_path: Path, kind: str) -> None:
-    np.save(tmp_path / "a.npy", VALUES_STORED_BYTES)
-    (tmp_path / "a_6x5x3x4_f4.raw").write_bytes(VALUES_STORED_BYTES.tobytes())
+    np.save(tmp_path / "a.npy", PLAIN)
+    (tmp_path / "a_6x5x3x4_f4.raw").write_bytes(PLAIN.tobytes())
     with pytest.raises(InputError, match="--var v cannot be used"):
         open_series(tmp_path / ("a.npy" if kind == "npy" else "a_6x5x3x4_f4.raw"), var="v")
 
 
-@pytest.mark.parametrize("kind", ["npy", "raw"])
+SAVE: dict[str, Callable[[Path], object]] = {
+    "npy": lambda path: np.save(path, PLAIN),
+    "raw": lambda path: path.write_bytes(PLAIN.tobytes()),
+    "h5": lambda path: write_hdf5(path, v=PLAIN),
+    "nc": lambda path: save_netcdf(path, xr.Dataset({"v": (tuple("tzyx"), PLAIN)})),
+}
+
+
+@pytest.mark.parametrize("kind", SAVE)
 def test_a_file_that_changes_is_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"a_6x5x3x4_f4.{kind}"
     for change in (
@@ -91,12 +100,9 @@ def test_a_file_that_changes_is_refused(tmp_path: Path, kind: str) -> None:
         lambda: os.truncate(path, 5000),
         lambda: os.utime(path, ns=(1, 1)),
     ):
-        if kind == "npy":
-            np.save(path, VALUES_STORED_BYTES)
-        else:
-            path.write_bytes(VALUES_STORED_BYTES.tobytes())
+        SAVE[kind](path)
         with open_series(path) as series:
-            np.testing.assert_array_equal(series.read(0), VALUES_STORED_BYTES[0])
+            np.testing.assert_array_equal(series.read(0), PLAIN[0])
             change()
             with pytest.raises(InputError, match=r"changed while it was being read|cannot be read"):
                 series.read(1)
@@ -104,9 +110,9 @@ def test_a_file_that_changes_is_refused(tmp_path: Path, kind: str) -> None:
 
 def test_a_file_cut_during_a_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    path.write_bytes(VALUES_STORED_BYTES.tobytes()[:-1])
+    path.write_bytes(PLAIN.tobytes()[:-1])
     with pytest.raises(InputError, match="ends after 1439 bytes, 1440 are needed"):
-        FlatArray(path, VALUES_STORED_BYTES.shape, VALUES_STORED_BYTES.dtype).read(
+        FlatArray(path, PLAIN.shape, PLAIN.dtype).read(
             (slice(3, 4), slice(0, 3), slice(0, 5), slice(0, 6))
         )
 

@@ -429,7 +429,6 @@ def test_sizes_are_bounded(monkeypatch) -> None:
     [
         stored(("lat", "lat"), np.zeros((3, 3))),
         stored(("lat",), np.zeros(5)),
-        stored(("a/b",), np.zeros(3)),
         stored(("nothing",), np.zeros(0)),
         stored(("lat",), np.zeros(3, dtype=complex)),
         stored(("lat",), np.array([1, "a", None], dtype=object)),
