@@ -137,13 +137,12 @@ def _options(header: Mapping[str, Any]) -> list[str]:
     """The settings other than the defaults, as options of the command line."""
     config, profile = header.get("config", {}), header["model"]["profile"]
     defaults = EncodeConfig(profile=profile).to_dict() | {"profile": CONFIG_DEFAULTS["profile"]}
-    named = {each.name: each.metadata.get("option") or each.name for each in fields(EncodeConfig)}
     words = []
-    for name, option in named.items():
+    for setting in fields(EncodeConfig):
+        name, flag = setting.name, EncodeConfig.label(setting)
         value = config.get(name)
         if value is None or value == defaults.get(name):
             continue
-        flag = option.replace("_", "-").lstrip("-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
             continue
@@ -372,17 +371,15 @@ def write_coordinates(
 
 
 def _storable_coords(series: Series) -> dict[str, Coordinate]:
-    """The coordinates of a series as a container holds them."""
-    return {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
-
-
-def _storable(coordinate: Coordinate) -> Coordinate:
-    """The coordinate with a name and attributes that JSON can hold."""
-    return replace(
-        coordinate,
-        name=str(coordinate.name),
-        attributes=json_attributes(coordinate.attributes, without=frozenset()),
-    )
+    """The coordinates of a series with names and attributes that JSON can hold."""
+    return {
+        axis: replace(
+            coordinate,
+            name=str(coordinate.name),
+            attributes=json_attributes(coordinate.attributes, without=frozenset()),
+        )
+        for axis, coordinate in series.coords.items()
+    }
 
 
 def write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:

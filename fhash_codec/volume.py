@@ -18,6 +18,8 @@ from fhash_codec.boxes import (
     checked_region,
     coarse_vertices,
     shared_part,
+    slice_of,
+    step_blocks,
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
@@ -26,7 +28,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
-from fhash_codec.volume_model import Card, Decoded, open_model, sampled
+from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, RegionError
@@ -231,6 +233,15 @@ class Volume(Card, ArrayLike):
         self._outside_is_missing = every_step and EVERYTHING in header["features"]
         self._model = open_model(container)
         self.chunks = self._model.chunks
+
+    def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
+        steps, *space = ranges
+        result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
+        region = Box.of((min(positions), max(positions) + 1) for positions in space)
+        local = tuple(map(slice_of, space, region.first))
+        for places, together in step_blocks(steps, region.shape):
+            result[places] = self.values_of_steps(together, region)[:, *local]
+        return result
 
     # -- contents of the file --
 
@@ -437,7 +448,7 @@ class Volume(Card, ArrayLike):
             t = self._steps_of_times(time)
         points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
         steps, *space = (position.ravel() for position in points)
-        values, slopes = sampled(self, self._model, steps, space, gradient=gradient)
+        values, slopes = self._sampled(steps, space, gradient=gradient)
         shape = points[0].shape
         values = self._in_range(values.reshape(shape).astype(self.float_dtype))
         if slopes is None:

@@ -46,8 +46,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("growing",),
     ),
     "fhash_codec": (
-        ("config", "native", "progress", "records"),
-        ("boxes", "devices", "measure"),
+        ("native", "progress", "records"),
+        ("boxes", "config", "devices", "measure"),
         ("features",),
         ("header",),
         ("compact",),

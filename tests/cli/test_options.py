@@ -21,11 +21,11 @@ import fhash_codec
 from fhash_cli.commands.encode import command as encode
 from fhash_cli.main import COMMANDS, program
 from fhash_cli.options import (
+    DURATION,
     GROUPS,
+    SLICE,
     BaseCommand,
-    DurationType,
     IntervalsType,
-    SliceType,
     parse_slice,
     written,
 )
@@ -62,7 +62,7 @@ def test_slice_means_what_it_means_in_python(text: str) -> None:
 )
 def test_slice_of_another_form_says_why_and_the_form(text: str, reason: str) -> None:
     with pytest.raises(click.BadParameter, match="half-open range A:B") as refused:
-        SliceType().convert(text, None, None)
+        SLICE.convert(text, None, None)
     assert reason in refused.value.message
 
 
@@ -123,7 +123,7 @@ def test_a_range_is_written_as_it_was_given(text: str) -> None:
 @pytest.mark.parametrize("text", ["soon", "2d", "-3s", "0s", "48h", ""])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is no time|allowed: 1s to 24h"):
-        DurationType().convert(text, None, None)
+        DURATION.convert(text, None, None)
 
 
 Fhash = Callable[..., Result]
@@ -241,7 +241,7 @@ def test_every_setting_is_an_option_with_its_help_and_default(
     assert option.default == field.default
     assert option.help is not None
     assert option.help.rstrip(".").lower() == field.metadata["help"].lower()
-    flag = "--" + (field.metadata["option"] or field.name).replace("_", "-")
+    flag = f"--{EncodeConfig.label(field)}"
     assert flag in option.opts
     if field.metadata["choices"]:
         assert isinstance(option.type, click.Choice)

@@ -250,7 +250,7 @@ def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float)
     others = {
         field.name
         for field in dataclasses.fields(EncodeConfig)
-        if field.metadata["profile"] not in ("", profile)
+        if field.metadata.get("profile", profile) != profile
     }
     promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
     own = {name: value for name, value in settings.items() if name not in others}

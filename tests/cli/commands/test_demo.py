@@ -16,7 +16,7 @@ from click.testing import Result
 from PIL import Image
 
 import fhash_codec
-from fhash_cli.commands.demo import SceneOptions, ShapeType
+from fhash_cli.commands.demo import SHAPE, SceneOptions
 from fhash_codec import gallery
 from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
@@ -49,7 +49,7 @@ def options(**settings: Any) -> SceneOptions:
     ],
 )
 def test_shapes_are_z_y_x_or_named(text: str, shape: dict[str, int]) -> None:
-    assert ShapeType().convert(text, None, None) == shape
+    assert SHAPE.convert(text, None, None) == shape
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_shapes_are_z_y_x_or_named(text: str, shape: dict[str, int]) -> None:
 )
 def test_other_shapes_are_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="is not Z,Y,X such as"):
-        ShapeType().convert(text, None, None)
+        SHAPE.convert(text, None, None)
 
 
 @pytest.mark.parametrize(

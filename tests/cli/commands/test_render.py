@@ -16,12 +16,12 @@ from PIL import Image as Pictures
 
 import fhash_codec
 from fhash_cli.commands.render import (
+    PLANE,
     SETTINGS,
-    NumbersType,
-    OpacityType,
-    PlaneType,
+    SIZE,
     SceneOptions,
-    SizeType,
+    numbers_type,
+    opacity_type,
     scene_options,
 )
 from fhash_codec.rendering.scenes import Scene, scene_in_png
@@ -33,14 +33,14 @@ Fhash = Callable[..., Result]
 @pytest.mark.parametrize(
     ("kind", "text", "value"),
     [
-        (NumbersType(2), "1,2.5", (1.0, 2.5)),
-        (SizeType(), "800x600", (800, 600)),
-        (SizeType(), "64", (64, 64)),
-        (OpacityType(), "linear", "linear"),
-        (OpacityType(), "0:0,2:1", [[0.0, 0.0], [2.0, 1.0]]),
-        (OpacityType(named=False), "0.1:1", [[0.1, 1.0]]),
-        (PlaneType(), "0,0,1,0.5", {"normal": [0.0, 0.0, 1.0], "offset": 0.5}),
-        (PlaneType(), "1,2,3,0,0,-1", {"point": [1.0, 2.0, 3.0], "normal": [0.0, 0.0, -1.0]}),
+        (numbers_type(2), "1,2.5", (1.0, 2.5)),
+        (SIZE, "800x600", (800, 600)),
+        (SIZE, "64", (64, 64)),
+        (opacity_type(), "linear", "linear"),
+        (opacity_type(), "0:0,2:1", [[0.0, 0.0], [2.0, 1.0]]),
+        (opacity_type(named=False), "0.1:1", [[0.1, 1.0]]),
+        (PLANE, "0,0,1,0.5", {"normal": [0.0, 0.0, 1.0], "offset": 0.5}),
+        (PLANE, "1,2,3,0,0,-1", {"point": [1.0, 2.0, 3.0], "normal": [0.0, 0.0, -1.0]}),
     ],
 )
 def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> None:
@@ -50,12 +50,12 @@ def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> No
 @pytest.mark.parametrize(
     ("kind", "text", "part"),
     [
-        (NumbersType(3), "1,2", "not 3 numbers"),
-        (SizeType(), "wide", "not a size"),
-        (OpacityType(), "0:a", "neither the name of an opacity nor points"),
-        (OpacityType(named=False), "linear", "not points"),
-        (PlaneType(), "0,0,1", "neither a normal and an offset"),
-        (PlaneType(), "a,b,c,d", "neither a normal and an offset"),
+        (numbers_type(3), "1,2", "not 3 numbers"),
+        (SIZE, "wide", "not a size"),
+        (opacity_type(), "0:a", "neither the name of an opacity nor points"),
+        (opacity_type(named=False), "linear", "not points"),
+        (PLANE, "0,0,1", "neither a normal and an offset"),
+        (PLANE, "a,b,c,d", "neither a normal and an offset"),
     ],
 )
 def test_other_texts_are_refused(kind: click.ParamType[Any], text: str, part: str) -> None:

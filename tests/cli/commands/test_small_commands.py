@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from fhash_cli.options import DurationType
+from fhash_cli.options import DURATION
 from fhash_codec.cost import cost
 from fhash_codec.cost import report as files
 from fhash_codec.cost import uses as pictures
@@ -298,7 +298,7 @@ def test_a_missing_library_or_folder_is_told_before_any_work(
     ("text", "seconds"), [("90s", 90.0), ("2m", 120.0), ("1.5h", 5400.0), ("30", 30.0)]
 )
 def test_times_are_read(text: str, seconds: float) -> None:
-    assert DurationType().convert(text, None, None) == seconds
+    assert DURATION.convert(text, None, None) == seconds
 
 
 def test_other_times_are_refused(refused: Callable[..., str], data: Path) -> None:
