@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from fhash_bench.kept import save
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
@@ -27,7 +28,6 @@ from fhash_codec.simulation.simulate import simulate
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashWarning, InputError, QualityError, suggestion
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.support.files import replacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -471,8 +471,7 @@ class _Work:
             return
         run = _run(axis, varied, seed, figures)
         if kept is not None:
-            with replacing(kept, force=False) as temporary:
-                temporary.write_text(json.dumps(asdict(run), indent=1) + "\n", encoding="utf-8")
+            save(kept, asdict(run))
         self.runs.append(run)
 
     def _name(self, axis: Axis, varied: dict[str, Any], config: EncodeConfig) -> str:

@@ -117,10 +117,10 @@ class Peak:
 
 
 class Peaks:
-    """The peaks of a device, measured a little at a time, in turns with what is held to them."""
+    """The peaks of a `device`, measured a little at a time, in turns with what is held to them."""
 
     def __init__(self, device: torch.device) -> None:
-        self._device = device
+        self.device = device
         self._paths = native.machine_paths() if device.type == "cpu" else []
         self.peaks = [_multiply_adds(name) for name in self._paths]
         if device.type == "cuda":
@@ -142,7 +142,7 @@ class Peaks:
         try:
             for number, path in enumerate(self._paths):
                 self._raise(number, "gflops", self._fma(path))
-            if self._device.type == "cuda":
+            if self.device.type == "cuda":
                 for number, precision in enumerate(PRECISIONS):
                     self._raise(number, "gflops", self._matrix_product(precision))
             self._raise(len(self.peaks) - 1, "gb_s", self._copy())
@@ -178,7 +178,7 @@ class Peaks:
     def _matrix_product(self, precision: str) -> float:
         """Operations a second of torch's matrix product."""
         size = GPU_SIZE
-        a, b = (torch.rand(size, size, device=self._device) for _ in range(2))
+        a, b = (torch.rand(size, size, device=self.device) for _ in range(2))
         allowed = torch.backends.cuda.matmul.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
         try:
@@ -191,7 +191,7 @@ class Peaks:
     def _copy(self) -> float:
         """Bytes a second of a copy, read and written."""
         moved = 2 * self._from.element_size() * self._from.numel()
-        if self._device.type == "cpu":
+        if self.device.type == "cpu":
             begun = now()
             np.copyto(self._to.numpy(), self._from.numpy())
             return moved / (now() - begun).on("cpu")

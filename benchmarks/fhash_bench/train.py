@@ -243,7 +243,7 @@ def bench_train(
         configs.append(replace(config, features=("all",)))
     with opened as series:
         results = [
-            _measured(series, each, engines, seconds, number, peaks, device, progress)
+            _measured(series, each, engines, seconds, number, peaks, progress)
             for each in configs
             for number in bricks or (0,)
         ]
@@ -261,11 +261,10 @@ def _measured(
     seconds: float,
     bricks: int,
     peaks: Peaks,
-    device: torch.device,
     progress: Progress,
 ) -> dict[str, Any]:
     """Return an entry of `series`; arguments as in `bench_train`, `bricks` of one step."""
-    selected = select(series, config, progress)
+    device, selected = peaks.device, select(series, config, progress)
     coreset, architecture = selected.coreset, selected.architecture
     samples = len(coreset.values)
     plan = plan_training(

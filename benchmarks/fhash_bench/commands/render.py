@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
+from fhash_bench.commands import check_plot, one_of, plot_option, save_plot
 from fhash_cli.options import (
     BaseCommand,
-    check_writable,
     force_option,
     json_option,
     quiet_option,
@@ -22,18 +22,10 @@ if TYPE_CHECKING:
     from fhash_bench.pictures.results import RenderBench, Switch
 
 
-class PartType(click.ParamType[str]):
-    """Name of a part of the bench, looked up only when one is given: --help loads nothing."""
+def _parts() -> tuple[str, ...]:
+    from fhash_bench.pictures.results import PARTS
 
-    name = "part"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name; refuses one that is unknown."""
-        from fhash_bench.pictures.results import PARTS
-
-        if value not in PARTS:
-            self.fail(f"'{value}' is no part; allowed: {', '.join(PARTS)}", param, ctx)
-        return str(value)
+    return PARTS
 
 
 @click.command("render", cls=BaseCommand, short_help="time and quality of pictures, beside VTK")
@@ -48,7 +40,7 @@ class PartType(click.ParamType[str]):
 @click.option(
     "--part",
     "parts",
-    type=PartType(),
+    type=one_of("part", _parts),
     multiple=True,
     help="effects, accelerations, orbit, shell, streams, vtk, exactness, playback or curves;"
     " repeat. Default: all.",
@@ -70,12 +62,7 @@ class PartType(click.ParamType[str]):
     metavar="N",
     help="Runs that each median is of.",
 )
-@click.option(
-    "--plot",
-    metavar="FILE.png",
-    type=click.Path(),
-    help="Draw quality against time, and times beside VTK's.",
-)
+@plot_option("Draw quality against time, and times beside VTK's.")
 @click.option(
     "--ospray",
     metavar="PATH",
@@ -102,19 +89,15 @@ def render(
     Each effect and acceleration is measured on and off; the variants of a comparison run in turns.
     VTK comes with pip install 'fhash[bench]'; without it the comparisons with VTK are left out.
     """
-    if plot is not None:
-        check_writable(plot, force, sources=[run])
+    check_plot(plot, force, [run])
     from fhash_codec.volume import open as open_volume
 
     with open_volume(run) as volume, Progress(quiet=quiet) as progress:
         from fhash_bench.pictures.render import bench_render
         from fhash_bench.pictures.results import PARTS
         from fhash_bench.pictures.results import plot as draw
-        from fhash_codec.cost.report import require_matplotlib
         from fhash_codec.rendering.scenes import Scene
 
-        if plot is not None:
-            require_matplotlib()
         scene = Scene() if scene_file is None else Scene.load(scene_file)
         result = bench_render(
             volume,
@@ -125,11 +108,7 @@ def render(
             ospray=ospray,
             progress=progress,
         )
-    if plot is not None:
-        from fhash_formats.support.files import replacing
-
-        with replacing(Path(plot), force=force) as temporary:
-            draw(result, temporary)
+    save_plot(plot, force, partial(draw, result))
     emit(result.to_dict(), _render_text(result), as_json)
 
 

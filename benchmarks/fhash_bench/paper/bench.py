@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from fhash_bench.paper.cells import Cell, Request, load, save
+from fhash_bench.kept import load, save
+from fhash_bench.paper.cells import Cell, Request
 from fhash_bench.paper.data import (
     CANDIDATES,
     ENCODINGS,
@@ -203,7 +204,7 @@ def bench_paper(
         encodings.remove("tcnn")
         notes.append(f"not measured: {reason}")
     requests = list(requests_of(plan, encodings, source, name))
-    finished = [load(folder, request) for request in requests]
+    finished = [load(folder / request.filename, Cell.from_dict) for request in requests]
     device, cells = choose_device(plan.device), []
     held: _Held | None = None
     for number, request in enumerate(requests):
@@ -218,7 +219,7 @@ def bench_paper(
                 progress("cells", number, len(requests), text.rstrip())  # noqa: B023
 
             cell = _run(request, held, device, told)
-            save(folder, request, cell)
+            save(folder / request.filename, cell.to_dict())
         cells.append(cell)
         progress("cells", number + 1, len(requests), str(request))
     return PaperBench(cells=tuple(cells), notes=tuple(notes))

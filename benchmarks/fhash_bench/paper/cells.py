@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Self
 
+from fhash_bench.kept import file_name
 from fhash_bench.paper.data import PROTOCOLS
 from fhash_bench.paper.printed import ENCODINGS, FEATURES, SETS, Spread
 from fhash_formats.errors import InputError
-from fhash_formats.support.files import replacing
 
 CELL_VERSION = 2
 """Version of the cells and of what they measure; a cell of another version is run again."""
@@ -140,12 +136,6 @@ class Cell:
         return None
 
 
-def settings_id(settings: Mapping[str, Any]) -> str:
-    """Eight hexadecimal digits of a hash of settings, by which their cell is found again."""
-    text = json.dumps({**settings, "version": CELL_VERSION}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Request:
     """A cell that is wanted.
@@ -166,41 +156,10 @@ class Request:
     def filename(self) -> str:
         """Name of the cell's file; another setting has another name."""
         words = (self.data_set, self.feature, self.protocol, self.encoding, f"seed{self.seed}")
-        plain = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", word) for word in words)
-        return f"{plain[:120]}_{settings_id(dict(self.settings) | {'words': words})}.json"
+        return file_name(words, self.settings, CELL_VERSION)
 
     def __str__(self) -> str:
         return f"{self.data_set} {self.feature} {self.protocol} {self.encoding} {self.seed}"
-
-
-def load(folder: Path, request: Request) -> Cell | None:
-    """Return a finished cell; None where there is none, or one that cannot be read."""
-    return _read(folder / request.filename)
-
-
-def save(folder: Path, request: Request, cell: Cell) -> None:
-    """Write a cell into a folder, which is made if it is missing.
-
-    The file is complete or absent. Raises OutputError where it cannot be written.
-    """
-    text = json.dumps(cell.to_dict(), indent=1, allow_nan=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / request.filename, force=True) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def load_all(folder: Path) -> list[Cell]:
-    """Return every cell in a folder, by file name; files that hold none are left out."""
-    cells = [_read(path) for path in sorted(folder.glob("*.json"))]
-    return [cell for cell in cells if cell is not None]
-
-
-def _read(path: Path) -> Cell | None:
-    """Return the cell in a file; None where the file holds none."""
-    try:
-        return Cell.from_dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
-        return None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tempfile
 import time
@@ -13,7 +12,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import fhash_codec
-from fhash_bench.paper.cells import Cell, settings_id
+from fhash_bench.kept import load, save, settings_id
+from fhash_bench.paper.cells import CELL_VERSION, Cell
 from fhash_bench.paper.printed import (
     ENCODINGS,
     FEATURES,
@@ -30,7 +30,6 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, MissingDependencyError, QualityError
 from fhash_formats.series import Series
-from fhash_formats.support.files import replacing
 
 TARGET = 45.0
 """PSNR in dB over all steps that a file must have (paper, Table 5)."""
@@ -306,7 +305,7 @@ def files_of(
             continue
         feature = cell.settings.get("feature_resolved", kind)
         path = folder / _filename(cell, feature, number_types)
-        kept = _load(path)
+        kept = load(path, _kept)
         if kept is None:
             found, missing = measure_files(
                 data_set,
@@ -316,7 +315,7 @@ def files_of(
                 number_types=number_types,
                 progress=progress,
             )
-            _save(path, found, missing)
+            save(path, {"files": [each.to_dict() for each in found], "refused": list(missing)})
             kept = found, missing
         results += kept[0]
         refused += kept[1]
@@ -336,22 +335,11 @@ def _filename(cell: Cell, feature: str, number_types: Sequence[str]) -> str:
         "number_types": list(number_types),
     }
     words = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{cell.data_set}_{cell.feature}")
-    return f"files_{words[:100]}_{settings_id(settings)}.json"
+    return f"files_{words[:100]}_{settings_id(settings, CELL_VERSION)}.json"
 
 
-def _load(path: Path) -> tuple[list[FileResult], list[str]] | None:
-    """Results that were kept; None where there are none, or where a codec was missing then."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if values["refused"]:
-            return None
-        return [FileResult.from_dict(each) for each in values["files"]], []
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
-        return None
-
-
-def _save(path: Path, results: Sequence[FileResult], refused: Sequence[str]) -> None:
-    """Keep results; their file is complete or absent."""
-    values = {"files": [each.to_dict() for each in results], "refused": list(refused)}
-    with replacing(path, force=True) as temporary:
-        temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+def _kept(values: Mapping[str, Any]) -> tuple[list[FileResult], list[str]]:
+    """Results that were kept; raises ValueError where a codec was missing then."""
+    if values["refused"]:
+        raise ValueError("a codec was missing")
+    return [FileResult.from_dict(each) for each in values["files"]], []

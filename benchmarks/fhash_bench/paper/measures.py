@@ -556,7 +556,6 @@ def measure_latency(
     value_range: Range = (0.0, 1.0),
     size: int = LATENCY_SIZE,
     views: int = VIEWS,
-    seed: int = 0,
     device: str = "cpu",
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -568,7 +567,6 @@ def measure_latency(
         feature, value_range: as for `PictureProbe`.
         size: pixels along both sides.
         views: random views; they go through the key frames in turn.
-        seed: of the views.
         device: of the encoding, cpu or cuda.
         progress: is told about each picture.
 
@@ -578,7 +576,7 @@ def measure_latency(
         "arm_passes", "samples" (streaming), "arm_samples" and "evaluations" (streaming).
     """
     arrays = TorchArrays(choose_device(device))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cameras = [
         Camera(azimuth=float(rng.uniform(0, 360)), elevation=float(rng.uniform(-60, 60)))
         for _ in range(views)

@@ -386,7 +386,7 @@ def build(
         part_seed = seed * len(keys) + part_keys[0]
         plan = _plan(coreset, steps, epochs, part_seed, arranged.schedule)
         before = parts[-1].model if parts else None
-        model = _model(name, data, arranged, coreset, plan, part_seed, device, before)
+        model = _model(name, data, arranged, coreset, plan, device, before)
         parts.append(Part(part_keys, coreset, plan, model))
     levels = levels_of(name, data, samples, arranged) if name == "hash" else []
     hashed = [level for level in levels if isinstance(level, HashLevel)]
@@ -439,7 +439,6 @@ def _model(
     arranged: Arrangement,
     coreset: Coreset,
     plan: TrainingPlan,
-    seed: int,
     device: torch.device,
     before: Model | None,
 ) -> Model:
@@ -448,16 +447,14 @@ def _model(
     before: the model of the key frame before, whose corners it may share.
     """
     if arranged.engine == "tcnn":
-        pass
-
         coarsest = SETS[data.name].coarsest if data.name in SETS else USUAL_COARSEST
-        return TcnnModel(coreset, plan.rates, coarsest=coarsest, seed=seed, device=device)
+        return TcnnModel(coreset, plan.rates, coarsest=coarsest, seed=plan.seed, device=device)
     levels = levels_of(name, data, coreset, arranged)
     if arranged.engine == "lattice":
         grids = [level for level in levels if isinstance(level, GridLevel)]
-        return LatticeModel(grids, coreset, plan.rates, seed=seed, device=device)
+        return LatticeModel(grids, coreset, plan.rates, seed=plan.seed, device=device)
     like = before if isinstance(before, GatherModel) else None
-    return GatherModel(levels, coreset, plan.rates, seed=seed, device=device, like=like)
+    return GatherModel(levels, coreset, plan.rates, seed=plan.seed, device=device, like=like)
 
 
 def _plan(coreset: Coreset, steps: int, epochs: int, seed: int, schedule: str) -> TrainingPlan:

@@ -84,14 +84,10 @@ class VtkPeer:
     def __init__(
         self,
         values: Single,
-        grid: Grid,
-        table: Table,
+        task: Task,
         *,
         unit: float,
-        size: tuple[int, int],
-        step: float,
         mapper: str = "cpu",
-        lighting: Lighting | None = None,
         threads: int | None = None,
         empty: bool = False,
     ) -> None:
@@ -99,30 +95,27 @@ class VtkPeer:
 
         Args:
             values: (z, y, x) of the whole domain, all finite.
-            grid: vertices and spacing of the domain.
-            table: transfer function.
+            task: what is drawn: the grid, transfer function, pixels, ray step and lighting.
             unit: length that VTK's opacities refer to, in units of the coordinates.
-            size: pixels across and down.
-            step: ray step, in units of the coordinates.
             mapper: one of MAPPERS.
-            lighting: light from the camera; None for an unlit volume.
             threads: threads of the `cpu` mapper.
             empty: the window shows nothing.
         """
+        assert task.table is not None
         self.vtk = vtk = require_vtk()
-        self.grid = grid
+        self.grid = grid = task.rays.grid
         self.image = vtk.vtkImageData()
         nx, ny, nz = grid.counts
         self.image.SetDimensions(nx, ny, nz)
         self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
         self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
         self.load(values)
-        self.mapper = self._mapper(mapper, step, threads)
+        self.mapper = self._mapper(mapper, task.step, threads)
         self.property = vtk.vtkVolumeProperty()
         self.property.SetInterpolationTypeToLinear()
         self.property.SetScalarOpacityUnitDistance(unit)
-        self._give(table, unit)
-        self.shade(lighting)
+        self._give(task.table, unit)
+        self.shade(task.lighting)
         volume = vtk.vtkVolume()
         volume.SetMapper(self.mapper)
         volume.SetProperty(self.property)
@@ -140,7 +133,7 @@ class VtkPeer:
             )
         self.window.SetOffScreenRendering(1)
         self.window.SetMultiSamples(0)
-        self.window.SetSize(*size)
+        self.window.SetSize(*task.rays.size)
         self.window.AddRenderer(self.renderer)
 
     def _mapper(self, name: str, step: float, threads: int | None) -> Any:
@@ -536,16 +529,11 @@ class Comparison:
 
     @contextmanager
     def _peer(self, plan: Plan, mapper: str, *, empty: bool = False) -> Iterator[VtkPeer]:
-        assert plan.task.table is not None
         peer = VtkPeer(
             self.values,
-            plan.task.rays.grid,
-            plan.task.table,
+            plan.task,
             unit=plan.function.unit_distance,
-            size=plan.task.rays.size,
-            step=plan.task.step,
             mapper=mapper,
-            lighting=plan.task.lighting,
             threads=usable_threads(),
             empty=empty,
         )
