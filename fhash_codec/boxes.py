@@ -218,7 +218,7 @@ def coarse_vertices(box: Box, region: Box, lod: int, path: str) -> tuple[range, 
     return z, y, x
 
 
-def shared_part(box: Box, region: Box) -> tuple[Box, Box] | None:
+def overlap(box: Box, region: Box) -> tuple[Box, Box] | None:
     """The vertices that a region shares with a box; None if there are none.
 
     They are returned twice: in vertices of the region, and in vertices of the box.

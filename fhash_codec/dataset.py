@@ -127,7 +127,7 @@ def volumes_of(path: str, storage_options: Mapping[str, Any] | None = None) -> M
     return opened if isinstance(opened, Dataset) else {opened.name: opened}
 
 
-def place_of(path: str | os.PathLike[str]) -> str:
+def absolute(path: str | os.PathLike[str]) -> str:
     """A path as another process finds it: absolute, or a URL."""
     text = os.fspath(path)
     return text if "://" in text else os.path.abspath(text)

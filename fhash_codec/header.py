@@ -70,7 +70,7 @@ MAX_OPTION = 80
 """Letters of the value of an option in a line of the history; a longer one is cut."""
 
 
-def source_parts(
+def described_source(
     series: Series, coords: Mapping[str, Coordinate], attributes: Mapping[str, Any]
 ) -> tuple[dict[str, Any] | None, dict[str, npt.NDArray[Any]]]:
     """The header's `source` of a series, and the arrays that belong to it.
@@ -302,7 +302,7 @@ def describe_source(
         free = [end for end in (*ends, low - 1, high + 1) if is_within(end, dtype)]
         free = [fill for fill in free if not low <= fill <= high]
         variable |= {"fill": free[0]} if free else {}
-    source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
+    source, _ = described_source(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),
         "encoder": {"version": version("fhash"), "seed": config.seed},
@@ -342,7 +342,7 @@ def write_series(
     if not writer.one_of_several:
         names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
         described = describe_coordinates(coords, names)
-    for name, array in source_parts(series, coords, {})[1].items():
+    for name, array in described_source(series, coords, {})[1].items():
         writer.add_whole(name, array)
     write_coordinates(writer, coords, described)
     every_step = len(key_frames) == series.shape[0]

@@ -17,7 +17,7 @@ from fhash_codec.boxes import (
     Spans,
     checked_region,
     coarse_vertices,
-    shared_part,
+    overlap,
     slice_of,
     step_blocks,
 )
@@ -352,7 +352,7 @@ class Volume(Card, ArrayLike):
             limits = np.iinfo(self.dtype)
             nearest = min(max(round(self.background), int(limits.min)), int(limits.max))
             result = np.full(read.shape, nearest, self.dtype)
-            common = shared_part(self.box, self._checked(region))
+            common = overlap(self.box, self._checked(region))
             if common is not None:
                 assert decoded is not None, "only such files hold integers"
                 np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
@@ -464,7 +464,7 @@ class Volume(Card, ArrayLike):
         """
         key, region = self._key_index(t), self._checked(region)
         result = np.zeros(region.shape, dtype=bool)
-        common = shared_part(self.box, region)
+        common = overlap(self.box, region)
         if common is not None:
             in_region, in_box = common
             result[in_region.slices()] = self._occupied(key, in_box)
@@ -526,7 +526,7 @@ class Volume(Card, ArrayLike):
         """
         if outside not in OUTSIDE:
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
-        common = shared_part(self.box, region)
+        common = overlap(self.box, region)
         if common is None:
             result: npt.NDArray[Any] = np.full((*steps, *region.shape), np.nan, self.float_dtype)
         else:

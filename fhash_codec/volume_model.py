@@ -139,7 +139,7 @@ class Card:
                     "level": table.level,
                     "shape": list(table.shape),
                     "dtype": table.dtype.name,
-                    **self._place(f"tables/level_{table.level}", "low-passed level 1"),
+                    **self._stored(f"tables/level_{table.level}", "low-passed level 1"),
                 }
                 for table in self.tables
             ],
@@ -155,7 +155,7 @@ class Card:
                 "layer": number,
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
-                **self._place(
+                **self._stored(
                     f"mlp/weight_{number}",
                     f"packed in the codec of {self._table_path}",
                 ),
@@ -171,7 +171,7 @@ class Card:
         apart = names if isinstance(self._model, PaperModel) and len(names) > 1 else []
         for name in (MASK_ARRAY, BITS_ARRAY):
             if name in arrays:
-                return {"shape": shape, **self._place(name, ""), "apart": apart}
+                return {"shape": shape, **self._stored(name, ""), "apart": apart}
         masked = self.container.arrays[TABLE].masked
         coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
@@ -182,7 +182,7 @@ class Card:
         arrays = self.container.arrays
         return arrays[TABLE].name if TABLE in arrays else TABLE
 
-    def _place(self, name: str, otherwise: str) -> dict[str, Any]:
+    def _stored(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""
         stored = self.container.arrays
         found = [key for key in stored if key == name or key.startswith(f"{name}/")]

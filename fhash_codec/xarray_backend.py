@@ -18,7 +18,7 @@ from xarray.core import indexing
 
 from fhash_codec.boxes import Box, index_ranges, slice_of, step_blocks
 from fhash_codec.config import EncodeConfig
-from fhash_codec.dataset import Handle, acquire, place_of, release
+from fhash_codec.dataset import Handle, absolute, acquire, release
 from fhash_codec.encoding import encode
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.header import figure_attributes, history_line, source_attributes
@@ -303,7 +303,7 @@ class FhashBackend(BackendEntrypoint):
         if outside not in OUTSIDE or (lod is not None and outside != OUTSIDE[0]):
             allowed = ", ".join(OUTSIDE) if lod is None else f"{OUTSIDE[0]} with lod"
             raise InputError(f"outside is {outside!r}; allowed: {allowed}")
-        place = place_of(filename_or_obj)
+        place = absolute(filename_or_obj)
         handle = acquire(place, storage_options)
         names = list(handle.volumes)
         if variable is not None and len(names := meant(variable, names)) != 1:

@@ -452,7 +452,7 @@ class _Work:
             (axis, varied, seed) for axis in axes for varied in axis.varied for seed in range(seeds)
         ]
         for number, (axis, varied, seed) in enumerate(tasks):
-            self._progress("encoding", number, len(tasks), f"{axis.name}: {told(varied)}")
+            self._progress("encoding", number, len(tasks), f"{axis.name}: {as_options(varied)}")
             self._one(axis, varied, seed)
         self._progress("encoding", len(tasks), len(tasks), "")
 
@@ -467,7 +467,7 @@ class _Work:
         try:
             figures = _encoded(self._series, self._scratch / "run.fhz", config)
         except InputError as error:
-            self.left_out.append(f"{axis.name}: {told(varied)}: {error}")
+            self.left_out.append(f"{axis.name}: {as_options(varied)}: {error}")
             return
         run = _run(axis, varied, seed, figures)
         if kept is not None:
@@ -478,7 +478,7 @@ class _Work:
         """The name of a kept run, which all that its figures depend on is part of."""
         identity = json.dumps([self._digest, config.to_dict()], sort_keys=True)
         digest = hashlib.sha256(identity.encode()).hexdigest()[:10]
-        words = re.sub(r"[^a-z0-9]+", "-", told(varied).lower()).strip("-")
+        words = re.sub(r"[^a-z0-9]+", "-", as_options(varied).lower()).strip("-")
         return f"{axis.name}-{words}-{digest}.json"
 
 
@@ -490,7 +490,7 @@ def _digest(series: Series) -> str:
     return digest.hexdigest()
 
 
-def told(settings: dict[str, Any]) -> str:
+def as_options(settings: dict[str, Any]) -> str:
     """Settings as options of the command line; an empty one as nothing left out."""
     texts = {
         name: (",".join(value) or "nothing") if isinstance(value, list | tuple) else value
@@ -589,7 +589,7 @@ def _curves(panel: Any, runs: list[Run]) -> None:
             color=COLOURS[number % len(COLOURS)],
             linestyle=STYLES[number // len(COLOURS) % len(STYLES)],
             linewidth=2.4 if run.reference else 1.3,
-            label=told(run.settings),
+            label=as_options(run.settings),
         )
     panel.set_xlabel("epochs")
     panel.set_ylabel("PSNR on some bricks of the key frames, dB")
@@ -604,7 +604,7 @@ def _points(panel: Any, rows: list[Row]) -> None:
             [row.bytes],
             "o",
             color=COLOURS[number % len(COLOURS)],
-            label=f"{told(row.settings)}: {quality}",
+            label=f"{as_options(row.settings)}: {quality}",
         )
     panel.set_xscale("log")
     panel.set_xlabel("seconds of the encoding")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -134,13 +134,8 @@ def _tables(result: RenderBench) -> Iterator[Rows]:
     yield _switches("effect", result.effects)
     yield _switches("acceleration", result.accelerations, psnr=True)
     yield _switches("orbit", result.orbit)
-    yield _beside(result)
-    yield _streams(result)
-    yield _break_even(result)
-    yield _beside_vtk(result)
-    yield _exactness(result)
-    yield _playback(result)
-    yield _curves(result)
+    for name, heading, row in TABLES:
+        yield [heading, *map(row, getattr(result, name))]
 
 
 def _switches(title: str, switches: Sequence[Switch], *, psnr: bool = False) -> Rows:
@@ -160,137 +155,100 @@ def _switches(title: str, switches: Sequence[Switch], *, psnr: bool = False) -> 
     return rows
 
 
-def _streams(result: RenderBench) -> Rows:
-    """Time, passes and quality of the marchers that evaluate the model itself."""
-    return [
-        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
-        *(
-            (
-                run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
-                _ms(run.milliseconds),
-                f"{run.passes:,}",
-                f"{run.samples:,}",
-                f"{run.evaluations:,}",
-                _decibels(run.psnr),
-                number(run.largest, digits=2),
-            )
-            for run in result.streams
-        ),
-    ]
-
-
-def _break_even(result: RenderBench) -> Rows:
-    """Time of the cache and of adaptive ray marching by the size of the picture."""
-    return [
-        ("pixels", "cache ms", "kept ms", "arm ms", "arm / cache", "arm up to", "auto"),
-        *(
-            (
-                str(pair.size),
-                _ms(pair.first_ms),
-                _ms(pair.kept_ms),
-                _ms(pair.arm_ms),
-                number(pair.ratio, "x", digits=3),
-                "any" if pair.pictures is None else f"{pair.pictures} pictures",
-                pair.auto,
-            )
-            for pair in result.break_even
-        ),
-    ]
-
-
-def _beside(result: RenderBench) -> Rows:
-    """Time and likeness of pictures of a large volume beside those of other renderers."""
-    return [
+TABLES: tuple[tuple[str, tuple[str, ...], Callable[[Any], tuple[str, ...]]], ...] = (
+    (  # pictures of a large volume beside those of other renderers
+        "beside",
         ("beside", "scene", "size", "threads", "ours ms", "peer ms", "peer / ours", "PSNR"),
-        *(
-            (
-                pair.peer,
-                _lit(pair.scene, pair.shaded),
-                str(pair.size),
-                str(pair.threads),
-                _ms(pair.ours_ms),
-                _ms(pair.peer_ms),
-                number(pair.ratio, "x", digits=3),
-                _decibels(pair.psnr),
-            )
-            for pair in result.beside
+        lambda pair: (
+            pair.peer,
+            _lit(pair.scene, pair.shaded),
+            str(pair.size),
+            str(pair.threads),
+            _ms(pair.ours_ms),
+            _ms(pair.peer_ms),
+            number(pair.ratio, "x", digits=3),
+            _decibels(pair.psnr),
         ),
-    ]
-
-
-def _beside_vtk(result: RenderBench) -> Rows:
-    """Time and likeness of pictures beside those of VTK's fixed-point ray caster."""
-    return [
+    ),
+    (  # the marchers that evaluate the model itself
+        "streams",
+        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
+        lambda run: (
+            run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
+            _ms(run.milliseconds),
+            f"{run.passes:,}",
+            f"{run.samples:,}",
+            f"{run.evaluations:,}",
+            _decibels(run.psnr),
+            number(run.largest, digits=2),
+        ),
+    ),
+    (  # the cache and adaptive ray marching by the size of the picture
+        "break_even",
+        ("pixels", "cache ms", "kept ms", "arm ms", "arm / cache", "arm up to", "auto"),
+        lambda pair: (
+            str(pair.size),
+            _ms(pair.first_ms),
+            _ms(pair.kept_ms),
+            _ms(pair.arm_ms),
+            number(pair.ratio, "x", digits=3),
+            "any" if pair.pictures is None else f"{pair.pictures} pictures",
+            pair.auto,
+        ),
+    ),
+    (  # pictures beside those of VTK's fixed-point ray caster
+        "against",
         ("beside VTK", "size", "ours ms", "whole ms", "VTK ms", "VTK / ours", "PSNR", "SSIM"),
-        *(
-            (
-                _lit(pair.scene, pair.shaded),
-                str(pair.size),
-                _ms(pair.ours_ms),
-                _ms(pair.whole_ms),
-                _ms(pair.vtk_ms),
-                number(pair.ratio, "x", digits=3),
-                _decibels(pair.psnr),
-                number(pair.ssim),
-            )
-            for pair in result.against
+        lambda pair: (
+            _lit(pair.scene, pair.shaded),
+            str(pair.size),
+            _ms(pair.ours_ms),
+            _ms(pair.whole_ms),
+            _ms(pair.vtk_ms),
+            number(pair.ratio, "x", digits=3),
+            _decibels(pair.psnr),
+            number(pair.ssim),
         ),
-    ]
-
-
-def _exactness(result: RenderBench) -> Rows:
-    """Likeness of pictures to those of VTK's GPU mapper on software OpenGL."""
-    return [
+    ),
+    (  # likeness to pictures of VTK's GPU mapper on software OpenGL
+        "exactness",
         ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
-        *(
-            (
-                _lit(pair.scene, bool(pair.gradient))
-                + (", central differences" if pair.gradient == "central" else ""),
-                str(pair.size),
-                f"{pair.step:g}",
-                _decibels(pair.psnr),
-                number(pair.ssim),
-                str(pair.largest),
-                _decibels(pair.explained),
-            )
-            for pair in result.exactness
+        lambda pair: (
+            _lit(pair.scene, bool(pair.gradient))
+            + (", central differences" if pair.gradient == "central" else ""),
+            str(pair.size),
+            f"{pair.step:g}",
+            _decibels(pair.psnr),
+            number(pair.ssim),
+            str(pair.largest),
+            _decibels(pair.explained),
         ),
-    ]
-
-
-def _playback(result: RenderBench) -> Rows:
-    """Time of playing all steps, beside VTK."""
-    return [
+    ),
+    (  # all steps played, beside VTK
+        "playback",
         ("playback", "size", "steps", "ours ms", "VTK ms", "ours / VTK"),
-        *(
-            (
-                _lit(run.scene, run.shaded),
-                str(run.size),
-                str(run.steps),
-                _ms(run.ours_ms),
-                _ms(run.vtk_ms),
-                number(run.ratio, "x", digits=3),
-            )
-            for run in result.playback
+        lambda run: (
+            _lit(run.scene, run.shaded),
+            str(run.size),
+            str(run.steps),
+            _ms(run.ours_ms),
+            _ms(run.vtk_ms),
+            number(run.ratio, "x", digits=3),
         ),
-    ]
-
-
-def _curves(result: RenderBench) -> Rows:
-    """Quality against time for each knob: step length, threshold, level of detail."""
-    return [
+    ),
+    (  # quality against time for each knob: step length, threshold, level of detail
+        "curves",
         ("knob", "value", "ms", "samples", "PSNR"),
-        *(
-            (
-                point.knob,
-                f"{point.value:.4g}",
-                _ms(point.milliseconds),
-                f"{point.samples:,}",
-                _decibels(point.psnr),
-            )
-            for point in result.curves
+        lambda point: (
+            point.knob,
+            f"{point.value:.4g}",
+            _ms(point.milliseconds),
+            f"{point.samples:,}",
+            _decibels(point.psnr),
         ),
-    ]
+    ),
+)
+"""Tables of single measurements: field of the result, heading, and row of a measurement."""
 
 
 def _ms(value: float) -> str:

@@ -339,11 +339,11 @@ def _ablate_text(result: AblateBench) -> str:
 
 def _cells(row: Row, reference: bool) -> tuple[str, ...]:
     """A row of the table."""
-    from fhash_bench.ablate import told
+    from fhash_bench.ablate import as_options
 
     spread = "" if row.psnr_spread is None else f" (spread {row.psnr_spread:.1f})"
     return (
-        told(row.settings) + (" *" if reference else ""),
+        as_options(row.settings) + (" *" if reference else ""),
         ("exact" if row.psnr is None else number(row.psnr)) + spread,
         "" if row.psnr_gain is None else f"{row.psnr_gain:+.1f}",
         number(row.psnr_domain),

@@ -305,7 +305,7 @@ def files_of(
             continue
         feature = cell.settings.get("feature_resolved", kind)
         path = folder / _filename(cell, feature, number_types)
-        kept = load(path, _kept)
+        kept = load(path, _results_of)
         if kept is None:
             found, missing = measure_files(
                 data_set,
@@ -338,7 +338,7 @@ def _filename(cell: Cell, feature: str, number_types: Sequence[str]) -> str:
     return f"files_{words[:100]}_{settings_id(settings, CELL_VERSION)}.json"
 
 
-def _kept(values: Mapping[str, Any]) -> tuple[list[FileResult], list[str]]:
+def _results_of(values: Mapping[str, Any]) -> tuple[list[FileResult], list[str]]:
     """Results that were kept; raises ValueError where a codec was missing then."""
     if values["refused"]:
         raise ValueError("a codec was missing")

@@ -15,7 +15,6 @@ import torch
 
 from fhash_bench.paper.cells import Point
 from fhash_bench.paper.data import Data
-from fhash_bench.paper.encodings import Encoding
 from fhash_codec.cost.uses import black, picture_psnr, picture_ssim
 from fhash_codec.devices import choose_device
 from fhash_codec.features.features import Interval, Isosurface, Segmentation, parse_feature
@@ -74,7 +73,7 @@ def measured_epochs(epochs: int) -> list[int]:
 
 
 def train(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     data: Data,
     epochs: int,
     *,
@@ -136,7 +135,7 @@ def wait(device: torch.device) -> None:
 
 
 def _point(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     data: Data,
     epoch: int,
     seconds: float,
@@ -497,7 +496,7 @@ class EncodingField(CoresetField):
     """
 
     def __init__(
-        self, encoding: Encoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
+        self, encoding: TrainedEncoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
     ) -> None:
         """Prepare a field.
 
@@ -549,7 +548,7 @@ class EncodingField(CoresetField):
 
 
 def measure_latency(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     masks: Sequence[Mask],
     feature: str,
     *,

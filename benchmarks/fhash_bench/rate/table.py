@@ -230,7 +230,7 @@ def bench_table(
         progress("series", number, len(sources), name)
         with opened() as series:
             run = _Run(name, series, folder, settings, goals, speed=speed, progress=progress)
-            cells += run.own()
+            cells += run.of_fhash()
             for codec, several in variants.items():
                 cells += run.peer(codec, several)
             cells += [
@@ -266,7 +266,7 @@ class _Run:
             checksum = zlib.crc32(frame.tobytes(), checksum)
         self._identity = {"checksum": checksum, "shape": list(series.shape), "speed": speed}
 
-    def own(self) -> list[RateCell]:
+    def of_fhash(self) -> list[RateCell]:
         """fhash at each quality; a cell is kept before the next one begins."""
         return [
             cell
@@ -274,7 +274,7 @@ class _Run:
             for cell in self._cells(
                 f"{OWN}{COMPACT}",
                 [goal],
-                lambda bench: bench.search_own(self._settings, COMPACT),
+                lambda bench: bench.search_profile(self._settings, COMPACT),
                 self._settings,
             )
         ]

@@ -33,8 +33,8 @@ from fhash_bench.rate.measuring import (
     RateBench,
     Spent,
     access_of,
-    places,
     promised,
+    random_regions,
     shown_psnr,
     speed_of,
     spent,
@@ -293,8 +293,8 @@ def test_the_fastest_runs_count() -> None:
 
 def test_places_are_the_same_for_all_and_within_the_series() -> None:
     shape = (3, 20, 5, 40)
-    assert list(places(shape)) == list(places(shape))
-    for step, box in places(shape):
+    assert list(random_regions(shape)) == list(random_regions(shape))
+    for step, box in random_regions(shape):
         assert 0 <= step < 3
         assert box.shape == (16, 5, 16)
         assert all(0 <= low < high <= n for (low, high), n in zip(box, shape[1:], strict=True))

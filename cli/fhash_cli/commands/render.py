@@ -596,10 +596,10 @@ def _draw_evolution(
         ("steps", str(len(steps))),
         ("seconds", number(image.seconds, digits=3)),
     ]
-    return result, table(rows) + ("\n\n" + _places(followed) if followed else "")
+    return result, table(rows) + ("\n\n" + _followed(followed) if followed else "")
 
 
-def _places(followed: list[dict[str, Any]]) -> str:
+def _followed(followed: list[dict[str, Any]]) -> str:
     """Size and centroid of each feature at each step."""
     header = ("step", *(entry["feature"] for entry in followed))
     rows = []
