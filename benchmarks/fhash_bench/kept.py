@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from fhash_formats.errors import InputError
 from fhash_formats.support.files import replacing
 
 Result = TypeVar("Result")
@@ -27,6 +28,16 @@ def file_name(words: Sequence[str], settings: Mapping[str, Any], version: int) -
     """Name of the file of a result; other words, settings or versions have another name."""
     plain = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", word) for word in words)
     return f"{plain[:120]}_{settings_id({**settings, 'words': words}, version)}.json"
+
+
+def of_fields(record: type[Result], values: Mapping[str, Any]) -> Result:
+    """A record of all its fields by name; raises InputError for missing or unknown ones."""
+    needed = sorted(record.__dataclass_fields__)  # type: ignore[attr-defined]
+    if sorted(values) != needed:
+        raise InputError(
+            f"a result has the fields {', '.join(sorted(values))}; needed: {', '.join(needed)}"
+        )
+    return record(**values)
 
 
 def load(path: Path, of: Callable[[Any], Result]) -> Result | None:

@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from fhash_bench.kept import file_name
+from fhash_bench.kept import file_name, of_fields
 from fhash_bench.paper.data import PROTOCOLS
 from fhash_bench.paper.printed import ENCODINGS, FEATURES, SETS, Spread
-from fhash_formats.errors import InputError
 
 CELL_VERSION = 2
 """Version of the cells and of what they measure; a cell of another version is run again."""
@@ -112,20 +111,15 @@ class Cell:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The cell of what `to_dict` gave; raises InputError for missing or unknown fields."""
-        needed = {entry.name for entry in dataclasses.fields(cls)}
-        if values.keys() != needed:
-            raise InputError(
-                f"a cell has the fields {', '.join(sorted(values))};"
-                f" needed: {', '.join(sorted(needed))}"
-            )
-        tuples = {
-            "shape": tuple(values["shape"]),
-            "key_frames": tuple(values["key_frames"]),
-            "box": tuple(tuple(span) for span in values["box"]),
-            "curve": tuple(Point(**point) for point in values["curve"]),
-            "trial": tuple(values["trial"]),
+        made = of_fields(cls, values)
+        tuples: dict[str, Any] = {
+            "shape": tuple(made.shape),
+            "key_frames": tuple(made.key_frames),
+            "box": tuple(map(tuple, made.box)),
+            "curve": tuple(of_fields(Point, point) for point in values["curve"]),
+            "trial": tuple(made.trial),
         }
-        return cls(**{**values, **tuples})
+        return dataclasses.replace(made, **tuples)
 
     def reached(self, decibels: float, figure: str = "coreset_psnr") -> Point | None:
         """The first point whose figure is at least `decibels`; None where none is (NR)."""
@@ -220,6 +214,14 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
         Group(*key, tuple(sorted(found[key], key=lambda cell: cell.seed)))
         for key in sorted(found, key=rank)
     ]
+
+
+def by_protocol(grouped: Iterable[Group]) -> dict[str, list[Group]]:
+    """Groups by protocol, in their order."""
+    found: dict[str, list[Group]] = {}
+    for group in grouped:
+        found.setdefault(group.protocol, []).append(group)
+    return found
 
 
 def of_protocol(grouped: Sequence[Group], protocol: str) -> list[Group]:

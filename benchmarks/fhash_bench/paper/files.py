@@ -7,12 +7,12 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import fhash_codec
-from fhash_bench.kept import load, save, settings_id
+from fhash_bench.kept import load, of_fields, save, settings_id
 from fhash_bench.paper.cells import CELL_VERSION, Cell
 from fhash_bench.paper.printed import (
     ENCODINGS,
@@ -28,7 +28,7 @@ from fhash_bench.rate.rate import bench_rate
 from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError, MissingDependencyError, QualityError
+from fhash_formats.errors import MissingDependencyError, QualityError
 from fhash_formats.series import Series
 
 TARGET = 45.0
@@ -81,17 +81,6 @@ class FileResult:
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
         return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The result of what `to_dict` gave; raises InputError for missing or unknown fields."""
-        needed = {entry.name for entry in fields(cls)}
-        if values.keys() != needed:
-            raise InputError(
-                f"a file's result has the fields {', '.join(sorted(values))};"
-                f" needed: {', '.join(sorted(needed))}"
-            )
-        return cls(**values)
 
 
 def measure_files(
@@ -342,4 +331,4 @@ def _results_of(values: Mapping[str, Any]) -> tuple[list[FileResult], list[str]]
     """Results that were kept; raises ValueError where a codec was missing then."""
     if values["refused"]:
         raise ValueError("a codec was missing")
-    return [FileResult.from_dict(each) for each in values["files"]], []
+    return [of_fields(FileResult, each) for each in values["files"]], []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from fhash_bench.engines import wait
 from fhash_bench.paper.cells import Point
 from fhash_bench.paper.data import Data
 from fhash_codec.cost.uses import black, picture_psnr, picture_ssim
@@ -128,12 +129,6 @@ def first_seconds(curve: Sequence[Point], decibels: float) -> float | None:
     )
 
 
-def wait(device: torch.device) -> None:
-    """Wait until a GPU has finished; a CPU always has."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-
-
 def _point(
     encoding: TrainedEncoding,
     data: Data,
@@ -203,23 +198,19 @@ class Places:
 
 def places_of(data: Data) -> list[Places]:
     """Return places of every step; it reads the whole series once."""
-    return list(_places(data))
-
-
-def _places(data: Data) -> Iterator[Places]:
-    """Yield the places of one step after the other."""
+    found = []
     times = time_axis(data.series.coords["t"].values)
-    keys = np.interp(times, *_ascending(times[list(data.key_frames)]))
+    key_times = times[list(data.key_frames)]
+    order = np.argsort(key_times)
+    keys = np.interp(times, key_times[order], order.astype(np.float64))
     around = [(int(np.floor(key)), int(np.ceil(key))) for key in keys]
     # All steps give the same share of their vertices, so that no step counts for more than it has.
     vertices = sum(int((data.masks[low] | data.masks[high]).sum()) for low, high in around)
     taken = min(1.0, MAX_PLACES / max(vertices, 1))
     random = np.random.default_rng(0)
     for step, (key, (before, after)) in enumerate(zip(keys, around, strict=True)):
-        mask, fringe = (
-            data.masks[before] | data.masks[after],
-            data.masks[before] ^ data.masks[after],
-        )
+        masks = data.masks[before], data.masks[after]
+        mask, fringe = np.bitwise_or(*masks), np.bitwise_xor(*masks)
         flat = np.flatnonzero(mask)
         if taken < 1:
             flat = np.sort(random.choice(flat, math.ceil(taken * len(flat)), replace=False))
@@ -229,40 +220,28 @@ def _places(data: Data) -> Iterator[Places]:
         low, high = (data.frames[number].reshape(-1)[flat] for number in (before, after))
         linear = low + np.float32(key - before) * (high - low)
         finite = np.isfinite(truth) & np.isfinite(linear)
-        yield Places(
-            key=float(key),
-            between=step not in data.key_frames,
-            vertices=np.stack(np.unravel_index(flat[finite], mask.shape), axis=1),
-            truth=truth[finite],
-            linear=linear[finite],
-            fringe=fringe.reshape(-1)[flat[finite]],
-            selected=int(np.count_nonzero(feature)),
-            missed=int(np.count_nonzero(feature & ~mask)),
+        found.append(
+            Places(
+                key=float(key),
+                between=step not in data.key_frames,
+                vertices=np.stack(np.unravel_index(flat[finite], mask.shape), axis=1),
+                truth=truth[finite],
+                linear=linear[finite],
+                fringe=fringe.reshape(-1)[flat[finite]],
+                selected=int(np.count_nonzero(feature)),
+                missed=int(np.count_nonzero(feature & ~mask)),
+            )
         )
-
-
-def _ascending(
-    times: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return key times in ascending order, for np.interp, and their numbers."""
-    order = np.argsort(times)
-    return times[order], order.astype(np.float64)
+    return found
 
 
 def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str, float | None]:
     """Return the figures of all steps, as a `Cell` has them: PSNR in dB, and shares."""
-    import torch
-
     errors: dict[str, list[npt.NDArray[np.float64]]] = {
-        "psnr": [],
-        "psnr_key_frames": [],
-        "psnr_between": [],
-        "psnr_linear": [],
-        "psnr_inner": [],
-        "psnr_inner_linear": [],
-        "psnr_fringe": [],
-        "psnr_fringe_linear": [],
-    }
+        f"psnr{name}": []
+        for name in ("", "_key_frames", "_between", "_linear", "_inner", "_inner_linear",
+                     "_fringe", "_fringe_linear")
+    }  # fmt: skip
     for step in places:
         decoded = encoding.sample(step.key, torch.from_numpy(step.vertices)).cpu().numpy()
         error = decoded.astype(np.float64) - step.truth
@@ -273,10 +252,9 @@ def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str
         linear = step.linear.astype(np.float64) - step.truth
         errors["psnr_between"].append(error)
         errors["psnr_linear"].append(linear)
-        errors["psnr_inner"].append(error[~step.fringe])
-        errors["psnr_inner_linear"].append(linear[~step.fringe])
-        errors["psnr_fringe"].append(error[step.fringe])
-        errors["psnr_fringe_linear"].append(linear[step.fringe])
+        for name, where in (("inner", ~step.fringe), ("fringe", step.fringe)):
+            errors[f"psnr_{name}"].append(error[where])
+            errors[f"psnr_{name}_linear"].append(linear[where])
     between = [step for step in places if step.between]
     return {
         **{name: _psnr(parts) for name, parts in errors.items()},

@@ -6,12 +6,12 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
 
-from fhash_bench.kept import file_name, load, save
+from fhash_bench.kept import file_name, load, of_fields, save
 from fhash_bench.rate.measuring import OWN, PEERS, Access, Bench, Best, Speed, TilePrice, shown_psnr
 from fhash_bench.rate.peers import AnyVariant
 from fhash_bench.rate.rate import NOTES, all_variants, bench_of, check, goals_of
@@ -93,10 +93,9 @@ class RateCell:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> RateCell:
-        """The cell of JSON values; raises TypeError or KeyError for others."""
-        if values.keys() != {field.name for field in fields(cls)}:
-            raise KeyError("not the keys of a cell")
-        return cls(**{**values, "shape": tuple(values["shape"])})
+        """The cell of JSON values; raises InputError or TypeError for others."""
+        cell = of_fields(cls, values)
+        return replace(cell, shape=tuple(cell.shape))
 
 
 def cell_of(
