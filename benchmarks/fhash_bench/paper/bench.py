@@ -6,6 +6,7 @@ import datetime
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +35,8 @@ from fhash_bench.paper.measures import (
     DECIBELS,
     PICTURE_SIZE,
     VIEWS,
-    Frames,
-    PictureMeasure,
     PictureProbe,
     Places,
-    Trained,
     first_seconds,
     measure_between,
     measure_latency,
@@ -287,7 +285,8 @@ def _run(request: Request, held: _Held, device: torch.device, progress: Progress
             device=device,
         )
 
-    pictures = _pictures(held, arranged)
+    # Vertices without training show nothing.
+    pictures = partial(held.probe.measure, masks=None if arranged.whole else data.masks)
     progress("warming up", 0, 1, "")
     warm = make(max(arranged.steps))
     threads_of = max(1, warm.samples_an_epoch // len(warm.parts) // max(arranged.steps))
@@ -336,7 +335,7 @@ def _best_steps(
     device: torch.device,
     progress: Progress,
 ) -> tuple[int, list[dict[str, Any]]]:
-    """Return the best of the candidates for the steps in an epoch, and what each led to.
+    """Return the best of the candidates for the steps in an epoch, and `Cell.trial`.
 
     Each is trained to the end. A single candidate is taken without a training.
     """
@@ -349,32 +348,18 @@ def _best_steps(
         if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
             continue
         course = train(encoding, data, epochs, device=device, progress=progress)
-        trial.append(_tried(encoding, course))
+        trial.append(
+            {
+                "steps": encoding.steps_an_epoch,
+                "seconds": course.seconds,
+                "psnr": course.curve[-1].coreset_psnr,
+                "reached": {f"{d:g}": first_seconds(course.curve, d) for d in DECIBELS},
+            }
+        )
         ranked = rank(course.curve), candidate
         best = ranked if best is None else max(best, ranked)
     assert best is not None
     return best[1], trial
-
-
-def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
-    """Return the result of a number of steps, as `Cell.trial` lists it."""
-    return {
-        "steps": encoding.steps_an_epoch,
-        "seconds": course.seconds,
-        "psnr": course.curve[-1].coreset_psnr,
-        "reached": {f"{d:g}": first_seconds(course.curve, d) for d in DECIBELS},
-    }
-
-
-def _pictures(held: _Held, arranged: Arrangement) -> PictureMeasure:
-    """Return a function that compares pictures; vertices without training show nothing."""
-    masks = None if arranged.whole else held.data.masks
-
-    def measure(frames: Frames) -> tuple[float, float]:
-        psnr, ssim = held.probe.measure(frames, masks)
-        return psnr, ssim
-
-    return measure
 
 
 def _latency(

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_bench.pictures.results import Beside, Switch
-from fhash_bench.pictures.vtk import Drawn, VtkPeer, require_vtk, timed
+from fhash_bench.pictures.vtk import Drawn, VtkPeer, median_psnr, require_vtk, timed
 from fhash_codec.cost.uses import black, picture_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
@@ -420,7 +420,6 @@ def beside_shell(
                 nothing.append(empty())
                 likeness.append(picture_psnr(black(marched.rgba), drawn.pixels, 255.0))
             name = version()
-        different = [psnr for psnr in likeness if psnr is not None]
         found.append(
             Beside(
                 peer=name,
@@ -430,7 +429,7 @@ def beside_shell(
                 threads=usable_threads(),
                 ours_ms=1e3 * median(ours),
                 peer_ms=1e3 * max(median(theirs) - median(nothing), 0.0),
-                psnr=median(different) if different else None,
+                psnr=median_psnr(likeness),
             )
         )
         progress("shell", number + 1, len(variants), name)
