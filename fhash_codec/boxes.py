@@ -218,7 +218,7 @@ def coarse_vertices(box: Box, region: Box, lod: int, path: str) -> tuple[range, 
     return z, y, x
 
 
-def shared_part(box: Box, region: Box) -> tuple[Box, Box] | None:
+def overlap(box: Box, region: Box) -> tuple[Box, Box] | None:
     """The vertices that a region shares with a box; None if there are none.
 
     They are returned twice: in vertices of the region, and in vertices of the box.
@@ -231,20 +231,22 @@ def shared_part(box: Box, region: Box) -> tuple[Box, Box] | None:
 
 
 class ArrayLike:
-    """The array (t, z, y, x) that a volume is to numpy.
+    """An array to numpy, decoded as it is indexed.
 
-    A volume adds its shape and type, and how values of neighbouring steps are decoded.
+    A subclass adds its shape and type, the names of its axes, and how values are decoded.
+
+    Attributes:
+        dims: names of the axes.
+        what: what is indexed, for messages.
     """
 
-    dims = AXES
-    ndim = 4
-    shape: tuple[int, int, int, int]
+    dims: tuple[str, ...] = AXES
+    what = "a volume"
+    shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
-    def values_of_steps(
-        self, steps: range, region: Spans | None = None, *, outside: str = "nan"
-    ) -> npt.NDArray[Any]:
-        """Values (t, z, y, x) of a region at neighbouring steps."""
+    def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
+        """The values at some positions of each axis, at least one."""
         raise NotImplementedError
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
@@ -252,30 +254,28 @@ class ArrayLike:
 
         Raises RegionError (an IndexError) for an index outside the shape and for other indices.
         """
-        parts = expand_index(index)
-        ranges = index_ranges(parts, self.shape)
-        steps, *space = ranges
-        result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
-        if result.size:
-            region = Box.of((min(positions), max(positions) + 1) for positions in space)
-            local = tuple(map(slice_of, space, region.first))
-            for places, together in step_blocks(steps, region.shape):
-                result[places] = self.values_of_steps(together, region)[:, *local]
-        return result[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
+        parts = expand_index(index, self.dims, self.what)
+        ranges = index_ranges(parts, self.shape, self.dims)
+        nothing = [len(positions) for positions in ranges]
+        values = self._decoded(ranges) if all(nothing) else np.empty(nothing, self.dtype)
+        return values[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
 
     def __array__(
         self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
     ) -> npt.NDArray[Any]:
         """All values, decoded."""
         if copy is False:
-            raise ValueError(
-                "a volume cannot become an array without a copy: its values are decoded"
-            )
+            raise ValueError(f"{self.what} cannot become an array without a copy: it is decoded")
         values = self[...]
         return values if dtype is None else values.astype(dtype)
 
     def __len__(self) -> int:
         return self.shape[0]
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return len(self.dims)
 
 
 CORNERS = "corners"
@@ -300,7 +300,7 @@ class TableSource(Protocol):
         ...
 
 
-class Table:
+class Table(ArrayLike):
     """The table of one level, an array (t, z, y, x, E) that is decoded as it is read.
 
     t counts key frames, and z, y, x vertices of the level within the feature bounding box. Basic
@@ -312,37 +312,22 @@ class Table:
         dtype: type of the numbers.
     """
 
-    ndim = 5
+    dims = TABLE_AXES
+    what = "a table"
 
     def __init__(self, level: int, source: TableSource, dtype: npt.DTypeLike) -> None:
         self.level, self._source = level, source
         self.shape = tuple(int(n) for n in source.shape)
         self.dtype = np.dtype(dtype)
 
-    def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
-        """Numbers by integers, slices and `...`. Raises RegionError for other indices."""
-        parts = expand_index(index, TABLE_AXES, "a table")
-        ranges = index_ranges(parts, self.shape, TABLE_AXES)
-        if not all(ranges):
-            values = np.empty([len(positions) for positions in ranges], self.dtype)
-        else:
-            spans = [(min(positions), max(positions) + 1) for positions in ranges]
-            read = self._source.read(tuple(slice(*span) for span in spans))
-            places = zip(ranges, spans, strict=True)
-            values = read[np.ix_(*(np.array(at) - first for at, (first, _) in places))]
-        return values[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
-
-    def __array__(
-        self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
-    ) -> npt.NDArray[Any]:
-        """All numbers, decoded."""
-        if copy is False:
-            raise ValueError("a table cannot become an array without a copy: it is decoded")
-        values = self[...]
-        return values if dtype is None else values.astype(dtype)
-
-    def __len__(self) -> int:
-        return self.shape[0]
+    def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
+        spans = [(min(positions), max(positions) + 1) for positions in ranges]
+        read = self._source.read(tuple(slice(*span) for span in spans))
+        places = zip(ranges, spans, strict=True)
+        values: npt.NDArray[Any] = read[
+            np.ix_(*(np.array(at) - first for at, (first, _) in places))
+        ]
+        return values
 
     def __repr__(self) -> str:
         return f"<fhash Table level {self.level} {self.shape} {self.dtype}>"

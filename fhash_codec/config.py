@@ -7,11 +7,10 @@ one place to read and to change.
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
+from fhash_codec.records import Record, limits
 from fhash_formats.errors import InputError, suggestion
 
 TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
@@ -44,68 +43,37 @@ DEFAULT_PSNR_BULK = 40.0
 """PSNR in dB that is promised of a wide bulk where nothing is asked for."""
 
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    choices: tuple[str, ...] = (),
-    low: float | None = None,
-    high: float | None = None,
-    option: str = "",
-    profile: str = "",
-) -> Any:
-    """A dataclass field that is an option of the command line too.
-
-    help: one line for the user, unit and range included.
-    choices: the texts that are allowed; any text if empty.
-    low, high: the numbers that are allowed, both included.
-    option: name on the command line, if it is not the field's name.
-    profile: the only profile that allows a value other than the default; any profile if empty.
-    """
-    return dataclasses.field(
-        default=default,
-        metadata={
-            "help": help,
-            "choices": choices,
-            "low": low,
-            "high": high,
-            "option": option,
-            "profile": profile,
-        },
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
-class EncodeConfig:
+class EncodeConfig(Record):
     """Settings of `encode`; raises InputError for a value that is not allowed."""
 
-    profile: str = option(
+    profile: str = limits(
         "compact",
         "'compact' is the smallest file at a promised quality; "
         "'paper' is the published F-Hash, trained from a random start",
         choices=("compact", "paper"),
     )
-    features: tuple[str, ...] = option(
+    features: tuple[str, ...] = limits(
         ("all",),
         "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; change:D "
         "and onset:V, where values change by more than D or rise above V; repeat to merge several",
         option="feature",
     )
-    dilation: int = option(1, "vertices by which features grow in every direction", low=0, high=64)
-    key_frames: str = option(
+    dilation: int = limits(1, "vertices by which features grow in every direction", low=0, high=64)
+    key_frames: str = limits(
         "all",
         "paper: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) "
         "or a list such as 0,4,9",
         profile="paper",
     )
-    fringe: str = option(
+    fringe: str = limits(
         "trained",
         "paper: a vertex in the coreset of one of two neighbouring key frames only is 'trained' at "
         "both, so that values between them are right, or 'untrained' at one, as published",
         choices=FRINGES,
         profile="paper",
     )
-    fold: int = option(
+    fold: int = limits(
         0,
         "paper: ratio of resolution from one level to the next, 2 to 64; 0 for 2, the published "
         "one, or 8 with --tables transform, where more levels cost bytes",
@@ -113,7 +81,7 @@ class EncodeConfig:
         high=64,
         profile="paper",
     )
-    embedding_size: int = option(
+    embedding_size: int = limits(
         0,
         "paper: numbers trained at each grid corner; 0 for 2, the published size, or 1 with "
         "--tables transform",
@@ -121,10 +89,10 @@ class EncodeConfig:
         high=16,
         profile="paper",
     )
-    hidden_layers: int = option(
+    hidden_layers: int = limits(
         2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
     )
-    width: int = option(
+    width: int = limits(
         0,
         "paper: neurons of each hidden layer; 0 for 64, the published width, or 16 with "
         "--tables transform",
@@ -132,14 +100,14 @@ class EncodeConfig:
         high=1024,
         profile="paper",
     )
-    epochs: int = option(
+    epochs: int = limits(
         0,
         "paper: passes over the coreset, 0 for 20 or as many as make 1000 training steps",
         low=0,
         high=100_000,
         profile="paper",
     )
-    train_on_seconds: int = option(
+    train_on_seconds: int = limits(
         3600,
         "paper: time that training may take beyond its epochs where --tables transform "
         "would miss --psnr",
@@ -147,49 +115,49 @@ class EncodeConfig:
         high=10**9,
         profile="paper",
     )
-    learning_rate: float = option(
+    learning_rate: float = limits(
         0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper"
     )
-    schedule: str = option(
+    schedule: str = limits(
         "cosine",
         "paper: course of the learning rate over the training",
         choices=("cosine", "constant"),
         profile="paper",
     )
-    batch: int = option(
+    batch: int = limits(
         0,
         "paper: samples per training step, of the coreset alone; 0 for a size that suits the data",
         low=0,
         high=2**31,
         profile="paper",
     )
-    brick: str = option(
+    brick: str = limits(
         "auto",
         "paper: vertices that are trained together, as ZxYxX such as 8x8x16; 'auto' for about 1024",
         profile="paper",
     )
-    psnr: float | None = option(
+    psnr: float | None = limits(
         None,
         "promise of quality in dB over the coreset of all steps "
         f"(compact: {DEFAULT_PSNR:g} if nothing is promised); missing it ends with exit code 3",
         low=0.0,
         high=400.0,
     )
-    psnr_bulk: float | None = option(
+    psnr_bulk: float | None = limits(
         None,
         "promise of quality in dB within the bulk, the range of the middle 98 % of the values "
         f"(compact: {DEFAULT_PSNR_BULK:g} if nothing is promised); alone or beside psnr",
         low=0.0,
         high=400.0,
     )
-    max_error: float | None = option(
+    max_error: float | None = limits(
         None,
         "compact: strict bound of the error of each value, in data units",
         low=0.0,
         high=1.7e308,
         profile="compact",
     )
-    max_error_rel: float | None = option(
+    max_error_rel: float | None = limits(
         None,
         "compact: strict bound of the error of each value, "
         "as a fraction of the range of the series",
@@ -197,14 +165,14 @@ class EncodeConfig:
         high=1.0,
         profile="compact",
     )
-    ratio: float | None = option(
+    ratio: float | None = limits(
         None,
         "compact: make the file this many times smaller than the raw data",
         low=1.0,
         high=1e9,
         profile="compact",
     )
-    effort: int = option(
+    effort: int = limits(
         5,
         "compact: 1 tries and trains nothing, 2 to 4 choose the transform by trial, "
         "from 5 on a head is trained",
@@ -212,25 +180,25 @@ class EncodeConfig:
         high=9,
         profile="compact",
     )
-    tile: str = option(
+    tile: str = limits(
         "auto",
         "compact: vertices that are decoded together, as TxZxYxX such as 4x32x32x32; "
         "'auto', or 'whole' for one tile",
         profile="compact",
     )
-    access: str = option(
+    access: str = limits(
         "balanced",
         "compact: bytes that small tiles may cost, by which a region is read sooner: 'fast' for up "
         "to 1.5 times those of the best tiles, 'balanced' for up to 1.1, 'small' for none",
         choices=ACCESSES,
         profile="compact",
     )
-    without: tuple[str, ...] = option(
+    without: tuple[str, ...] = limits(
         (),
         "stages to leave out, which then take no time: tiles, transform, filling, head, predictor "
         "(trials of compact, for fewer bytes) and ssim; repeat, or join by commas",
     )
-    tables: str = option(
+    tables: str = limits(
         "float16",
         "paper: number type of the stored tables, which have only the vertices that the coreset "
         "needs where it is below half of its box; 'sparse' (always so) and 'dense' (never) are "
@@ -238,17 +206,17 @@ class EncodeConfig:
         choices=TABLES,
         profile="paper",
     )
-    engine: str = option(
+    engine: str = limits(
         "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
     )
-    device: str = option(
+    device: str = limits(
         "auto", "paper: where to train", choices=("auto", "cpu", "cuda"), profile="paper"
     )
-    deterministic: bool = option(
+    deterministic: bool = limits(
         False, "paper: the same bits in every run on CUDA, too; slower there", profile="paper"
     )
-    seed: int = option(0, "seed of every random choice", low=0, high=2**63 - 1)
-    timings: bool = option(
+    seed: int = limits(0, "seed of every random choice", low=0, high=2**63 - 1)
+    timings: bool = limits(
         True,
         "store seconds with the training history; "
         "without, the same input and number of threads give the same bytes",
@@ -256,8 +224,9 @@ class EncodeConfig:
 
     def __post_init__(self) -> None:
         self._accept_python_values()
-        for field in dataclasses.fields(self):
-            _check(field, getattr(self, field.name))
+        super().__post_init__()
+        if not self.features:
+            raise InputError("feature is empty; name at least one, such as 'all'")
         if self.fold == 1:
             raise InputError(
                 "--fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables"
@@ -270,6 +239,12 @@ class EncodeConfig:
                 "leaves nothing to choose: give one of them"
             )
         self._check_promises()
+
+    @staticmethod
+    def label(setting: dataclasses.Field[Any]) -> str:
+        """The name of a setting on the command line, without its leading dashes."""
+        name: str = setting.metadata.get("option", setting.name)
+        return name.replace("_", "-")
 
     @property
     def model_fold(self) -> int:
@@ -305,22 +280,6 @@ class EncodeConfig:
             if name != "deterministic" or value
         }
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> EncodeConfig:
-        """The record of `to_dict`'s values.
-
-        Raises InputError for an unknown name, with the nearest name that exists.
-        """
-        names = [field.name for field in dataclasses.fields(cls)]
-        for name in values:
-            if name not in names:
-                raise InputError(f"unknown setting {name!r}; {suggestion(name, names)}")
-        arguments: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in values.items()
-        }
-        return cls(**arguments)
-
     def _accept_python_values(self) -> None:
         """Turn a single feature into a tuple, and key frames given as numbers into text."""
         features, key_frames = cast(Any, self.features), cast(Any, self.key_frames)
@@ -345,12 +304,12 @@ class EncodeConfig:
     def _check_profile(self) -> None:
         """Raise InputError for a setting that belongs to the other profile."""
         for field in dataclasses.fields(self):
-            profile, value = field.metadata["profile"], getattr(self, field.name)
+            profile, value = field.metadata.get("profile"), getattr(self, field.name)
             if field.name == "device" and value == "cpu":
                 continue  # where every other profile computes
             if profile and profile != self.profile and value != field.default:
                 raise InputError(
-                    f"{_option_name(field)} belongs to --profile {profile}; "
+                    f"{self.label(field)} belongs to --profile {profile}; "
                     f"the profile is {self.profile}"
                 )
 
@@ -371,32 +330,5 @@ class EncodeConfig:
             if field.name in PROMISES and getattr(self, field.name) is not None
         ]
         if len(promised) > 1 and not {field.name for field in promised} <= set(PAIR):
-            names = " and ".join(map(_option_name, promised))
+            names = " and ".join(map(self.label, promised))
             raise InputError(f"{names} are given; promise one of them")
-
-
-def _option_name(field: dataclasses.Field[Any]) -> str:
-    """The name of a setting on the command line, without its leading dashes."""
-    name: str = field.metadata["option"] or field.name
-    return name.replace("_", "-")
-
-
-def _check(field: dataclasses.Field[Any], value: Any) -> None:
-    """Raise InputError for a value outside the choices or the limits of its field."""
-    limits = field.metadata
-    name = _option_name(field)
-    if limits["choices"] and value not in limits["choices"]:
-        raise InputError(f"{name} is '{value}'; allowed: {', '.join(limits['choices'])}")
-    if limits["low"] is not None and value is not None:
-        low, high = cast(float, limits["low"]), cast(float, limits["high"])
-        if not _is_number(value) or not low <= value <= high:
-            raise InputError(f"{name} is {value}; allowed: {low:g} to {high:g}")
-        if isinstance(field.default, int) and not isinstance(value, int):
-            raise InputError(f"{name} is {value}; a whole number is needed")
-    if field.name == "features" and not value:
-        raise InputError("feature is empty; name at least one, such as 'all'")
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is a finite number; True and False are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -7,7 +7,6 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from functools import partial
-from types import TracebackType
 from typing import Any
 
 from fhash_codec.progress import Progress, silent
@@ -105,12 +104,7 @@ class Dataset(Mapping[str, Volume]):
     def __enter__(self) -> Dataset:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def __reduce__(self) -> tuple[Any, tuple[Place]]:
@@ -133,7 +127,7 @@ def volumes_of(path: str, storage_options: Mapping[str, Any] | None = None) -> M
     return opened if isinstance(opened, Dataset) else {opened.name: opened}
 
 
-def place_of(path: str | os.PathLike[str]) -> str:
+def absolute(path: str | os.PathLike[str]) -> str:
     """A path as another process finds it: absolute, or a URL."""
     text = os.fspath(path)
     return text if "://" in text else os.path.abspath(text)

@@ -38,6 +38,19 @@ def leave_threads_of_parent() -> None:
 
 
 @contextmanager
+def torch_threads(threads: int) -> Iterator[None]:
+    """Let torch compute in a number of threads while the context lasts."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
 def threads_for(vertices: int) -> Iterator[int]:
     """Limit torch's threads, while the context lasts, to those that pay for a training.
 
@@ -48,13 +61,9 @@ def threads_for(vertices: int) -> Iterator[int]:
     """
     import torch
 
-    before = torch.get_num_threads()
-    threads = max(1, min(before, vertices // VERTICES_A_THREAD))
-    torch.set_num_threads(threads)
-    try:
+    threads = max(1, min(torch.get_num_threads(), vertices // VERTICES_A_THREAD))
+    with torch_threads(threads):
         yield threads
-    finally:
-        torch.set_num_threads(before)
 
 
 # The matrix products of CUDA give the same bits in every run only with workspaces of one kind.

@@ -451,24 +451,23 @@ def _by_name(config: Configs | None, names: Sequence[str]) -> dict[str, EncodeCo
     return {name: config.get(name, EncodeConfig()) for name in names}
 
 
-def encodable(listed: Sequence[Listed], selected: int = 0) -> tuple[list[str], list[str]]:
-    """The names of the variables of a file that can be encoded as they are, and of the others.
+def encodable(listed: Sequence[Listed], selected: int = 0) -> list[str]:
+    """The names of the variables of a file that can be encoded as they are.
 
     listed: as `list_variables` gives them. selected: number of dimensions along which an index was
         selected for the listing; a variable that needs another one is left out.
     """
-    names: list[str] = []
-    others: list[str] = []
-    for entry in listed:
-        plain = len(entry.options) == 1 and entry.options[0].count("--select") == selected
-        (names if plain else others).append(entry.name)
-    return names, others
+    return [
+        entry.name
+        for entry in listed
+        if len(entry.options) == 1 and entry.options[0].count("--select") == selected
+    ]
 
 
 def _all_variables(source: str | Path | Mapping[str, Source]) -> list[str]:
     """The names of all variables of a source that can be encoded as they are."""
     if isinstance(source, str | Path):
-        names = encodable(list_variables(source))[0]
+        names = encodable(list_variables(source))
     elif hasattr(source, "data_vars"):
         arrays = source.data_vars.items()
         names = [str(name) for name, a in arrays if a.ndim >= 3 and a.dtype.kind in "iuf"]

@@ -70,7 +70,7 @@ MAX_OPTION = 80
 """Letters of the value of an option in a line of the history; a longer one is cut."""
 
 
-def source_parts(
+def described_source(
     series: Series, coords: Mapping[str, Coordinate], attributes: Mapping[str, Any]
 ) -> tuple[dict[str, Any] | None, dict[str, npt.NDArray[Any]]]:
     """The header's `source` of a series, and the arrays that belong to it.
@@ -137,13 +137,12 @@ def _options(header: Mapping[str, Any]) -> list[str]:
     """The settings other than the defaults, as options of the command line."""
     config, profile = header.get("config", {}), header["model"]["profile"]
     defaults = EncodeConfig(profile=profile).to_dict() | {"profile": CONFIG_DEFAULTS["profile"]}
-    named = {each.name: each.metadata.get("option") or each.name for each in fields(EncodeConfig)}
     words = []
-    for name, option in named.items():
+    for setting in fields(EncodeConfig):
+        name, flag = setting.name, EncodeConfig.label(setting)
         value = config.get(name)
         if value is None or value == defaults.get(name):
             continue
-        flag = option.replace("_", "-").lstrip("-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
             continue
@@ -303,7 +302,7 @@ def describe_source(
         free = [end for end in (*ends, low - 1, high + 1) if is_within(end, dtype)]
         free = [fill for fill in free if not low <= fill <= high]
         variable |= {"fill": free[0]} if free else {}
-    source, _ = source_parts(series, _storable_coords(series), variable["attributes"])
+    source, _ = described_source(series, _storable_coords(series), variable["attributes"])
     return {
         **({} if source is None else {SOURCE: source | date_of(config)}),
         "encoder": {"version": version("fhash"), "seed": config.seed},
@@ -343,7 +342,7 @@ def write_series(
     if not writer.one_of_several:
         names = writer.name_axes([coords[axis].name for axis in AXES], series.shape)
         described = describe_coordinates(coords, names)
-    for name, array in source_parts(series, coords, {})[1].items():
+    for name, array in described_source(series, coords, {})[1].items():
         writer.add_whole(name, array)
     write_coordinates(writer, coords, described)
     every_step = len(key_frames) == series.shape[0]
@@ -372,17 +371,15 @@ def write_coordinates(
 
 
 def _storable_coords(series: Series) -> dict[str, Coordinate]:
-    """The coordinates of a series as a container holds them."""
-    return {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
-
-
-def _storable(coordinate: Coordinate) -> Coordinate:
-    """The coordinate with a name and attributes that JSON can hold."""
-    return replace(
-        coordinate,
-        name=str(coordinate.name),
-        attributes=json_attributes(coordinate.attributes, without=frozenset()),
-    )
+    """The coordinates of a series with names and attributes that JSON can hold."""
+    return {
+        axis: replace(
+            coordinate,
+            name=str(coordinate.name),
+            attributes=json_attributes(coordinate.attributes, without=frozenset()),
+        )
+        for axis, coordinate in series.coords.items()
+    }
 
 
 def write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:

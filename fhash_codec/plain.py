@@ -144,7 +144,12 @@ class _Export:
         keys = array.shape[0]
         self._total = 2 * tiles + keys + sum(map(_chunk_count, tables[1:]))
         self._write_axes()
-        self._write_tiles("tables/level_1", array, tables[0].dtype, self._lattice(array))
+        self._write_tiles(
+            "tables/level_1",
+            array,
+            tables[0].dtype,
+            lambda index: self._table(array, index)[..., np.newaxis],
+        )
         for table in tables[1:]:
             self._write_table(table)
         self._write_head(head)
@@ -204,14 +209,6 @@ class _Export:
             chunks=chunks(),
             dimension_names=TABLE_AXES,
         )
-
-    def _lattice(self, array: StoredArray) -> Callable[[Index], npt.NDArray[Any]]:
-        """The table of a tile, as far as the array reaches, with an axis of its own for E."""
-
-        def read(index: Index) -> npt.NDArray[Any]:
-            return self._table(array, index)[..., np.newaxis]
-
-        return read
 
     def _write_tiles(
         self,

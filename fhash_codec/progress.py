@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -190,33 +190,26 @@ def recording() -> Iterator[StageClock]:
         _clock.reset(token)
 
 
-@contextmanager
-def stage(name: str, why: str) -> Iterator[None]:
+def _present() -> StageClock:
+    """The clock of the job that is recorded; one that nobody reads where there is none."""
+    return _clock.get() or StageClock()
+
+
+def stage(name: str, why: str) -> AbstractContextManager[None]:
     """Enter a stage of the job that is recorded, if there is one; see `StageClock.stage`."""
-    clock = _clock.get()
-    if clock is None:
-        yield
-        return
-    with clock.stage(name, why):
-        yield
+    return _present().stage(name, why)
 
 
 def skip(name: str, why: str) -> None:
     """Record that a stage is left out; see `StageClock.skip`."""
-    clock = _clock.get()
-    if clock is not None:
-        clock.skip(name, why)
+    _present().skip(name, why)
 
 
 def attribute(name: str, why: str, seconds: float) -> None:
     """Count seconds of the open stage for another one; see `StageClock.attribute`."""
-    clock = _clock.get()
-    if clock is not None:
-        clock.attribute(name, why, seconds)
+    _present().attribute(name, why, seconds)
 
 
 def tell(name: str, why: str) -> None:
     """Replace the reason of a stage by what came of it; see `StageClock.tell`."""
-    clock = _clock.get()
-    if clock is not None:
-        clock.tell(name, why)
+    _present().tell(name, why)

@@ -55,8 +55,15 @@ class Record:
         """Check and convert every field; raises InputError."""
         hints = _hints(type(self))  # type: ignore[arg-type]
         for setting in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = _checked(setting, hints[setting.name], getattr(self, setting.name))
+            value = _checked(
+                self.label(setting), setting, hints[setting.name], getattr(self, setting.name)
+            )
             object.__setattr__(self, setting.name, value)
+
+    @staticmethod
+    def label(setting: dataclasses.Field[Any]) -> str:
+        """The name of a field in messages."""
+        return setting.name
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, without the fields that have their defaults."""
@@ -127,6 +134,7 @@ def limits(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    **more: str,
 ) -> Any:
     """Declare a field of a Record with its help and the values that it may have.
 
@@ -136,10 +144,10 @@ def limits(
         low: smallest number allowed; checked only together with `high`.
         high: largest number allowed.
         choices: texts allowed; any text if empty.
+        more: what one kind of record knows of its fields besides.
     """
-    return field(
-        default=default, metadata={"help": help, "low": low, "high": high, "choices": choices}
-    )
+    declared = {"help": help, "low": low, "high": high, "choices": choices, **more}
+    return field(default=default, metadata=declared)
 
 
 @cache
@@ -184,35 +192,39 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-def _checked(setting: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
-    """Convert a value to the type of its field and check it; raises InputError."""
+def _checked(name: str, setting: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
+    """Convert a value to the type of its field and check it; raises InputError.
+
+    name: of the field, for messages.
+    """
     try:
         converted = _converted(hint, value)
     except _RefusedSettingError as error:
-        raise error.within(setting.name) from error
+        raise error.within(name) from error
     if converted is _WRONG:
-        raise _RefusedSettingError(setting.name, f"is {value!r:.60}; {_needed(setting, hint)}")
+        raise _RefusedSettingError(name, f"is {value!r:.60}; {_needed(setting, hint)}")
     for item in converted if isinstance(converted, tuple) else (converted,):
         if isinstance(item, str):
-            _check_choice(setting, item)
+            _check_choice(name, setting, item)
         elif isinstance(item, int | float) and not isinstance(item, bool):
-            _check_range(setting, item)
+            _check_range(name, setting, item)
     return converted
 
 
-def _check_range(setting: dataclasses.Field[Any], number: float) -> None:
+def _check_range(name: str, setting: dataclasses.Field[Any], number: float) -> None:
     low: float | None = setting.metadata.get("low")
     high: float | None = setting.metadata.get("high")
     if low is not None and high is not None and not low <= number <= high:
-        raise _RefusedSettingError(setting.name, f"is {number:g}; allowed: {low:g} to {high:g}")
+        shown = number if isinstance(number, int) else f"{number:g}"
+        raise _RefusedSettingError(name, f"is {shown}; allowed: {low:g} to {high:g}")
 
 
-def _check_choice(setting: dataclasses.Field[Any], text: str) -> None:
+def _check_choice(name: str, setting: dataclasses.Field[Any], text: str) -> None:
     choices: tuple[str, ...] = setting.metadata.get("choices", ())
     if choices and text not in choices:
         near = difflib.get_close_matches(text, choices, n=1, cutoff=0.6)
         raise _RefusedSettingError(
-            setting.name,
+            name,
             f"is '{text[:60]}'; allowed: {', '.join(choices)}"
             + (f"; did you mean '{near[0]}'?" if near else ""),
         )

@@ -17,7 +17,9 @@ from fhash_codec.boxes import (
     Spans,
     checked_region,
     coarse_vertices,
-    shared_part,
+    overlap,
+    slice_of,
+    step_blocks,
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
@@ -26,7 +28,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
-from fhash_codec.volume_model import Card, Decoded, open_model, sampled
+from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, RegionError
@@ -232,6 +234,15 @@ class Volume(Card, ArrayLike):
         self._model = open_model(container)
         self.chunks = self._model.chunks
 
+    def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
+        steps, *space = ranges
+        result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
+        region = Box.of((min(positions), max(positions) + 1) for positions in space)
+        local = tuple(map(slice_of, space, region.first))
+        for places, together in step_blocks(steps, region.shape):
+            result[places] = self.values_of_steps(together, region)[:, *local]
+        return result
+
     # -- contents of the file --
 
     @cached_property
@@ -341,7 +352,7 @@ class Volume(Card, ArrayLike):
             limits = np.iinfo(self.dtype)
             nearest = min(max(round(self.background), int(limits.min)), int(limits.max))
             result = np.full(read.shape, nearest, self.dtype)
-            common = shared_part(self.box, self._checked(region))
+            common = overlap(self.box, self._checked(region))
             if common is not None:
                 assert decoded is not None, "only such files hold integers"
                 np.copyto(result[(slice(None), *common[0].slices())], decoded[0], where=decoded[1])
@@ -437,7 +448,7 @@ class Volume(Card, ArrayLike):
             t = self._steps_of_times(time)
         points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
         steps, *space = (position.ravel() for position in points)
-        values, slopes = sampled(self, self._model, steps, space, gradient=gradient)
+        values, slopes = self._sampled(steps, space, gradient=gradient)
         shape = points[0].shape
         values = self._in_range(values.reshape(shape).astype(self.float_dtype))
         if slopes is None:
@@ -453,7 +464,7 @@ class Volume(Card, ArrayLike):
         """
         key, region = self._key_index(t), self._checked(region)
         result = np.zeros(region.shape, dtype=bool)
-        common = shared_part(self.box, region)
+        common = overlap(self.box, region)
         if common is not None:
             in_region, in_box = common
             result[in_region.slices()] = self._occupied(key, in_box)
@@ -515,7 +526,7 @@ class Volume(Card, ArrayLike):
         """
         if outside not in OUTSIDE:
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
-        common = shared_part(self.box, region)
+        common = overlap(self.box, region)
         if common is None:
             result: npt.NDArray[Any] = np.full((*steps, *region.shape), np.nan, self.float_dtype)
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from math import floor, prod
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,69 +23,25 @@ from fhash_formats.series import AXES, Coordinate, SourceMetadata
 
 Positions = npt.NDArray[np.float64]
 """Positions (n,) of points along one axis."""
-Decoded = tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]
+Mask = npt.NDArray[np.bool_]
+Decoded = tuple[npt.NDArray[Any], Mask]
 """Values of a part of the box, and the mask of those in the coreset."""
 
 
-class VolumeModel(Protocol):
-    """Values of a series, in data units, inside the feature bounding box.
+VolumeModel = CompactModel | PaperModel
+"""Values of a series, in data units, inside the feature bounding box.
 
-    Regions and positions count vertices of the feature bounding box. Times are key indices:
-    0 to key frames - 1, fractional between key frames.
-    """
+Regions and positions count vertices of that box. Times are key indices: 0 to key frames - 1,
+fractional between key frames.
 
-    @property
-    def chunks(self) -> tuple[int, ...]:
-        """Vertices (t, z, y, x) that are decoded together: a read decodes at least so many."""
-        ...
-
-    @property
-    def tables(self) -> list[Table]:
-        """Tables of the levels, finest first."""
-        ...
-
-    @property
-    def mlp(self) -> Mlp:
-        """Layers behind the tables."""
-        ...
-
-    def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
-        """Mask (z, y, x) of a region: the vertices in the coreset between two key frames.
-
-        first, last: neighbouring key frames, or the same key frame twice.
-        """
-        ...
-
-    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-        """Values (z, y, x) of a region, of any number type.
-
-        requested: mask (z, y, x) of the region; where it is False, the values are undefined.
-        """
-        ...
-
-    def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
-        """Low-passed values (z, y, x) at every 2^lod-th vertex of the box, within a region.
-
-        region: in coarse vertices, so that vertex 1 of it is vertex 2^lod of the box.
-        Raises InputError if the profile has no levels of detail.
-        """
-        ...
-
-    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
-        """Values (n,) at points.
-
-        keys: key indices of the points. space: their positions z, y and x. All lie in the box.
-        """
-        ...
-
-    def sample_with_gradient(
-        self, keys: Positions, space: list[Positions]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Values (n,) at points, and derivatives (n, 4) by key index, z, y and x.
-
-        On the border of two cells, the derivatives are those of the cell after the border.
-        """
-        ...
+- chunks, tables, mlp: vertices (t, z, y, x) that are decoded together, and what `Card` shows.
+- occupied(first, last, region): mask (z, y, x) of the coreset between two neighbouring key frames.
+- read(key, region, requested): values (z, y, x), undefined where the mask `requested` is False.
+- read_lod(key, lod, region): low-passed values at every 2^lod-th vertex, in coarse vertices.
+- sample(keys, space): values (n,) at points of the box; space holds their positions z, y and x.
+- sample_with_gradient(keys, space): these, and derivatives (n, 4) by key index, z, y and x; on the
+  border of two cells those of the cell after the border.
+"""
 
 
 def open_model(container: Container) -> VolumeModel:
@@ -107,6 +63,11 @@ class Card:
 
         @property
         def coords(self) -> Mapping[str, Coordinate]: ...
+
+        @property
+        def key_times(self) -> KeyTimes: ...
+
+        def occupancy(self, t: float, region: Spans | None = None) -> Mask: ...
 
         def sample(
             self, *, z: Any, y: Any, x: Any, t: Any = None, time: Any = None, gradient: bool = False
@@ -178,7 +139,7 @@ class Card:
                     "level": table.level,
                     "shape": list(table.shape),
                     "dtype": table.dtype.name,
-                    **self._place(f"tables/level_{table.level}", "low-passed level 1"),
+                    **self._stored(f"tables/level_{table.level}", "low-passed level 1"),
                 }
                 for table in self.tables
             ],
@@ -194,7 +155,7 @@ class Card:
                 "layer": number,
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
-                **self._place(
+                **self._stored(
                     f"mlp/weight_{number}",
                     f"packed in the codec of {self._table_path}",
                 ),
@@ -210,7 +171,7 @@ class Card:
         apart = names if isinstance(self._model, PaperModel) and len(names) > 1 else []
         for name in (MASK_ARRAY, BITS_ARRAY):
             if name in arrays:
-                return {"shape": shape, **self._place(name, ""), "apart": apart}
+                return {"shape": shape, **self._stored(name, ""), "apart": apart}
         masked = self.container.arrays[TABLE].masked
         coding = f"in the tiles of {self._table_path}" if masked else "every vertex of the box"
         return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
@@ -221,7 +182,7 @@ class Card:
         arrays = self.container.arrays
         return arrays[TABLE].name if TABLE in arrays else TABLE
 
-    def _place(self, name: str, otherwise: str) -> dict[str, Any]:
+    def _stored(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""
         stored = self.container.arrays
         found = [key for key in stored if key == name or key.startswith(f"{name}/")]
@@ -264,56 +225,28 @@ class Card:
         values: npt.NDArray[Any] = self.sample(t=t, z=z, y=y, x=x)
         return values
 
+    def _sampled(
+        self, steps: Positions, space: Sequence[Positions], *, gradient: bool
+    ) -> tuple[Positions, Positions | None]:
+        """Values (n,) at points, NaN where there is none, and derivatives (n, 4) by t, z, y and x.
 
-Mask = npt.NDArray[np.bool_]
-
-
-class Series(Protocol):
-    """A volume, as far as sampling asks it: where it has values, and how its time runs."""
-
-    @property
-    def box(self) -> Box:
-        """The feature bounding box."""
-        ...
-
-    @property
-    def key_times(self) -> KeyTimes:
-        """The map from steps to key indices."""
-        ...
-
-    def occupancy(self, t: float, region: Spans | None = None) -> Mask:
-        """The vertices (z, y, x) of a region of the domain that are in the coreset at a step."""
-        ...
-
-
-def sampled(
-    series: Series,
-    model: VolumeModel,
-    steps: Positions,
-    space: Sequence[Positions],
-    *,
-    gradient: bool,
-) -> tuple[Positions, Positions | None]:
-    """Values (n,) at points, NaN where there is none, and derivatives (n, 4) by t, z, y and x.
-
-    steps: of the points. space: positions z, y and x of the points, in vertices of the domain.
-    gradient: whether derivatives are asked for; None is returned for them otherwise.
-    """
-    keys = series.key_times.key_indices(steps)
-    inside = interpolable(series.box, steps, keys, space, series.occupancy)
-    values = np.full(inside.shape, np.nan)
-    slopes = np.full((*inside.shape, 4), np.nan) if gradient else None
-    if inside.any():
-        local = [
-            (position - first)[inside]
-            for position, first in zip(space, series.box.first, strict=True)
-        ]
-        if slopes is None:
-            values[inside] = model.sample(keys[inside], local)
-        else:
-            values[inside], slopes[inside] = model.sample_with_gradient(keys[inside], local)
-            slopes[inside, 0] *= series.key_times.keys_per_step(steps[inside])
-    return values, slopes
+        steps: of the points. space: positions z, y and x of the points, in vertices of the domain.
+        gradient: whether derivatives are asked for; None is returned for them otherwise.
+        """
+        keys = self.key_times.key_indices(steps)
+        inside = interpolable(self.box, steps, keys, space, self.occupancy)
+        values = np.full(inside.shape, np.nan)
+        slopes = np.full((*inside.shape, 4), np.nan) if gradient else None
+        if inside.any():
+            first = self.box.first
+            local = [(along - low)[inside] for along, low in zip(space, first, strict=True)]
+            if slopes is None:
+                values[inside] = self._model.sample(keys[inside], local)
+            else:
+                found = self._model.sample_with_gradient(keys[inside], local)
+                values[inside], slopes[inside] = found
+                slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
+        return values, slopes
 
 
 def interpolable(

@@ -16,9 +16,9 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from fhash_codec.boxes import Box, slice_of, step_blocks
+from fhash_codec.boxes import Box, index_ranges, slice_of, step_blocks
 from fhash_codec.config import EncodeConfig
-from fhash_codec.dataset import Handle, acquire, place_of, release
+from fhash_codec.dataset import Handle, absolute, acquire, release
 from fhash_codec.encoding import encode
 from fhash_codec.features.selection import labelled_series
 from fhash_codec.header import figure_attributes, history_line, source_attributes
@@ -204,10 +204,8 @@ class FhashArray(BackendArray):
     def _get(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
         """Values at whole numbers and slices, one for each dimension."""
         dimensions = list(self._form.dimensions.items())
-        chosen = {
-            axis: _positions(length, part)
-            for (_, axis), length, part in zip(dimensions, self.shape, key, strict=True)
-        }
+        ranges = index_ranges(key, self.shape, tuple(self._form.dimensions))
+        chosen = dict(zip(self._form.dimensions.values(), ranges, strict=True))
         values = self._values({axis: chosen.get(axis, range(1)) for axis in AXES})
         # from t, z, y, x to the dimensions that there are, in their order
         present = [axis for _, axis in dimensions if axis != NO_AXIS]
@@ -245,14 +243,6 @@ class FhashArray(BackendArray):
             values = volume.values_of_steps(steps, region, outside=form.outside)
             result[places] = values[:, *local]
         return result
-
-
-def _positions(length: int, part: int | slice) -> range:
-    """The positions that a number or slice of a key stands for."""
-    if isinstance(part, slice):
-        return range(length)[part]
-    position = range(length)[part]
-    return range(position, position + 1)
 
 
 SUFFIX = ".fhz"
@@ -313,7 +303,7 @@ class FhashBackend(BackendEntrypoint):
         if outside not in OUTSIDE or (lod is not None and outside != OUTSIDE[0]):
             allowed = ", ".join(OUTSIDE) if lod is None else f"{OUTSIDE[0]} with lod"
             raise InputError(f"outside is {outside!r}; allowed: {allowed}")
-        place = place_of(filename_or_obj)
+        place = absolute(filename_or_obj)
         handle = acquire(place, storage_options)
         names = list(handle.volumes)
         if variable is not None and len(names := meant(variable, names)) != 1:

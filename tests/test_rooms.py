@@ -46,8 +46,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("growing",),
     ),
     "fhash_codec": (
-        ("config", "native", "progress", "records"),
-        ("boxes", "devices", "measure"),
+        ("native", "progress", "records"),
+        ("boxes", "config", "devices", "measure"),
         ("features",),
         ("header",),
         ("compact",),
@@ -86,7 +86,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("main",),
     ),
     "fhash_bench": (
-        ("ablate", "engines", "labels", "pictures", "rate"),
+        ("engines", "kept", "labels", "pictures"),
+        ("ablate", "rate"),
         ("paper", "train"),
         ("commands",),
         ("main",),
@@ -106,11 +107,8 @@ MANY_PARAMETERS = {
     "fhash_codec/xarray_backend.py": {"open_dataset"},
     "formats/fhash_formats/container/writer.py": {"add_array"},
     "benchmarks/fhash_bench/paper/measures.py": {"measure_latency"},
-    "benchmarks/fhash_bench/paper/trained.py": {"_model"},
-    "benchmarks/fhash_bench/pictures/vtk.py": {"__init__"},
     "benchmarks/fhash_bench/rate/rate.py": {"bench_rate"},
     "benchmarks/fhash_bench/rate/table.py": {"bench_table"},
-    "benchmarks/fhash_bench/train.py": {"_measured"},
 }
 """Functions with more all the same: interfaces whose callers write keywords. No name is added."""
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from fhash_bench.kept import save
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
@@ -27,7 +28,6 @@ from fhash_codec.simulation.simulate import simulate
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import FhashWarning, InputError, QualityError, suggestion
 from fhash_formats.series import ArraySeries, Series
-from fhash_formats.support.files import replacing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -452,7 +452,7 @@ class _Work:
             (axis, varied, seed) for axis in axes for varied in axis.varied for seed in range(seeds)
         ]
         for number, (axis, varied, seed) in enumerate(tasks):
-            self._progress("encoding", number, len(tasks), f"{axis.name}: {told(varied)}")
+            self._progress("encoding", number, len(tasks), f"{axis.name}: {as_options(varied)}")
             self._one(axis, varied, seed)
         self._progress("encoding", len(tasks), len(tasks), "")
 
@@ -467,19 +467,18 @@ class _Work:
         try:
             figures = _encoded(self._series, self._scratch / "run.fhz", config)
         except InputError as error:
-            self.left_out.append(f"{axis.name}: {told(varied)}: {error}")
+            self.left_out.append(f"{axis.name}: {as_options(varied)}: {error}")
             return
         run = _run(axis, varied, seed, figures)
         if kept is not None:
-            with replacing(kept, force=False) as temporary:
-                temporary.write_text(json.dumps(asdict(run), indent=1) + "\n", encoding="utf-8")
+            save(kept, asdict(run))
         self.runs.append(run)
 
     def _name(self, axis: Axis, varied: dict[str, Any], config: EncodeConfig) -> str:
         """The name of a kept run, which all that its figures depend on is part of."""
         identity = json.dumps([self._digest, config.to_dict()], sort_keys=True)
         digest = hashlib.sha256(identity.encode()).hexdigest()[:10]
-        words = re.sub(r"[^a-z0-9]+", "-", told(varied).lower()).strip("-")
+        words = re.sub(r"[^a-z0-9]+", "-", as_options(varied).lower()).strip("-")
         return f"{axis.name}-{words}-{digest}.json"
 
 
@@ -491,7 +490,7 @@ def _digest(series: Series) -> str:
     return digest.hexdigest()
 
 
-def told(settings: dict[str, Any]) -> str:
+def as_options(settings: dict[str, Any]) -> str:
     """Settings as options of the command line; an empty one as nothing left out."""
     texts = {
         name: (",".join(value) or "nothing") if isinstance(value, list | tuple) else value
@@ -590,7 +589,7 @@ def _curves(panel: Any, runs: list[Run]) -> None:
             color=COLOURS[number % len(COLOURS)],
             linestyle=STYLES[number // len(COLOURS) % len(STYLES)],
             linewidth=2.4 if run.reference else 1.3,
-            label=told(run.settings),
+            label=as_options(run.settings),
         )
     panel.set_xlabel("epochs")
     panel.set_ylabel("PSNR on some bricks of the key frames, dB")
@@ -605,7 +604,7 @@ def _points(panel: Any, rows: list[Row]) -> None:
             [row.bytes],
             "o",
             color=COLOURS[number % len(COLOURS)],
-            label=f"{told(row.settings)}: {quality}",
+            label=f"{as_options(row.settings)}: {quality}",
         )
     panel.set_xscale("log")
     panel.set_xlabel("seconds of the encoding")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fhash_codec.devices import torch_threads
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.native import network as native
 from fhash_codec.paper.engines import Engine, make_engine
@@ -53,8 +54,6 @@ def now() -> Spent:
 def wait(device: torch.device) -> None:
     """Wait until a device has done its work."""
     if device.type == "cuda":
-        import torch
-
         torch.cuda.synchronize(device)
 
 
@@ -117,37 +116,35 @@ class Peak:
 
 
 class Peaks:
-    """The peaks of a device, measured a little at a time, in turns with what is held to them."""
+    """The peaks of a `device`, measured a little at a time, in turns with what is held to them."""
 
     def __init__(self, device: torch.device) -> None:
-        self._device = device
+        self.device = device
         self._paths = native.machine_paths() if device.type == "cpu" else []
-        self.peaks = [_multiply_adds(name) for name in self._paths]
+        self.peaks = [
+            Peak(what="multiply-adds", path=name, precision="float32", clock="cpu", gflops=0.0)
+            for name in self._paths
+        ]
+        clock = "cpu" if device.type == "cpu" else "events"
         if device.type == "cuda":
-            self.peaks += [_product(name) for name in PRECISIONS]
-        self.peaks.append(
-            Peak(
-                what="copy", path=None, precision=None, gb_s=0.0,
-                clock="cpu" if device.type == "cpu" else "events",
-            )
-        )  # fmt: skip
+            self.peaks += [
+                Peak(what="matrix product", path=None, precision=name, clock=clock, gflops=0.0)
+                for name in PRECISIONS
+            ]
+        self.peaks.append(Peak(what="copy", path=None, precision=None, clock=clock, gb_s=0.0))
         numbers = COPY_BYTES // 8
         self._from = torch.ones(numbers, dtype=torch.float32, device=device)
         self._to = torch.zeros_like(self._from)
 
     def measure(self) -> None:
         """Measure every rate once more, in one thread; the best counts."""
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with torch_threads(1):
             for number, path in enumerate(self._paths):
                 self._raise(number, "gflops", self._fma(path))
-            if self._device.type == "cuda":
+            if self.device.type == "cuda":
                 for number, precision in enumerate(PRECISIONS):
                     self._raise(number, "gflops", self._matrix_product(precision))
             self._raise(len(self.peaks) - 1, "gb_s", self._copy())
-        finally:
-            torch.set_num_threads(threads)
 
     def flops(self, path: str | None = None) -> float:
         """Operations a second of some instructions of the processor; None for the best."""
@@ -178,7 +175,7 @@ class Peaks:
     def _matrix_product(self, precision: str) -> float:
         """Operations a second of torch's matrix product."""
         size = GPU_SIZE
-        a, b = (torch.rand(size, size, device=self._device) for _ in range(2))
+        a, b = (torch.rand(size, size, device=self.device) for _ in range(2))
         allowed = torch.backends.cuda.matmul.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
         try:
@@ -191,19 +188,11 @@ class Peaks:
     def _copy(self) -> float:
         """Bytes a second of a copy, read and written."""
         moved = 2 * self._from.element_size() * self._from.numel()
-        if self._device.type == "cpu":
+        if self.device.type == "cpu":
             begun = now()
             np.copyto(self._to.numpy(), self._from.numpy())
             return moved / (now() - begun).on("cpu")
         return moved / _device_seconds(lambda: self._to.copy_(self._from))
-
-
-def _multiply_adds(path: str) -> Peak:
-    return Peak(what="multiply-adds", path=path, precision="float32", clock="cpu", gflops=0.0)
-
-
-def _product(precision: str) -> Peak:
-    return Peak(what="matrix product", path=None, precision=precision, clock="events", gflops=0.0)
 
 
 def _device_seconds(work: Any) -> float:
@@ -329,7 +318,7 @@ class EngineRun:
         """
         first = engine(np.full(WARM_UP_STEPS + 1, rate))
         taken = []
-        with self._threads():
+        with torch_threads(self.variant.threads):
             for chosen in self.plan.order(0)[:WARM_UP_STEPS]:
                 begun = now()
                 first.train(chosen)
@@ -340,7 +329,7 @@ class EngineRun:
     def train(self, seconds: float) -> None:
         """Go on with the training for some seconds, and measure the quality then."""
         samples, begun, spent = 0, now(), Spent()
-        with self._threads():
+        with torch_threads(self.variant.threads):
             while spent.on(self.device.type) < seconds and self.engine.step < self._last:
                 epoch, batch = divmod(self.engine.step, self.plan.batches)
                 if batch == 0 or samples == 0:
@@ -364,7 +353,7 @@ class EngineRun:
         self.engine.settle()
         batches = self.plan.order(0)
         samples, number, begun, spent = 0, 0, now(), Spent()
-        with self._threads():
+        with torch_threads(self.variant.threads):
             while spent.on(self.device.type) < seconds or number == 0:
                 chosen = batches[number % len(batches)]
                 self.engine.infer(chosen)
@@ -399,22 +388,6 @@ class EngineRun:
             "seconds_to": [_reached(self.curve, goal) for goal in GOALS],
             "curve": [asdict(point) for point in self.curve],
         }
-
-    def _threads(self) -> _Threads:
-        return _Threads(self.variant.threads)
-
-
-class _Threads:
-    """A context in which torch computes with a number of threads."""
-
-    def __init__(self, threads: int) -> None:
-        self._threads, self._before = threads, torch.get_num_threads()
-
-    def __enter__(self) -> None:
-        torch.set_num_threads(self._threads)
-
-    def __exit__(self, *_: object) -> None:
-        torch.set_num_threads(self._before)
 
 
 def _reached(curve: list[CurvePoint], goal: float) -> dict[str, float | None]:

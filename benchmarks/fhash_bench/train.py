@@ -17,7 +17,7 @@ import torch
 
 from fhash_bench.engines import GOALS, EngineRun, Peaks, Variant, now
 from fhash_bench.rate.generated import DEFAULT, is_made, made_series
-from fhash_codec.boxes import Box
+from fhash_codec.boxes import Box, TableSource
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.cost.plan import machine
 from fhash_codec.cost.report import require_matplotlib
@@ -59,7 +59,12 @@ def bench_points(
         layers: its layers.
         threads: numbers of threads to measure with.
     """
-    network = _network(architecture, layers)
+    random = np.random.default_rng(0)
+    size = architecture.embedding_size
+    tables = [
+        ArrayTable(random.random((*level, size), dtype=np.float32)) for level in architecture.levels
+    ]
+    network = _network(architecture, layers, tables)
     time = 0.37 * (network.key_frames - 1)
     results = []
     for order, places in (("rays", _rays(network)), ("random", _random(network))):
@@ -87,15 +92,13 @@ def bench_points(
     return results
 
 
-def _network(architecture: Architecture, layers: Sequence[Layer]) -> Network:
-    random = np.random.default_rng(0)
+def _network(
+    architecture: Architecture, layers: Sequence[Layer], tables: Sequence[TableSource]
+) -> Network:
     return Network(
         levels=architecture.levels,
         embedding_size=architecture.embedding_size,
-        tables=[
-            ArrayTable(random.random((*level, architecture.embedding_size), dtype=np.float32))
-            for level in architecture.levels
-        ],
+        tables=tables,
         layers=tuple(layers),
         box_size=architecture.box_size,
         key_frames=architecture.key_frames,
@@ -154,14 +157,8 @@ def bench_decode(
         times as fast as the whole box; medians over the turns.
     """
     size = architecture.embedding_size
-    network = Network(
-        levels=architecture.levels,
-        embedding_size=size,
-        tables=[_ZeroTable((*level, size)) for level in architecture.levels],
-        layers=tuple(layers),
-        box_size=architecture.box_size,
-        key_frames=architecture.key_frames,
-    )
+    tables = [_ZeroTable((*level, size)) for level in architecture.levels]
+    network = _network(architecture, layers, tables)
     every = -(-architecture.key_frames // KEY_FRAMES)
     keys = range(0, architecture.key_frames, every)
     masks = [unpack(coreset.occupancy[key], coreset.box.shape) for key in keys]
@@ -243,7 +240,7 @@ def bench_train(
         configs.append(replace(config, features=("all",)))
     with opened as series:
         results = [
-            _measured(series, each, engines, seconds, number, peaks, device, progress)
+            _measured(series, each, engines, seconds, number, peaks, progress)
             for each in configs
             for number in bricks or (0,)
         ]
@@ -261,11 +258,10 @@ def _measured(
     seconds: float,
     bricks: int,
     peaks: Peaks,
-    device: torch.device,
     progress: Progress,
 ) -> dict[str, Any]:
     """Return an entry of `series`; arguments as in `bench_train`, `bricks` of one step."""
-    selected = select(series, config, progress)
+    device, selected = peaks.device, select(series, config, progress)
     coreset, architecture = selected.coreset, selected.architecture
     samples = len(coreset.values)
     plan = plan_training(
@@ -300,19 +296,12 @@ def _measured(
         "batch_samples": samples / plan.batches,
         "batch_bricks": len(coreset.bricks) / plan.batches,
         "brick_fill": samples / (len(coreset.bricks) * prod(coreset.brick_shape)),
-        **_sizes(coreset, architecture),
-        "engines": results,
-        "points": bench_points(architecture, numpy_layers, threads),
-        **bench_decode(architecture, coreset, numpy_layers),
-    }
-
-
-def _sizes(coreset: Coreset, architecture: Architecture) -> dict[str, int]:
-    """Return bytes: those of the samples, and of the model as float16 without further coding."""
-    return {
         "sample_bytes": coreset.values.nbytes,
         "parameters": architecture.parameters,
         "float16_bytes": 2 * architecture.parameters,
+        "engines": results,
+        "points": bench_points(architecture, numpy_layers, threads),
+        **bench_decode(architecture, coreset, numpy_layers),
     }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -13,11 +12,11 @@ from types import SimpleNamespace
 import click
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 
 from fhash_bench import engines as clock
 from fhash_bench import train as bench
-from fhash_bench.commands.rate import Peer, PeerType, filters_of, opened, programs_of
+from fhash_bench.commands.rate import PEER, Peer, filters_of, opened, programs_of
 from fhash_bench.main import command
 from fhash_bench.pictures import vtk
 from fhash_bench.rate import generated as made
@@ -27,15 +26,13 @@ from fhash_codec.progress import silent
 from fhash_formats.series import Series
 
 
-def test_every_benchmark_is_named_in_the_help(fhash: Callable[..., Result]) -> None:
+def test_every_benchmark_is_named_in_the_help(fhash: Fhash) -> None:
     result = fhash("bench", "--help")
     assert result.exit_code == 0
     listed = [line.split()[0] for line in result.stdout.splitlines() if line.startswith("  ")]
     assert set(command.commands) <= set(listed)
     assert {"train", "rate", "render"} <= set(command.commands)
 
-
-Fhash = Callable[..., Result]
 
 RATE = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
 
@@ -45,14 +42,7 @@ def test_bench_rate_prints_one_json_object(fhash: Fhash, data: Path) -> None:
         "bench",
         "rate",
         data,
-        "--target",
-        "40",
-        "--bound",
-        "0.02",
-        "--peer",
-        "SZ3",
-        "--peer",
-        "Blosc",
+        *["--target", "40", "--bound", "0.02", "--peer", "SZ3", "--peer", "Blosc"],
         *RATE,
         "--json",
     )
@@ -75,14 +65,7 @@ def test_bench_rate_prints_tables(fhash: Fhash, data: Path) -> None:
         "bench",
         "rate",
         data,
-        "--t",
-        ":2",
-        "--target",
-        "40",
-        "--bound",
-        "0.05",
-        "--peer",
-        "SZ3",
+        *["--t", ":2", "--target", "40", "--bound", "0.05", "--peer", "SZ3"],
         *RATE,
     )
     assert result.exit_code == 0
@@ -100,15 +83,7 @@ def test_bench_rate_measures_size_alone_and_no_profile(fhash: Fhash, data: Path)
         "bench",
         "rate",
         data,
-        "--target",
-        "40",
-        "--peer",
-        "ZFP",
-        "--profile",
-        "none",
-        "--no-speed",
-        "-q",
-        "--json",
+        *["--target", "40", "--peer", "ZFP", "--profile", "none", "--no-speed", "-q", "--json"],
     )
     assert result.exit_code == 0
     report = json.loads(result.stdout)
@@ -122,15 +97,7 @@ def test_bench_rate_draws(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         "bench",
         "rate",
         data,
-        "--target",
-        "40",
-        "--peer",
-        "SZ3",
-        "--profile",
-        "none",
-        "--no-speed",
-        "-q",
-        "--plot",
+        *["--target", "40", "--peer", "SZ3", "--profile", "none", "--no-speed", "-q", "--plot"],
         picture,
     ]
     assert fhash(*words).exit_code == 0
@@ -141,7 +108,7 @@ def test_bench_rate_draws(fhash: Fhash, data: Path, tmp_path: Path) -> None:
 
 
 def test_bench_rate_refuses_what_is_unknown(
-    refused: Callable[..., str], data: Path, monkeypatch: pytest.MonkeyPatch
+    refused: Refused, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "'zip' is no peer; allowed: SZ3, SPERR" in refused(
         2, "bench", "rate", data, "--peer", "zip"
@@ -182,7 +149,7 @@ def test_data_are_measured_by_the_options_of_a_series(fhash: Fhash, tmp_path: Pa
     assert "uint8 2 x 3 x 16 x 20" in result.stdout
 
 
-def test_an_unknown_kind_is_refused(refused: Callable[..., str]) -> None:
+def test_an_unknown_kind_is_refused(refused: Refused) -> None:
     assert "kind is 'foo'; allowed: " in refused(2, "bench", "labels", "--kind", "foo")
 
 
@@ -202,7 +169,7 @@ def test_bench_table_prints_markdown_and_goes_on(fhash: Fhash, data: Path, tmp_p
     assert {cell["codec"] for cell in again["cells"]} == {"fhash compact", "SZ3"}
 
 
-def test_bench_table_needs_data(refused: Callable[..., str], data: Path) -> None:
+def test_bench_table_needs_data(refused: Refused, data: Path) -> None:
     assert "Missing DATA; or give --generated" in refused(2, "bench", "table")
     assert "is no program that can be run" in refused(
         2, "bench", "table", data, "--peer", "tthresh=/nowhere/tthresh"
@@ -220,7 +187,7 @@ def test_filters_are_all_unless_some_are_named() -> None:
 
 
 def test_a_peer_is_a_name_or_a_program() -> None:
-    kind = PeerType()
+    kind = PEER
     assert kind.convert("SZ3", None, None) == Peer(name="SZ3")
     assert kind.convert("tthresh=a=b", None, None) == Peer(name="tthresh", path="a=b")
     assert kind.convert(Peer(name="none"), None, None) == Peer(name="none")
@@ -241,14 +208,7 @@ def test_prints_tables(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(vtk, "FINE_SIZE", 16)
     monkeypatch.setattr(vtk, "EXPLAINED_SIZE", 16)
     result = fhash(
-        "bench",
-        "render",
-        run,
-        *QUICK,
-        "--part",
-        "accelerations",
-        "--part",
-        "exactness",
+        "bench", "render", run, *QUICK, *["--part", "accelerations", "--part", "exactness"]
     )
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
@@ -292,9 +252,7 @@ def test_draws(fhash: Fhash, run: Path, tmp_path: Path) -> None:
         (["--plot", "none/a.png"], "does not exist"),
     ],
 )
-def test_refuses_in_one_line(
-    words: list[str], part: str, refused: Callable[..., str], run: Path
-) -> None:
+def test_refuses_in_one_line(words: list[str], part: str, refused: Refused, run: Path) -> None:
     assert part in refused(2, "bench", "render", run, "-q", *words)
 
 
@@ -337,7 +295,7 @@ def test_a_table_has_a_row_for_each_variation(
 
 
 def test_unsuitable_options_are_refused(
-    refused: Callable[..., str], data_bench_ablate: Path, tmp_path: Path
+    refused: Refused, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
     assert "unknown axis 'tiles'" in refused(
         2, "bench", "ablate", data_bench_ablate, "--axis", "tiles"
@@ -491,6 +449,6 @@ def test_files_are_asked_for_by_data_set(
     ],
 )
 def test_unsuitable_words_are_refused(
-    refused: Callable[..., str], words: list[str], line: str, tmp_path: Path
+    refused: Refused, words: list[str], line: str, tmp_path: Path
 ) -> None:
     assert line in refused(2, "bench", "paper", "-q", "-o", tmp_path / "none", *words)

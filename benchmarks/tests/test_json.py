@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from click.testing import Result
+from command_line import Fhash
 from documented_json import check, parsed
 
 from fhash_bench import engines, train
 from fhash_bench.pictures.results import RenderBench
 from fhash_bench.rate.measuring import Access, Point, RateBench, Speed, TilePrice
-
-Fhash = Callable[..., Result]
 
 
 def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:

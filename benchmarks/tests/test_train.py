@@ -394,7 +394,7 @@ def test_rays_are_straight_and_inside() -> None:
     layers = [
         (np.ones((n, m), np.float32), np.zeros(n, np.float32)) for n, m in architecture.layer_shapes
     ]
-    network = train._network(architecture, layers)
+    network = train._network(architecture, layers, [])
     rays = train._rays(network).reshape(3, -1, train.RAY_POINTS)
     np.testing.assert_allclose(np.diff(rays, n=2, axis=2), 0, atol=1e-12)
     for places in (train._rays(network), train._random(network)):

@@ -21,46 +21,57 @@ AXES = 3
 """Axes of a region: z, y and x."""
 
 
-class NumberType(click.ParamType[int | float]):
-    """A number; whole numbers stay exact beyond the precision of floats."""
+class TextType(click.ParamType[Any]):
+    """Values that users write as a text.
 
-    name = "V"
+    name: what stands for the value in the help. parse: gives the value of a text; its ValueError
+        says what is wrong.
+    """
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int | float:
-        """The number."""
-        for number in (int, float):
-            try:
-                return number(value)
-            except ValueError:
-                continue
-        self.fail(f"{value!r} is not a number", param, ctx)
+    def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
+        self.name, self._parse = name, parse
 
-
-class SliceType(click.ParamType[slice]):
-    """Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive."""
-
-    name = "A:B:S"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> slice:
-        """The slice that a text stands for; `-1` is `slice(-1, None)`, the last."""
-        if isinstance(value, slice):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a text; what is no text, such as a default, stays as it is."""
+        if not isinstance(value, str):
             return value
         try:
-            return parse_slice(str(value))
+            return self._parse(value)
         except ValueError as error:
-            self.fail(
-                f"'{value}' {error}; write an index or a half-open range A:B or A:B:S,"
-                " such as 4, 40:50, 10: or ::2",
-                param,
-                ctx,
-            )
+            self.fail(str(error), param, ctx)
 
 
-class IntervalsType(click.ParamType[tuple[Any, ...]]):
+def _number(text: str) -> int | float:
+    for number in (int, float):
+        try:
+            return number(text)
+        except ValueError:
+            continue
+    raise ValueError(f"{text!r} is not a number")
+
+
+NUMBER = TextType("V", _number)
+"""A number; whole numbers stay exact beyond the precision of floats."""
+
+
+def _slice(text: str) -> slice:
+    try:
+        return parse_slice(text)
+    except ValueError as error:
+        raise ValueError(
+            f"'{text}' {error}; write an index or a half-open range A:B or A:B:S,"
+            " such as 4, 40:50, 10: or ::2"
+        ) from None
+
+
+SLICE = TextType("A:B:S", _slice)
+"""Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive.
+
+`-1` is `slice(-1, None)`, the last.
+"""
+
+
+class IntervalsType(TextType):
     """Intervals along z, y and x, of indices or (`number=float`) of positions.
 
     An end that is left out stands for the end of the domain. Axes that are left out at the end, or
@@ -68,20 +79,18 @@ class IntervalsType(click.ParamType[tuple[Any, ...]]):
     """
 
     def __init__(self, number: type[int] | type[float]) -> None:
+        super().__init__("z0:z1,y0:y1,x0:x1", self._region)
         self.number = number
-        self.name = "z0:z1,y0:y1,x0:x1"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[Any, ...]:
+    def _region(self, text: str) -> tuple[Any, ...]:
         """((z0, z1), (y0, y1), (x0, x1)), None for an end left out."""
-        if isinstance(value, tuple):
-            return value
         try:
-            return self._intervals(str(value))
+            return self._intervals(text)
         except ValueError as error:
             example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
-            self.fail(f"'{value}': {error}; write z0:z1,y0:y1,x0:x1 as in {example}", param, ctx)
+            raise ValueError(
+                f"'{text}': {error}; write z0:z1,y0:y1,x0:x1 as in {example}"
+            ) from None
 
     def _intervals(self, text: str) -> tuple[Any, ...]:
         """The intervals along all axes; raises ValueError with the reason."""
@@ -162,24 +171,18 @@ MAX_BUDGET = 86_400.0
 """Longest budget, in seconds."""
 
 
-class DurationType(click.ParamType[float]):
-    """A time such as 90s, 2m or 1h; a plain number is in seconds."""
+def _duration(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh]?)", text.strip())
+    if match is None:
+        raise ValueError(f"'{text}' is no time; write one such as 90s, 2m or 1h")
+    seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+    if not 1 <= seconds <= MAX_BUDGET:
+        raise ValueError(f"'{text}' is {seconds:g} s; allowed: 1s to 24h")
+    return seconds
 
-    name = "TIME"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """Seconds; refuses what is no time, and one outside of 1 s to 24 h."""
-        if isinstance(value, float):
-            return value
-        match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh]?)", str(value).strip())
-        if match is None:
-            self.fail(f"'{value}' is no time; write one such as 90s, 2m or 1h", param, ctx)
-        seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
-        if not 1 <= seconds <= MAX_BUDGET:
-            self.fail(f"'{value}' is {seconds:g} s; allowed: 1s to 24h", param, ctx)
-        return seconds
+DURATION = TextType("TIME", _duration)
+"""Seconds as a time such as 90s, 2m or 1h, from 1 s to 24 h; a plain number is in seconds."""
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -426,21 +429,18 @@ class NumberByVariable(RealRange):
         return numbers
 
 
-class SelectType(click.ParamType[tuple[str, str]]):
-    """One index along a dimension: `member=2`, `dim3=0`, `lev=850.0`, `member=r1i1p1`."""
+def _selected(text: str) -> tuple[str, str]:
+    name, equals, index = (word.strip() for word in text.rpartition("="))
+    if not (name and equals and index):
+        raise ValueError(f"'{text}' is not NAME=INDEX, such as member=2 or dim3=0")
+    return name, index
 
-    name = "NAME=INDEX"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, str]:
-        """Name and index as texts; the file says what they mean."""
-        if isinstance(value, tuple):
-            return value
-        name, equals, index = (word.strip() for word in str(value).rpartition("="))
-        if not (name and equals and index):
-            self.fail(f"'{value}' is not NAME=INDEX, such as member=2 or dim3=0", param, ctx)
-        return name, index
+SELECT = TextType("NAME=INDEX", _selected)
+"""One index along a dimension: `member=2`, `dim3=0`, `lev=850.0`, `member=r1i1p1`.
+
+Name and index are texts; the file says what they mean.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -532,14 +532,14 @@ series_options = option_group(
     ),
     click.option(
         "--select",
-        type=SelectType(),
+        type=SELECT,
         multiple=True,
         help="Index along a dimension that is not t, z, y or x, such as member=2; dim3=0 where it"
         " has no name. Repeat for several dimensions.",
     ),
     click.option(
         "--missing",
-        type=NumberType(),
+        type=NUMBER,
         multiple=True,
         help="A value that stands for a missing one, such as -9999 or 1e20; repeat for several.",
     ),
@@ -564,7 +564,7 @@ series_options = option_group(
         help="What the file's dimensions are, in its own order; letters left out have length 1.",
     ),
     click.option(
-        "--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2."
+        "--t", "t", type=SLICE, help="Only these steps, half-open as in Python: 40:50, ::2."
     ),
     click.option(
         "--shape",
@@ -636,8 +636,10 @@ def _setting(
     field: dataclasses.Field[Any], hint: Any, *, by_variable: bool = False
 ) -> Callable[[Command], Command]:
     """The click option of one field of EncodeConfig."""
+    from fhash_codec.config import EncodeConfig
+
     limits = field.metadata
-    flag = "--" + (limits["option"] or field.name).replace("_", "-")
+    flag = f"--{EncodeConfig.label(field)}"
     text = limits["help"][0].upper() + limits["help"][1:] + "."
     if hint is bool:
         return click.option(

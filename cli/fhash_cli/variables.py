@@ -103,12 +103,12 @@ def _names(
             raise InputError(f"--var {source.var} has '{twice}' where another name is needed")
         return names
     scalars = [entry for entry in listed if entry.name not in parts]
-    names = encodable(scalars, len(source.select))[0]
+    names = encodable(scalars, len(source.select))
     if parts:
         select = (*source.select, (str(components), "0"))
         again = dataclasses.replace(source, var=None, select=select).list(path)
         vectors = [entry for entry in again if entry.name in parts]
-        names += encodable(vectors, len(select))[0]
+        names += encodable(vectors, len(select))
     if not names:
         raise InputError(f"{path} has no variable that can be encoded; see: fhash info {path}")
     others = [entry.name for entry in listed if entry.name not in names]

@@ -29,7 +29,7 @@ from fhash_codec.header import (
     brief_quality,
     check_name,
     describe_source,
-    source_parts,
+    described_source,
     write_series,
 )
 from fhash_codec.measure.errors import ErrorSums
@@ -302,7 +302,7 @@ class _Job:
         if self.part.number != 1:
             return {}
         whole = describe_source(self.series, self.plan.value_range, self.plan.config)
-        for name, array in source_parts(self.series, self.series.coords, {})[1].items():
+        for name, array in described_source(self.series, self.series.coords, {})[1].items():
             writer.add_whole(f"{WHOLE}{name}", array)
         kept = {SOURCE: whole.get(SOURCE), NOT_STORED: whole["variable"].get(NOT_STORED)}
         return {key: value for key, value in kept.items() if value is not None}

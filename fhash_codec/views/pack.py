@@ -515,7 +515,7 @@ def _all_coded(source: Path) -> tuple[Path, list[str]]:
             f"{source} has no variable that fhash.transform coded in Zarr format 3: "
             f"fhash encode {source}"
         )
-    lost = [name for name in encodable(list_variables(root))[0] if name in coded.keys() - names]
+    lost = [name for name in encodable(list_variables(root)) if name in coded.keys() - names]
     if lost:
         raise InputError(
             f"{source}: variable {lost[0]} is not coded by fhash.transform and would be left out; "

@@ -153,7 +153,7 @@ class DecodedStore(Store):
         data = view.get(key) if is_short else await asyncio.to_thread(view.get, key)
         if data is None:
             return None
-        return (prototype or default_buffer_prototype()).buffer.from_bytes(_part(data, byte_range))
+        return (prototype or default_buffer_prototype()).buffer.from_bytes(_asked(data, byte_range))
 
     async def get_partial_values(
         self,
@@ -220,7 +220,7 @@ class DecodedStore(Store):
         return f"fhash://{self.path}"
 
 
-def _part(data: bytes, byte_range: ByteRequest | None) -> bytes:
+def _asked(data: bytes, byte_range: ByteRequest | None) -> bytes:
     """The bytes that zarr asks for."""
     match byte_range:
         case RangeByteRequest(start, end):

@@ -37,6 +37,7 @@ from fhash_formats.writers.common import (
     Region,
     coordinate_attributes,
     safe_name,
+    unused_name,
     variable_attributes,
 )
 
@@ -69,11 +70,11 @@ def view_chunks(shape: Sequence[int], tile: Sequence[int], itemsize: int) -> Sha
     t = -(-t // parts) if single[0] else max(n for n in range(1, steps + 1) if t % n == 0)
     while itemsize * prod(space) > MOST_BYTES and max(space) > 1:
         axis = space.index(max(space))
-        space[axis] = _part(space[axis], whole=single[1 + axis])
+        space[axis] = _half(space[axis], whole=single[1 + axis])
     return _joined([t, *space], shape, itemsize)
 
 
-def _part(length: int, *, whole: bool) -> int:
+def _half(length: int, *, whole: bool) -> int:
     """A half or a third of a side; the larger half where that does not divide it.
 
     whole: whether one tile is as long as the axis, so that no chunk can reach into another tile.
@@ -141,7 +142,7 @@ class ZarrView:
         scales = []
         used = {"": {LEVELS, DOCUMENT}}
         for key, volume in volumes.items():
-            self.names[key] = _unique(safe_name(volume.name or key), used[""])
+            self.names[key] = unused_name(volume.name or key, used[""])
         self._shown = {LEVELS, DOCUMENT, *self.names.values()}
         for key, volume in volumes.items():
             name = self.names[key]
@@ -396,15 +397,6 @@ def _positions(name: str, values: Any, attributes: Mapping[str, Any]) -> ViewArr
         read=lambda region: values[region],
         holds=lambda region: True,
     )
-
-
-def _unique(name: str, used: set[str]) -> str:
-    """The name, with a number where it is taken; it counts as taken from then on."""
-    unique, number = name, 2
-    while unique in used:
-        unique, number = f"{name}_{number}", number + 1
-    used.add(unique)
-    return unique
 
 
 def _depth_and_group(path: str) -> tuple[int, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash
 from documented_json import DOCUMENT, KEYS, check, fits, parsed
 
 import fhash_codec
@@ -31,7 +30,6 @@ from fhash_codec.selftest.case import Finding
 from fhash_codec.selftest.run import CaseResult, Summary
 from fhash_codec.views.server import Server
 
-Fhash = Callable[..., Result]
 WITHOUT_JSON = {"completion"}
 """Commands whose output is no result."""
 

@@ -6,18 +6,16 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import click
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash
 
 import fhash_codec
 from fhash_cli.main import COMMANDS, program
 
-Fhash = Callable[..., Result]
 MAIN = [sys.executable, "-m", "fhash_cli.main"]
 
 
@@ -61,26 +59,6 @@ def test_without_a_command_help_goes_to_stderr(fhash: Fhash) -> None:
     result = fhash()
     assert (result.exit_code, result.stdout) == (2, "")
     assert "Commands:" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["enode"], "No such command 'enode'"),
-        (["encode"], "Missing argument 'DATA' (see 'fhash encode --help')"),
-        (["encode", "x"], "Missing option '-o'"),
-        (["info", "x", "--jsn"], "No such option"),
-        (["info", "x", "y"], "unexpected extra argument"),
-        (
-            ["bench", "train", "x", "--engines", "slab,fast"],
-            "'fast' is no engine; allowed, separated by commas: fused, native, slab",
-        ),
-    ],
-)
-def test_usage_errors_are_one_line(
-    refused: Callable[..., str], words: list[str], message: str
-) -> None:
-    assert message in refused(2, *words)
 
 
 def test_ctrl_c_is_one_line_and_130(
@@ -186,12 +164,7 @@ def test_a_signal_leaves_nothing_half_written(
             data,
             "-o",
             tmp_path / "out.fhz",
-            "--profile",
-            "paper",
-            "--epochs",
-            "1",
-            "--width",
-            "4",
+            *["--profile", "paper", "--epochs", "1", "--width", "4"],
         ],
         "decode": ["decode", run, "-o", tmp_path / "out.npy"],
     }[command]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from click.testing import Result
+from command_line import Fhash
 
 pytestmark = pytest.mark.filterwarnings("default::fhash_formats.errors.FhashWarning")
-Fhash = Callable[..., Result]
 VALUES = np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5) + 1
 QUICK = ["--max-error", "0.01", "--effort", "1", "-q", "--force"]
 NAMES = ["zeta ", " ", "a/b", "..", "a\nb", "__x", "zarr.json", "y" * 300, "tables", "\u03be", "%d"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -15,21 +15,22 @@ import h5py
 import numpy as np
 import pytest
 import xarray
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
+from command_line import Fhash, Refused
 
 import fhash_codec
 from fhash_cli.commands.encode import command as encode
 from fhash_cli.main import COMMANDS, program
 from fhash_cli.options import (
+    DURATION,
     GROUPS,
+    SLICE,
     BaseCommand,
-    DurationType,
     IntervalsType,
-    SliceType,
     parse_slice,
     written,
 )
-from fhash_cli.selection import region_of_box, steps_of
+from fhash_cli.selection import region_of_box
 from fhash_cli.variables import config_of, configs_of
 from fhash_codec.config import EncodeConfig
 from fhash_formats.errors import InputError, RegionError
@@ -62,7 +63,7 @@ def test_slice_means_what_it_means_in_python(text: str) -> None:
 )
 def test_slice_of_another_form_says_why_and_the_form(text: str, reason: str) -> None:
     with pytest.raises(click.BadParameter, match="half-open range A:B") as refused:
-        SliceType().convert(text, None, None)
+        SLICE.convert(text, None, None)
     assert reason in refused.value.message
 
 
@@ -123,10 +124,7 @@ def test_a_range_is_written_as_it_was_given(text: str) -> None:
 @pytest.mark.parametrize("text", ["soon", "2d", "-3s", "0s", "48h", ""])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is no time|allowed: 1s to 24h"):
-        DurationType().convert(text, None, None)
-
-
-Fhash = Callable[..., Result]
+        DURATION.convert(text, None, None)
 
 
 def commands() -> Iterator[click.Command]:
@@ -217,7 +215,7 @@ def test_no_option_is_in_two_groups() -> None:
     ids=" ".join,
 )
 def test_a_single_value_that_is_given_twice_is_refused(
-    refused: Callable[..., str], words: list[str], option: str
+    refused: Refused, words: list[str], option: str
 ) -> None:
     advice = "a file RUN.fhz holds one variable" if option == "--var" else "give it once"
     assert refused(2, *words).startswith(f"{option} is given more than once; {advice}")
@@ -241,7 +239,7 @@ def test_every_setting_is_an_option_with_its_help_and_default(
     assert option.default == field.default
     assert option.help is not None
     assert option.help.rstrip(".").lower() == field.metadata["help"].lower()
-    flag = "--" + (field.metadata["option"] or field.name).replace("_", "-")
+    flag = f"--{EncodeConfig.label(field)}"
     assert flag in option.opts
     if field.metadata["choices"]:
         assert isinstance(option.type, click.Choice)
@@ -285,22 +283,7 @@ def test_settings_refuse_nan(flag: str) -> None:
     assert result.exit_code == 2
 
 
-def test_an_option_that_counts_once_is_not_repeated(
-    refused: Callable[..., str], data: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "a.fhz"
-    message = refused(2, "encode", data, "-o", out, "--var", "a", "--var", "b")
-    assert message.startswith(
-        "--var is given more than once; a file RUN.fhz holds one variable, so encode each with a"
-        " command of its own"
-    )
-    for option, value in (("--axes", "t,z,y,x"), ("--t", "0"), ("--endian", "big")):
-        assert f"{option} is given more than once; give it once" in refused(
-            2, "encode", data, "-o", out, option, value, option, value
-        )
-
-
-def test_select_and_missing(refused: Callable[..., str], data: Path, tmp_path: Path) -> None:
+def test_select_and_missing(refused: Refused, data: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.fhz"
     for words, text in (
         (["--select", "member"], "'member' is not NAME=INDEX"),
@@ -311,9 +294,7 @@ def test_select_and_missing(refused: Callable[..., str], data: Path, tmp_path: P
         assert text in refused(2, "encode", data, "-o", out, *words)
 
 
-def test_a_fill_value_that_nobody_declared(
-    fhash: Callable[..., Result], refused: Callable[..., str], tmp_path: Path
-) -> None:
+def test_a_fill_value_that_nobody_declared(fhash: Fhash, refused: Refused, tmp_path: Path) -> None:
     values = np.linspace(270, 300, 4 * 5 * 6, dtype=np.float32).reshape(4, 5, 6)
     values[:2, :2] = 1e20
     np.save(tmp_path / "a.npy", values)
@@ -330,21 +311,6 @@ def test_a_fill_value_that_nobody_declared(
     np.testing.assert_allclose(decoded[2:], values[2:], atol=1)
     measured = fhash("diff", tmp_path / "a.npy", tmp_path / "a.fhz", "--missing", "1e20", "--json")
     assert measured.exit_code == 0
-
-
-COORDINATE = Coordinate(name="x", values=np.array([1.0, 2.0, 4.0, 8.0]))
-VOLUME = cast(
-    fhash_codec.Volume,
-    SimpleNamespace(shape=(4, 4, 4, 4), coords=dict.fromkeys("tzyx", COORDINATE)),
-)
-
-
-@pytest.mark.parametrize(
-    ("chosen", "steps"),
-    [(None, [0, 1, 2, 3]), (slice(-1, None), [3]), (slice(1, 4, 2), [1, 3]), (slice(0, 1), [0])],
-)
-def test_steps_are_those_of_a_python_slice(chosen: slice | None, steps: list[float]) -> None:
-    assert steps_of(VOLUME, chosen) == steps
 
 
 @pytest.mark.parametrize(
@@ -506,7 +472,7 @@ def test_decode_writes_all_or_those_that_are_named_into_one_output(
 
 
 def test_decode_refuses_what_one_output_cannot_hold(
-    refused: Callable[..., str], run_variables: Path, tmp_path: Path
+    refused: Refused, run_variables: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "out.npy"
     assert "holds one variable, and there are 2" in refused(2, "decode", run_variables, "-o", path)
@@ -519,11 +485,7 @@ def test_decode_refuses_what_one_output_cannot_hold(
 
 @pytest.mark.parametrize("command", ["render", "diff", "export"])
 def test_a_variable_must_be_named(
-    refused: Callable[..., str],
-    run_variables: Path,
-    data_variables: Path,
-    tmp_path: Path,
-    command: str,
+    refused: Refused, run_variables: Path, data_variables: Path, tmp_path: Path, command: str
 ) -> None:
     words = {
         "diff": [data_variables, run_variables],
@@ -560,9 +522,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_commands(
-    refused: Callable[..., str], data_variables: Path, tmp_path: Path, case: str
-) -> None:
+def test_bad_commands(refused: Refused, data_variables: Path, tmp_path: Path, case: str) -> None:
     words, message = BAD[case]
     output = tmp_path / "run.fhz"
     assert message in refused(2, "encode", data_variables, "-o", output, *SMALL, *words)

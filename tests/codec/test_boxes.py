@@ -22,7 +22,7 @@ from fhash_codec.boxes import (
     coarse_vertices,
     expand_index,
     index_ranges,
-    shared_part,
+    overlap,
     slice_of,
     step_blocks,
 )
@@ -182,11 +182,11 @@ def test_other_indices_are_refused(index: Any) -> None:
 
 def test_the_part_that_a_region_shares_with_a_box() -> None:
     box, region = Box.of([(1, 4), (2, 6), (0, 3)]), Box.of([(0, 2), (3, 9), (1, 2)])
-    assert shared_part(box, region) == (
+    assert overlap(box, region) == (
         Box.of([(1, 2), (0, 3), (0, 1)]),
         Box.of([(0, 1), (1, 4), (1, 2)]),
     )
-    assert shared_part(box, Box.of([(4, 5), (2, 6), (0, 3)])) is None
+    assert overlap(box, Box.of([(4, 5), (2, 6), (0, 3)])) is None
 
 
 @given(low=st.integers(0, 11), length=st.integers(1, 12), lod=st.integers(0, 3))

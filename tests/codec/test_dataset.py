@@ -38,7 +38,7 @@ from fhash_codec.dataset import acquire, release, volumes_of
 from fhash_codec.features.occupancy import morton_index, pack
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.volume import open as open_volume
-from fhash_codec.volume_model import VolumeModel, interpolable, open_model
+from fhash_codec.volume_model import interpolable, open_model
 from fhash_formats.container import Container
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.errors import MissingInputError
@@ -320,11 +320,9 @@ def test_each_profile_has_its_model(named_model) -> None:
     name, model = named_model
     assert isinstance(model, CompactModel if name == "compact" else PaperModel)
     assert tuple(model.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
-    for method, declared in inspect.getmembers(VolumeModel, inspect.isfunction):
-        if not method.startswith("_"):
-            assert len(inspect.signature(getattr(type(model), method)).parameters) == len(
-                inspect.signature(declared).parameters
-            )
+    for method in ("occupied", "read", "read_lod", "sample", "sample_with_gradient"):
+        both = [getattr(kind, method) for kind in (CompactModel, PaperModel)]
+        assert len({len(inspect.signature(each).parameters) for each in both}) == 1
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=str)

@@ -96,7 +96,7 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
         ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
         ({"fold": 2.5}, "fold is 2.5; a whole number"),
         ({"epochs": True}, "epochs is True"),
-        ({"epochs": "many"}, "epochs is many"),
+        ({"epochs": "many"}, "epochs is 'many'"),
         ({"learning_rate": float("nan")}, "learning-rate is nan"),
         ({"psnr": -1.0}, "psnr is -1"),
         ({"features": ()}, "feature is empty"),

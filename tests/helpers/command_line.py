@@ -16,6 +16,7 @@ SMALL = ["--effort", "1", "--quiet"]
 """Settings that make an encoding of the tiny series a matter of milliseconds."""
 
 Fhash = Callable[..., Result]
+Refused = Callable[..., str]
 
 
 def invoke(*words: object) -> Result:
@@ -75,7 +76,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def refused(tmp_path: Path) -> Callable[..., str]:
+def refused(tmp_path: Path) -> Refused:
     """Runs a command line that must fail with an exit code, one line on stderr and no trace.
 
     The line is returned without 'fhash: error: '.

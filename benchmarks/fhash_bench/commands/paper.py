@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_bench.commands import one_of
 from fhash_cli.options import BaseCommand, SourceOptions, json_option, quiet_option, series_options
 from fhash_cli.output import Progress, emit, extent, table
 
@@ -20,20 +21,15 @@ if TYPE_CHECKING:
     from fhash_formats.series import Series
 
 
-class NameType(click.ParamType[str]):
-    """A name of the bench, looked up only when one is given: --help loads nothing."""
+def _names(constant: str) -> Callable[[], tuple[str, ...]]:
+    """The names in a constant of the bench."""
 
-    def __init__(self, name: str, constant: str) -> None:
-        self.name, self._constant = name, constant
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name; refuses one that is unknown."""
+    def names() -> tuple[str, ...]:
         from fhash_bench.paper import data
 
-        allowed = tuple(getattr(data, self._constant))
-        if value not in allowed:
-            self.fail(f"'{value}' is no {self.name}; allowed: {', '.join(allowed)}", param, ctx)
-        return str(value)
+        return tuple(getattr(data, constant))
+
+    return names
 
 
 @click.command("paper", cls=BaseCommand, short_help="the paper's encodings, trained side by side")
@@ -46,14 +42,14 @@ class NameType(click.ParamType[str]):
 )
 @click.option(
     "--scale",
-    type=NameType("scale", "SCALES"),
+    type=one_of("scale", _names("SCALES")),
     metavar="NAME",
     help="Of the scenes: full, half, quarter or eighth of the paper's lengths. Default: full.",
 )
 @click.option(
     "--protocol",
     "protocols",
-    type=NameType("protocol", "PROTOCOLS"),
+    type=one_of("protocol", _names("PROTOCOLS")),
     metavar="NAME",
     multiple=True,
     help="published, released, equal or best; repeat. Default: all.",
@@ -61,7 +57,7 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--data-set",
     "data_sets",
-    type=NameType("data set", "SETS"),
+    type=one_of("data set", _names("SETS")),
     metavar="NAME",
     multiple=True,
     help="flame, bubble or shell; repeat. Default: all.",
@@ -69,7 +65,7 @@ class NameType(click.ParamType[str]):
 @click.option(
     "--encoding",
     "encodings",
-    type=NameType("encoding", "ENCODINGS"),
+    type=one_of("encoding", _names("ENCODINGS")),
     metavar="NAME",
     multiple=True,
     help="dense, dense-multi, hash, tcnn or fhash; repeat. Default: all.",

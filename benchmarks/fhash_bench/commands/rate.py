@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_bench.commands import check_plot, one_of, plot_option, save_plot
 from fhash_cli.options import (
     BaseCommand,
+    Command,
     RealRange,
     SourceOptions,
-    check_writable,
+    TextType,
     force_option,
     json_option,
     quiet_option,
@@ -28,8 +29,6 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 if TYPE_CHECKING:
     from fhash_bench.labels import LabelBench
     from fhash_bench.rate.measuring import RateBench
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 NONE = "none"
 """Name that stands for no peer at all."""
@@ -48,32 +47,24 @@ class Peer:
     path: str = ""
 
 
-class PeerType(click.ParamType[Peer]):
-    """A filter of HDF5 by its name, a program as NAME=PATH, or 'none'.
+def _peer(text: str) -> Peer:
+    from fhash_bench.rate.measuring import PEERS
+    from fhash_bench.rate.peers import PROGRAMS
 
-    Names are looked up only when one is given, so that --help loads nothing.
-    """
+    name, equals, path = text.partition("=")
+    if name in (PROGRAMS if equals else (*PEERS, NONE)):
+        return Peer(name=name, path=path)
+    allowed = f"{', '.join((*PEERS, NONE))}, and as NAME=PATH {', '.join(PROGRAMS)}"
+    raise ValueError(f"'{text}' is no peer; allowed: {allowed}")
 
-    name = "NAME[=PATH]"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Peer:
-        """The peer; refuses a name that is unknown, and a program without a path."""
-        from fhash_bench.rate.measuring import PEERS
-        from fhash_bench.rate.peers import PROGRAMS
-
-        if isinstance(value, Peer):
-            return value
-        name, equals, path = str(value).partition("=")
-        if name in (PROGRAMS if equals else (*PEERS, NONE)):
-            return Peer(name=name, path=path)
-        allowed = f"{', '.join((*PEERS, NONE))}, and as NAME=PATH {', '.join(PROGRAMS)}"
-        self.fail(f"'{value}' is no peer; allowed: {allowed}", param, ctx)
-
+PEER = TextType("NAME[=PATH]", _peer)
+"""A filter of HDF5 by its name, a program as NAME=PATH, or 'none'."""
 
 peer_option = click.option(
     "--peer",
     "peers",
-    type=PeerType(),
+    type=PEER,
     multiple=True,
     help="SZ3, SPERR, ZFP, BitRound, Blosc or none; repeat. Default: all. Besides, as NAME=PATH,"
     " a program: tthresh, qoz, hpez, sz3, or an ffmpeg for hevc, av1 or vvc.",
@@ -138,25 +129,10 @@ def opened(
         yield series
 
 
-class ProfileType(click.ParamType[str]):
-    """A profile, or 'none'.
+def _profiles() -> tuple[str, ...]:
+    from fhash_bench.rate.measuring import PROFILES
 
-    Names are looked up only when one is given, so that --help loads nothing.
-    """
-
-    name = "profile"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name; refuses one that is unknown."""
-        from fhash_codec.config import EncodeConfig
-
-        profiles = next(
-            field for field in dataclasses.fields(EncodeConfig) if field.name == "profile"
-        ).metadata["choices"]
-        allowed = (*profiles, "none")
-        if value not in allowed:
-            self.fail(f"'{value}' is no profile; allowed: {', '.join(allowed)}", param, ctx)
-        return str(value)
+    return (*PROFILES, NONE)
 
 
 @click.command(
@@ -171,7 +147,7 @@ class ProfileType(click.ParamType[str]):
 @click.option(
     "--profile",
     "profiles",
-    type=ProfileType(),
+    type=one_of("profile", _profiles),
     multiple=True,
     help="Of fhash, or none; repeat. Default: all.",
 )
@@ -182,7 +158,7 @@ class ProfileType(click.ParamType[str]):
     help="Measure speed and access too, at the target nearest to 50 dB.",
 )
 @setting_options("effort", "tile", "epochs", "width", "device", "seed")
-@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw bytes against quality.")
+@plot_option("Draw bytes against quality.")
 @force_option
 @json_option
 @quiet_option
@@ -207,16 +183,12 @@ def rate(
     generated:KIND: plateau, noise, labels, smooth, thin, long or short. The other codecs come with
     pip install 'fhash[bench]'; programs are named by their paths.
     """
-    if plot is not None:
-        check_writable(plot, force, sources=[data])
+    check_plot(plot, force, [data])
     with Progress(quiet=quiet) as progress, opened(data, source, progress) as series:
         from fhash_bench.rate.measuring import PROFILES
         from fhash_bench.rate.rate import BOUNDS, TARGETS, bench_rate
         from fhash_bench.rate.rate import plot as draw
-        from fhash_codec.cost.report import require_matplotlib
 
-        if plot is not None:
-            require_matplotlib()
         every = not (targets or bounds)
         result = bench_rate(
             series,
@@ -225,15 +197,11 @@ def rate(
             bounds=BOUNDS if every else bounds,
             names=filters_of(peers),
             named=programs_of(peers),
-            profiles=[name for name in profiles or PROFILES if name != "none"],
+            profiles=[name for name in profiles or PROFILES if name != NONE],
             speed=speed,
             progress=progress,
         )
-    if plot is not None:
-        from fhash_formats.support.files import replacing
-
-        with replacing(Path(plot), force=force) as temporary:
-            draw(result, temporary)
+    save_plot(plot, force, partial(draw, result))
     emit(result.to_dict(), _rate_text(result), as_json)
 
 

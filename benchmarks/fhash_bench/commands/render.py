@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_bench.commands import check_plot, one_of, plot_option, save_plot
 from fhash_cli.options import (
     BaseCommand,
-    check_writable,
     force_option,
     json_option,
     quiet_option,
@@ -22,18 +22,10 @@ if TYPE_CHECKING:
     from fhash_bench.pictures.results import RenderBench, Switch
 
 
-class PartType(click.ParamType[str]):
-    """Name of a part of the bench, looked up only when one is given: --help loads nothing."""
+def _parts() -> tuple[str, ...]:
+    from fhash_bench.pictures.results import PARTS
 
-    name = "part"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name; refuses one that is unknown."""
-        from fhash_bench.pictures.results import PARTS
-
-        if value not in PARTS:
-            self.fail(f"'{value}' is no part; allowed: {', '.join(PARTS)}", param, ctx)
-        return str(value)
+    return PARTS
 
 
 @click.command("render", cls=BaseCommand, short_help="time and quality of pictures, beside VTK")
@@ -48,7 +40,7 @@ class PartType(click.ParamType[str]):
 @click.option(
     "--part",
     "parts",
-    type=PartType(),
+    type=one_of("part", _parts),
     multiple=True,
     help="effects, accelerations, orbit, shell, streams, vtk, exactness, playback or curves;"
     " repeat. Default: all.",
@@ -70,12 +62,7 @@ class PartType(click.ParamType[str]):
     metavar="N",
     help="Runs that each median is of.",
 )
-@click.option(
-    "--plot",
-    metavar="FILE.png",
-    type=click.Path(),
-    help="Draw quality against time, and times beside VTK's.",
-)
+@plot_option("Draw quality against time, and times beside VTK's.")
 @click.option(
     "--ospray",
     metavar="PATH",
@@ -102,19 +89,15 @@ def render(
     Each effect and acceleration is measured on and off; the variants of a comparison run in turns.
     VTK comes with pip install 'fhash[bench]'; without it the comparisons with VTK are left out.
     """
-    if plot is not None:
-        check_writable(plot, force, sources=[run])
+    check_plot(plot, force, [run])
     from fhash_codec.volume import open as open_volume
 
     with open_volume(run) as volume, Progress(quiet=quiet) as progress:
         from fhash_bench.pictures.render import bench_render
         from fhash_bench.pictures.results import PARTS
         from fhash_bench.pictures.results import plot as draw
-        from fhash_codec.cost.report import require_matplotlib
         from fhash_codec.rendering.scenes import Scene
 
-        if plot is not None:
-            require_matplotlib()
         scene = Scene() if scene_file is None else Scene.load(scene_file)
         result = bench_render(
             volume,
@@ -125,11 +108,7 @@ def render(
             ospray=ospray,
             progress=progress,
         )
-    if plot is not None:
-        from fhash_formats.support.files import replacing
-
-        with replacing(Path(plot), force=force) as temporary:
-            draw(result, temporary)
+    save_plot(plot, force, partial(draw, result))
     emit(result.to_dict(), _render_text(result), as_json)
 
 
@@ -155,13 +134,8 @@ def _tables(result: RenderBench) -> Iterator[Rows]:
     yield _switches("effect", result.effects)
     yield _switches("acceleration", result.accelerations, psnr=True)
     yield _switches("orbit", result.orbit)
-    yield _beside(result)
-    yield _streams(result)
-    yield _break_even(result)
-    yield _beside_vtk(result)
-    yield _exactness(result)
-    yield _playback(result)
-    yield _curves(result)
+    for name, heading, row in TABLES:
+        yield [heading, *map(row, getattr(result, name))]
 
 
 def _switches(title: str, switches: Sequence[Switch], *, psnr: bool = False) -> Rows:
@@ -181,137 +155,100 @@ def _switches(title: str, switches: Sequence[Switch], *, psnr: bool = False) -> 
     return rows
 
 
-def _streams(result: RenderBench) -> Rows:
-    """Time, passes and quality of the marchers that evaluate the model itself."""
-    return [
-        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
-        *(
-            (
-                run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
-                _ms(run.milliseconds),
-                f"{run.passes:,}",
-                f"{run.samples:,}",
-                f"{run.evaluations:,}",
-                _decibels(run.psnr),
-                number(run.largest, digits=2),
-            )
-            for run in result.streams
-        ),
-    ]
-
-
-def _break_even(result: RenderBench) -> Rows:
-    """Time of the cache and of adaptive ray marching by the size of the picture."""
-    return [
-        ("pixels", "cache ms", "kept ms", "arm ms", "arm / cache", "arm up to", "auto"),
-        *(
-            (
-                str(pair.size),
-                _ms(pair.first_ms),
-                _ms(pair.kept_ms),
-                _ms(pair.arm_ms),
-                number(pair.ratio, "x", digits=3),
-                "any" if pair.pictures is None else f"{pair.pictures} pictures",
-                pair.auto,
-            )
-            for pair in result.break_even
-        ),
-    ]
-
-
-def _beside(result: RenderBench) -> Rows:
-    """Time and likeness of pictures of a large volume beside those of other renderers."""
-    return [
+TABLES: tuple[tuple[str, tuple[str, ...], Callable[[Any], tuple[str, ...]]], ...] = (
+    (  # pictures of a large volume beside those of other renderers
+        "beside",
         ("beside", "scene", "size", "threads", "ours ms", "peer ms", "peer / ours", "PSNR"),
-        *(
-            (
-                pair.peer,
-                _lit(pair.scene, pair.shaded),
-                str(pair.size),
-                str(pair.threads),
-                _ms(pair.ours_ms),
-                _ms(pair.peer_ms),
-                number(pair.ratio, "x", digits=3),
-                _decibels(pair.psnr),
-            )
-            for pair in result.beside
+        lambda pair: (
+            pair.peer,
+            _lit(pair.scene, pair.shaded),
+            str(pair.size),
+            str(pair.threads),
+            _ms(pair.ours_ms),
+            _ms(pair.peer_ms),
+            number(pair.ratio, "x", digits=3),
+            _decibels(pair.psnr),
         ),
-    ]
-
-
-def _beside_vtk(result: RenderBench) -> Rows:
-    """Time and likeness of pictures beside those of VTK's fixed-point ray caster."""
-    return [
+    ),
+    (  # the marchers that evaluate the model itself
+        "streams",
+        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
+        lambda run: (
+            run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
+            _ms(run.milliseconds),
+            f"{run.passes:,}",
+            f"{run.samples:,}",
+            f"{run.evaluations:,}",
+            _decibels(run.psnr),
+            number(run.largest, digits=2),
+        ),
+    ),
+    (  # the cache and adaptive ray marching by the size of the picture
+        "break_even",
+        ("pixels", "cache ms", "kept ms", "arm ms", "arm / cache", "arm up to", "auto"),
+        lambda pair: (
+            str(pair.size),
+            _ms(pair.first_ms),
+            _ms(pair.kept_ms),
+            _ms(pair.arm_ms),
+            number(pair.ratio, "x", digits=3),
+            "any" if pair.pictures is None else f"{pair.pictures} pictures",
+            pair.auto,
+        ),
+    ),
+    (  # pictures beside those of VTK's fixed-point ray caster
+        "against",
         ("beside VTK", "size", "ours ms", "whole ms", "VTK ms", "VTK / ours", "PSNR", "SSIM"),
-        *(
-            (
-                _lit(pair.scene, pair.shaded),
-                str(pair.size),
-                _ms(pair.ours_ms),
-                _ms(pair.whole_ms),
-                _ms(pair.vtk_ms),
-                number(pair.ratio, "x", digits=3),
-                _decibels(pair.psnr),
-                number(pair.ssim),
-            )
-            for pair in result.against
+        lambda pair: (
+            _lit(pair.scene, pair.shaded),
+            str(pair.size),
+            _ms(pair.ours_ms),
+            _ms(pair.whole_ms),
+            _ms(pair.vtk_ms),
+            number(pair.ratio, "x", digits=3),
+            _decibels(pair.psnr),
+            number(pair.ssim),
         ),
-    ]
-
-
-def _exactness(result: RenderBench) -> Rows:
-    """Likeness of pictures to those of VTK's GPU mapper on software OpenGL."""
-    return [
+    ),
+    (  # likeness to pictures of VTK's GPU mapper on software OpenGL
+        "exactness",
         ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
-        *(
-            (
-                _lit(pair.scene, bool(pair.gradient))
-                + (", central differences" if pair.gradient == "central" else ""),
-                str(pair.size),
-                f"{pair.step:g}",
-                _decibels(pair.psnr),
-                number(pair.ssim),
-                str(pair.largest),
-                _decibels(pair.explained),
-            )
-            for pair in result.exactness
+        lambda pair: (
+            _lit(pair.scene, bool(pair.gradient))
+            + (", central differences" if pair.gradient == "central" else ""),
+            str(pair.size),
+            f"{pair.step:g}",
+            _decibels(pair.psnr),
+            number(pair.ssim),
+            str(pair.largest),
+            _decibels(pair.explained),
         ),
-    ]
-
-
-def _playback(result: RenderBench) -> Rows:
-    """Time of playing all steps, beside VTK."""
-    return [
+    ),
+    (  # all steps played, beside VTK
+        "playback",
         ("playback", "size", "steps", "ours ms", "VTK ms", "ours / VTK"),
-        *(
-            (
-                _lit(run.scene, run.shaded),
-                str(run.size),
-                str(run.steps),
-                _ms(run.ours_ms),
-                _ms(run.vtk_ms),
-                number(run.ratio, "x", digits=3),
-            )
-            for run in result.playback
+        lambda run: (
+            _lit(run.scene, run.shaded),
+            str(run.size),
+            str(run.steps),
+            _ms(run.ours_ms),
+            _ms(run.vtk_ms),
+            number(run.ratio, "x", digits=3),
         ),
-    ]
-
-
-def _curves(result: RenderBench) -> Rows:
-    """Quality against time for each knob: step length, threshold, level of detail."""
-    return [
+    ),
+    (  # quality against time for each knob: step length, threshold, level of detail
+        "curves",
         ("knob", "value", "ms", "samples", "PSNR"),
-        *(
-            (
-                point.knob,
-                f"{point.value:.4g}",
-                _ms(point.milliseconds),
-                f"{point.samples:,}",
-                _decibels(point.psnr),
-            )
-            for point in result.curves
+        lambda point: (
+            point.knob,
+            f"{point.value:.4g}",
+            _ms(point.milliseconds),
+            f"{point.samples:,}",
+            _decibels(point.psnr),
         ),
-    ]
+    ),
+)
+"""Tables of single measurements: field of the result, heading, and row of a measurement."""
 
 
 def _ms(value: float) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_bench.commands import check_plot, plot_option, save_plot
 from fhash_cli.options import (
     BaseCommand,
     RealRange,
     SourceOptions,
-    check_writable,
+    TextType,
     config_options,
     force_option,
     json_option,
@@ -28,48 +29,38 @@ if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
 
 
-class EnginesType(click.ParamType[tuple[str, ...]]):
-    """Names of engines, separated by commas."""
+def _engines_named(text: str) -> tuple[str, ...]:
+    from fhash_codec.config import ENGINES
 
-    name = "A,B"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """The names; refuses one that is unknown."""
-        from fhash_codec.config import ENGINES
-
-        names = tuple(name.strip() for name in str(value).split(","))
-        for name in names:
-            if name not in ENGINES:
-                self.fail(
-                    f"'{name}' is no engine; allowed, separated by commas: {', '.join(ENGINES)}",
-                    param,
-                    ctx,
-                )
-        return names
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in ENGINES:
+            raise ValueError(
+                f"'{name}' is no engine; allowed, separated by commas: {', '.join(ENGINES)}"
+            )
+    return names
 
 
-class BricksType(click.ParamType[tuple[int, ...]]):
-    """Numbers of bricks, separated by commas."""
+ENGINES = TextType("A,B", _engines_named)
+"""Names of engines, separated by commas."""
 
-    name = "N,M"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        """The numbers; refuses what is no positive whole number."""
-        words = [word.strip() for word in str(value).split(",")]
-        for word in words:
-            if not (word.isascii() and word.isdigit() and int(word) > 0):
-                self.fail(f"'{word}' is no number of bricks; such as 64,256", param, ctx)
-        return tuple(int(word) for word in words)
+def _numbers_of_bricks(text: str) -> tuple[int, ...]:
+    words = [word.strip() for word in text.split(",")]
+    for word in words:
+        if not (word.isascii() and word.isdigit() and int(word) > 0):
+            raise ValueError(f"'{word}' is no number of bricks; such as 64,256")
+    return tuple(map(int, words))
+
+
+BRICKS = TextType("N,M", _numbers_of_bricks)
+"""Numbers of bricks, separated by commas."""
 
 
 @click.command("train", cls=BaseCommand, short_help="training and inference speed of each engine")
 @click.argument("data", type=click.Path(), required=False)
 @series_options
-@click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
+@click.option("--engines", type=ENGINES, help="Which to measure. Default: all there are.")
 @click.option(
     "--seconds",
     type=RealRange(0.1, 3600),
@@ -81,7 +72,7 @@ class BricksType(click.ParamType[tuple[int, ...]]):
 @click.option(
     "--bricks-per-step",
     "bricks",
-    type=BricksType(),
+    type=BRICKS,
     help="Bricks of a training step, each measured, such as 64,256; without it, --batch.",
 )
 @click.option(
@@ -102,7 +93,7 @@ class BricksType(click.ParamType[tuple[int, ...]]):
     "seed",
     profile="paper",
 )
-@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw PSNR over seconds.")
+@plot_option("Draw PSNR over seconds.")
 @force_option
 @json_option
 @quiet_option
@@ -132,14 +123,11 @@ def train(
     from fhash_codec.devices import need_torch
 
     need_torch("bench train")
-    if plot is not None:
-        from fhash_codec.cost.report import require_matplotlib
-
-        require_matplotlib()
-        check_writable(plot, force, sources=[] if data is None else [data])
+    check_plot(plot, force, [data])
     with Progress(quiet=quiet) as progress, ExitStack() as stack:
         from fhash_bench.rate.generated import is_made
         from fhash_bench.train import bench_train
+        from fhash_bench.train import plot as draw
 
         if data is None or is_made(data):
             source.refuse_without_data()
@@ -155,12 +143,7 @@ def train(
             whole=whole,
             progress=progress,
         )
-    if plot is not None:
-        from fhash_bench.train import plot as draw
-        from fhash_formats.support.files import replacing
-
-        with replacing(Path(plot), force=force) as temporary:
-            draw(result, temporary)
+    save_plot(plot, force, partial(draw, result))
     emit(result, _train_text(result), as_json)
 
 
@@ -272,7 +255,7 @@ def _points(points: list[dict[str, Any]]) -> str:
     type=click.Path(),
     help="Keep a JSON file for each finished encoding; the same command goes on from there.",
 )
-@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw a panel for each axis.")
+@plot_option("Draw a panel for each axis.")
 @force_option
 @json_option
 @quiet_option
@@ -299,16 +282,13 @@ def ablate(
 
     if any(axis.profile == "paper" for axis in axes_named(names)):
         need_torch("bench ablate")
-    if plot is not None:
-        from fhash_codec.cost.report import require_matplotlib
-
-        require_matplotlib()
-        check_writable(plot, force, sources=[] if data is None else [data])
+    check_plot(plot, force, [data])
     if data is None:
         source.refuse_without_data()
     folder = None if output is None else make_folder(output)
     with Progress(quiet=quiet) as progress:
         from fhash_bench.ablate import bench_ablate
+        from fhash_bench.ablate import plot as draw
 
         series = None if data is None else source.open(data, progress)
         result = bench_ablate(
@@ -320,12 +300,7 @@ def ablate(
             folder=folder,
             progress=progress,
         )
-    if plot is not None:
-        from fhash_bench.ablate import plot as draw
-        from fhash_formats.support.files import replacing
-
-        with replacing(Path(plot), force=force) as temporary:
-            draw(result, temporary)
+    save_plot(plot, force, partial(draw, result))
     emit(result.to_dict(), _ablate_text(result), as_json)
 
 
@@ -364,11 +339,11 @@ def _ablate_text(result: AblateBench) -> str:
 
 def _cells(row: Row, reference: bool) -> tuple[str, ...]:
     """A row of the table."""
-    from fhash_bench.ablate import told
+    from fhash_bench.ablate import as_options
 
     spread = "" if row.psnr_spread is None else f" (spread {row.psnr_spread:.1f})"
     return (
-        told(row.settings) + (" *" if reference else ""),
+        as_options(row.settings) + (" *" if reference else ""),
         ("exact" if row.psnr is None else number(row.psnr)) + spread,
         "" if row.psnr_gain is None else f"{row.psnr_gain:+.1f}",
         number(row.psnr_domain),

@@ -6,13 +6,15 @@ import datetime
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from fhash_bench.paper.cells import Cell, Request, load, save
+from fhash_bench.kept import load, save
+from fhash_bench.paper.cells import Cell, Request
 from fhash_bench.paper.data import (
     CANDIDATES,
     ENCODINGS,
@@ -33,11 +35,8 @@ from fhash_bench.paper.measures import (
     DECIBELS,
     PICTURE_SIZE,
     VIEWS,
-    Frames,
-    PictureMeasure,
     PictureProbe,
     Places,
-    Trained,
     first_seconds,
     measure_between,
     measure_latency,
@@ -203,7 +202,7 @@ def bench_paper(
         encodings.remove("tcnn")
         notes.append(f"not measured: {reason}")
     requests = list(requests_of(plan, encodings, source, name))
-    finished = [load(folder, request) for request in requests]
+    finished = [load(folder / request.filename, Cell.from_dict) for request in requests]
     device, cells = choose_device(plan.device), []
     held: _Held | None = None
     for number, request in enumerate(requests):
@@ -218,7 +217,7 @@ def bench_paper(
                 progress("cells", number, len(requests), text.rstrip())  # noqa: B023
 
             cell = _run(request, held, device, told)
-            save(folder, request, cell)
+            save(folder / request.filename, cell.to_dict())
         cells.append(cell)
         progress("cells", number + 1, len(requests), str(request))
     return PaperBench(cells=tuple(cells), notes=tuple(notes))
@@ -286,7 +285,8 @@ def _run(request: Request, held: _Held, device: torch.device, progress: Progress
             device=device,
         )
 
-    pictures = _pictures(held, arranged)
+    # Vertices without training show nothing.
+    pictures = partial(held.probe.measure, masks=None if arranged.whole else data.masks)
     progress("warming up", 0, 1, "")
     warm = make(max(arranged.steps))
     threads_of = max(1, warm.samples_an_epoch // len(warm.parts) // max(arranged.steps))
@@ -335,7 +335,7 @@ def _best_steps(
     device: torch.device,
     progress: Progress,
 ) -> tuple[int, list[dict[str, Any]]]:
-    """Return the best of the candidates for the steps in an epoch, and what each led to.
+    """Return the best of the candidates for the steps in an epoch, and `Cell.trial`.
 
     Each is trained to the end. A single candidate is taken without a training.
     """
@@ -348,32 +348,18 @@ def _best_steps(
         if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
             continue
         course = train(encoding, data, epochs, device=device, progress=progress)
-        trial.append(_tried(encoding, course))
+        trial.append(
+            {
+                "steps": encoding.steps_an_epoch,
+                "seconds": course.seconds,
+                "psnr": course.curve[-1].coreset_psnr,
+                "reached": {f"{d:g}": first_seconds(course.curve, d) for d in DECIBELS},
+            }
+        )
         ranked = rank(course.curve), candidate
         best = ranked if best is None else max(best, ranked)
     assert best is not None
     return best[1], trial
-
-
-def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
-    """Return the result of a number of steps, as `Cell.trial` lists it."""
-    return {
-        "steps": encoding.steps_an_epoch,
-        "seconds": course.seconds,
-        "psnr": course.curve[-1].coreset_psnr,
-        "reached": {f"{d:g}": first_seconds(course.curve, d) for d in DECIBELS},
-    }
-
-
-def _pictures(held: _Held, arranged: Arrangement) -> PictureMeasure:
-    """Return a function that compares pictures; vertices without training show nothing."""
-    masks = None if arranged.whole else held.data.masks
-
-    def measure(frames: Frames) -> tuple[float, float]:
-        psnr, ssim = held.probe.measure(frames, masks)
-        return psnr, ssim
-
-    return measure
 
 
 def _latency(

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Self
 
+from fhash_bench.kept import file_name, of_fields
 from fhash_bench.paper.data import PROTOCOLS
 from fhash_bench.paper.printed import ENCODINGS, FEATURES, SETS, Spread
-from fhash_formats.errors import InputError
-from fhash_formats.support.files import replacing
 
 CELL_VERSION = 2
 """Version of the cells and of what they measure; a cell of another version is run again."""
@@ -116,20 +111,15 @@ class Cell:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """The cell of what `to_dict` gave; raises InputError for missing or unknown fields."""
-        needed = {entry.name for entry in dataclasses.fields(cls)}
-        if values.keys() != needed:
-            raise InputError(
-                f"a cell has the fields {', '.join(sorted(values))};"
-                f" needed: {', '.join(sorted(needed))}"
-            )
-        tuples = {
-            "shape": tuple(values["shape"]),
-            "key_frames": tuple(values["key_frames"]),
-            "box": tuple(tuple(span) for span in values["box"]),
-            "curve": tuple(Point(**point) for point in values["curve"]),
-            "trial": tuple(values["trial"]),
+        made = of_fields(cls, values)
+        tuples: dict[str, Any] = {
+            "shape": tuple(made.shape),
+            "key_frames": tuple(made.key_frames),
+            "box": tuple(map(tuple, made.box)),
+            "curve": tuple(of_fields(Point, point) for point in values["curve"]),
+            "trial": tuple(made.trial),
         }
-        return cls(**{**values, **tuples})
+        return dataclasses.replace(made, **tuples)
 
     def reached(self, decibels: float, figure: str = "coreset_psnr") -> Point | None:
         """The first point whose figure is at least `decibels`; None where none is (NR)."""
@@ -138,12 +128,6 @@ class Cell:
             if value is not None and value >= decibels:
                 return point
         return None
-
-
-def settings_id(settings: Mapping[str, Any]) -> str:
-    """Eight hexadecimal digits of a hash of settings, by which their cell is found again."""
-    text = json.dumps({**settings, "version": CELL_VERSION}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,41 +150,10 @@ class Request:
     def filename(self) -> str:
         """Name of the cell's file; another setting has another name."""
         words = (self.data_set, self.feature, self.protocol, self.encoding, f"seed{self.seed}")
-        plain = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", word) for word in words)
-        return f"{plain[:120]}_{settings_id(dict(self.settings) | {'words': words})}.json"
+        return file_name(words, self.settings, CELL_VERSION)
 
     def __str__(self) -> str:
         return f"{self.data_set} {self.feature} {self.protocol} {self.encoding} {self.seed}"
-
-
-def load(folder: Path, request: Request) -> Cell | None:
-    """Return a finished cell; None where there is none, or one that cannot be read."""
-    return _read(folder / request.filename)
-
-
-def save(folder: Path, request: Request, cell: Cell) -> None:
-    """Write a cell into a folder, which is made if it is missing.
-
-    The file is complete or absent. Raises OutputError where it cannot be written.
-    """
-    text = json.dumps(cell.to_dict(), indent=1, allow_nan=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / request.filename, force=True) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def load_all(folder: Path) -> list[Cell]:
-    """Return every cell in a folder, by file name; files that hold none are left out."""
-    cells = [_read(path) for path in sorted(folder.glob("*.json"))]
-    return [cell for cell in cells if cell is not None]
-
-
-def _read(path: Path) -> Cell | None:
-    """Return the cell in a file; None where the file holds none."""
-    try:
-        return Cell.from_dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
-        return None
 
 
 @dataclass(frozen=True)
@@ -261,6 +214,14 @@ def groups(cells: Iterable[Cell]) -> list[Group]:
         Group(*key, tuple(sorted(found[key], key=lambda cell: cell.seed)))
         for key in sorted(found, key=rank)
     ]
+
+
+def by_protocol(grouped: Iterable[Group]) -> dict[str, list[Group]]:
+    """Groups by protocol, in their order."""
+    found: dict[str, list[Group]] = {}
+    for group in grouped:
+        found.setdefault(group.protocol, []).append(group)
+    return found
 
 
 def of_protocol(grouped: Sequence[Group], protocol: str) -> list[Group]:

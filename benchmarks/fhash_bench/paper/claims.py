@@ -9,7 +9,7 @@ from itertools import product
 from statistics import median
 from typing import Any
 
-from fhash_bench.paper.cells import Cell, Group, by_data, groups, of_protocol
+from fhash_bench.paper.cells import Cell, Group, by_data, by_protocol, groups, of_protocol
 from fhash_bench.paper.data import SETS, paper_parameters
 from fhash_bench.paper.files import TARGET, FileResult
 from fhash_bench.paper.printed import DECIBELS, PaperTable
@@ -164,13 +164,7 @@ def super_resolution(protocol: str, data: Sequence[Encodings]) -> Answer:
 
     Where the fringe was not trained, the other vertices decide.
     """
-    found = [
-        cell.between
-        for encodings in data
-        if "fhash" in encodings
-        for cell in encodings["fhash"].cells
-        if cell.between
-    ]
+    found = _between(group for encodings in data for group in encodings.values())
 
     def ahead(part: str, linear: str) -> list[float]:
         pairs = [(one[part], one[linear]) for one in found]
@@ -259,10 +253,9 @@ def answers(cells: Sequence[Cell], files: Sequence[FileResult] = ()) -> list[Ans
         files: sizes of files at a quality, for the claim about other codecs.
     """
     grouped = groups(cells)
-    protocols = list(dict.fromkeys(group.protocol for group in grouped))
     found: list[Answer] = []
     for about in (convergence, accuracy, collisions, super_resolution):
-        for protocol in protocols:
+        for protocol in by_protocol(grouped):
             if about is not collisions or protocol != "released":
                 mine = of_protocol(grouped, protocol)
                 found.append(about(protocol, [encodings for _, encodings in by_data(mine)]))
@@ -363,10 +356,9 @@ def _adaptive(grouped: Iterable[Group]) -> Answer:
 def _latency(grouped: Sequence[Group]) -> Answer:
     """Whether F-Hash is the fastest to render, with the occupancy granted to all."""
     ratios: dict[str, list[float]] = {"off": [], "on": [], "as printed": []}
-    for protocol in dict.fromkeys(group.protocol for group in grouped):
-        mine = [group for group in grouped if group.protocol == protocol]
+    for mine in by_protocol(grouped).values():
         for _, encodings in by_data(mine):
-            own = _measured([encodings[key] for key in encodings if key == "fhash"], "fhash")
+            own = _measured(encodings.values(), "fhash")
             others = _measured([encodings[key] for key in encodings if key != "fhash"], None)
             if not own or not others:
                 continue

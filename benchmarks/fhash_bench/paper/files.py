@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import fhash_codec
-from fhash_bench.paper.cells import Cell, settings_id
+from fhash_bench.kept import load, of_fields, save, settings_id
+from fhash_bench.paper.cells import CELL_VERSION, Cell
 from fhash_bench.paper.printed import (
     ENCODINGS,
     FEATURES,
@@ -28,9 +28,8 @@ from fhash_bench.rate.rate import bench_rate
 from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError, MissingDependencyError, QualityError
+from fhash_formats.errors import MissingDependencyError, QualityError
 from fhash_formats.series import Series
-from fhash_formats.support.files import replacing
 
 TARGET = 45.0
 """PSNR in dB over all steps that a file must have (paper, Table 5)."""
@@ -82,17 +81,6 @@ class FileResult:
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
         return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The result of what `to_dict` gave; raises InputError for missing or unknown fields."""
-        needed = {entry.name for entry in fields(cls)}
-        if values.keys() != needed:
-            raise InputError(
-                f"a file's result has the fields {', '.join(sorted(values))};"
-                f" needed: {', '.join(sorted(needed))}"
-            )
-        return cls(**values)
 
 
 def measure_files(
@@ -306,7 +294,7 @@ def files_of(
             continue
         feature = cell.settings.get("feature_resolved", kind)
         path = folder / _filename(cell, feature, number_types)
-        kept = _load(path)
+        kept = load(path, _results_of)
         if kept is None:
             found, missing = measure_files(
                 data_set,
@@ -316,7 +304,7 @@ def files_of(
                 number_types=number_types,
                 progress=progress,
             )
-            _save(path, found, missing)
+            save(path, {"files": [each.to_dict() for each in found], "refused": list(missing)})
             kept = found, missing
         results += kept[0]
         refused += kept[1]
@@ -336,22 +324,11 @@ def _filename(cell: Cell, feature: str, number_types: Sequence[str]) -> str:
         "number_types": list(number_types),
     }
     words = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{cell.data_set}_{cell.feature}")
-    return f"files_{words[:100]}_{settings_id(settings)}.json"
+    return f"files_{words[:100]}_{settings_id(settings, CELL_VERSION)}.json"
 
 
-def _load(path: Path) -> tuple[list[FileResult], list[str]] | None:
-    """Results that were kept; None where there are none, or where a codec was missing then."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if values["refused"]:
-            return None
-        return [FileResult.from_dict(each) for each in values["files"]], []
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
-        return None
-
-
-def _save(path: Path, results: Sequence[FileResult], refused: Sequence[str]) -> None:
-    """Keep results; their file is complete or absent."""
-    values = {"files": [each.to_dict() for each in results], "refused": list(refused)}
-    with replacing(path, force=True) as temporary:
-        temporary.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+def _results_of(values: Mapping[str, Any]) -> tuple[list[FileResult], list[str]]:
+    """Results that were kept; raises ValueError where a codec was missing then."""
+    if values["refused"]:
+        raise ValueError("a codec was missing")
+    return [of_fields(FileResult, each) for each in values["files"]], []

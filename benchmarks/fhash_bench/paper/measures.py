@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from fhash_bench.engines import wait
 from fhash_bench.paper.cells import Point
 from fhash_bench.paper.data import Data
-from fhash_bench.paper.encodings import Encoding
 from fhash_codec.cost.uses import black, picture_psnr, picture_ssim
 from fhash_codec.devices import choose_device
 from fhash_codec.features.features import Interval, Isosurface, Segmentation, parse_feature
@@ -74,7 +74,7 @@ def measured_epochs(epochs: int) -> list[int]:
 
 
 def train(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     data: Data,
     epochs: int,
     *,
@@ -129,14 +129,8 @@ def first_seconds(curve: Sequence[Point], decibels: float) -> float | None:
     )
 
 
-def wait(device: torch.device) -> None:
-    """Wait until a GPU has finished; a CPU always has."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-
-
 def _point(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     data: Data,
     epoch: int,
     seconds: float,
@@ -204,23 +198,19 @@ class Places:
 
 def places_of(data: Data) -> list[Places]:
     """Return places of every step; it reads the whole series once."""
-    return list(_places(data))
-
-
-def _places(data: Data) -> Iterator[Places]:
-    """Yield the places of one step after the other."""
+    found = []
     times = time_axis(data.series.coords["t"].values)
-    keys = np.interp(times, *_ascending(times[list(data.key_frames)]))
+    key_times = times[list(data.key_frames)]
+    order = np.argsort(key_times)
+    keys = np.interp(times, key_times[order], order.astype(np.float64))
     around = [(int(np.floor(key)), int(np.ceil(key))) for key in keys]
     # All steps give the same share of their vertices, so that no step counts for more than it has.
     vertices = sum(int((data.masks[low] | data.masks[high]).sum()) for low, high in around)
     taken = min(1.0, MAX_PLACES / max(vertices, 1))
     random = np.random.default_rng(0)
     for step, (key, (before, after)) in enumerate(zip(keys, around, strict=True)):
-        mask, fringe = (
-            data.masks[before] | data.masks[after],
-            data.masks[before] ^ data.masks[after],
-        )
+        masks = data.masks[before], data.masks[after]
+        mask, fringe = np.bitwise_or(*masks), np.bitwise_xor(*masks)
         flat = np.flatnonzero(mask)
         if taken < 1:
             flat = np.sort(random.choice(flat, math.ceil(taken * len(flat)), replace=False))
@@ -230,40 +220,28 @@ def _places(data: Data) -> Iterator[Places]:
         low, high = (data.frames[number].reshape(-1)[flat] for number in (before, after))
         linear = low + np.float32(key - before) * (high - low)
         finite = np.isfinite(truth) & np.isfinite(linear)
-        yield Places(
-            key=float(key),
-            between=step not in data.key_frames,
-            vertices=np.stack(np.unravel_index(flat[finite], mask.shape), axis=1),
-            truth=truth[finite],
-            linear=linear[finite],
-            fringe=fringe.reshape(-1)[flat[finite]],
-            selected=int(np.count_nonzero(feature)),
-            missed=int(np.count_nonzero(feature & ~mask)),
+        found.append(
+            Places(
+                key=float(key),
+                between=step not in data.key_frames,
+                vertices=np.stack(np.unravel_index(flat[finite], mask.shape), axis=1),
+                truth=truth[finite],
+                linear=linear[finite],
+                fringe=fringe.reshape(-1)[flat[finite]],
+                selected=int(np.count_nonzero(feature)),
+                missed=int(np.count_nonzero(feature & ~mask)),
+            )
         )
-
-
-def _ascending(
-    times: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return key times in ascending order, for np.interp, and their numbers."""
-    order = np.argsort(times)
-    return times[order], order.astype(np.float64)
+    return found
 
 
 def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str, float | None]:
     """Return the figures of all steps, as a `Cell` has them: PSNR in dB, and shares."""
-    import torch
-
     errors: dict[str, list[npt.NDArray[np.float64]]] = {
-        "psnr": [],
-        "psnr_key_frames": [],
-        "psnr_between": [],
-        "psnr_linear": [],
-        "psnr_inner": [],
-        "psnr_inner_linear": [],
-        "psnr_fringe": [],
-        "psnr_fringe_linear": [],
-    }
+        f"psnr{name}": []
+        for name in ("", "_key_frames", "_between", "_linear", "_inner", "_inner_linear",
+                     "_fringe", "_fringe_linear")
+    }  # fmt: skip
     for step in places:
         decoded = encoding.sample(step.key, torch.from_numpy(step.vertices)).cpu().numpy()
         error = decoded.astype(np.float64) - step.truth
@@ -274,10 +252,9 @@ def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str
         linear = step.linear.astype(np.float64) - step.truth
         errors["psnr_between"].append(error)
         errors["psnr_linear"].append(linear)
-        errors["psnr_inner"].append(error[~step.fringe])
-        errors["psnr_inner_linear"].append(linear[~step.fringe])
-        errors["psnr_fringe"].append(error[step.fringe])
-        errors["psnr_fringe_linear"].append(linear[step.fringe])
+        for name, where in (("inner", ~step.fringe), ("fringe", step.fringe)):
+            errors[f"psnr_{name}"].append(error[where])
+            errors[f"psnr_{name}_linear"].append(linear[where])
     between = [step for step in places if step.between]
     return {
         **{name: _psnr(parts) for name, parts in errors.items()},
@@ -497,7 +474,7 @@ class EncodingField(CoresetField):
     """
 
     def __init__(
-        self, encoding: Encoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
+        self, encoding: TrainedEncoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
     ) -> None:
         """Prepare a field.
 
@@ -549,14 +526,13 @@ class EncodingField(CoresetField):
 
 
 def measure_latency(
-    encoding: Encoding,
+    encoding: TrainedEncoding,
     masks: Sequence[Mask],
     feature: str,
     *,
     value_range: Range = (0.0, 1.0),
     size: int = LATENCY_SIZE,
     views: int = VIEWS,
-    seed: int = 0,
     device: str = "cpu",
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -568,7 +544,6 @@ def measure_latency(
         feature, value_range: as for `PictureProbe`.
         size: pixels along both sides.
         views: random views; they go through the key frames in turn.
-        seed: of the views.
         device: of the encoding, cpu or cuda.
         progress: is told about each picture.
 
@@ -578,7 +553,7 @@ def measure_latency(
         "arm_passes", "samples" (streaming), "arm_samples" and "evaluations" (streaming).
     """
     arrays = TorchArrays(choose_device(device))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cameras = [
         Camera(azimuth=float(rng.uniform(0, 360)), elevation=float(rng.uniform(-60, 60)))
         for _ in range(views)

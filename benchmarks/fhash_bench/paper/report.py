@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from fhash_bench.paper.cells import Cell, Group, by_data, groups, of_protocol, within
+from fhash_bench.paper.cells import Cell, Group, by_data, by_protocol, groups, of_protocol, within
 from fhash_bench.paper.claims import claims_table
 from fhash_bench.paper.data import paper_parameters
 from fhash_bench.paper.files import FileResult, files_table
@@ -53,8 +53,7 @@ def paper_tables(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
     """Tables 1, and 3 to 6 of all protocols that the cells are of, and what each training was."""
     grouped = groups(cells)
     tables = [_trainings(grouped), _folds(), _configurations()]
-    for protocol in dict.fromkeys(group.protocol for group in grouped):
-        mine = [group for group in grouped if group.protocol == protocol]
+    for protocol, mine in by_protocol(grouped).items():
         beside = of_protocol(grouped, protocol)
         tables += [_convergence(protocol, beside, quality) for quality in QUALITIES]
         tables += [_accuracy(protocol, beside), _ratios(protocol, mine)]
@@ -367,9 +366,7 @@ def plot_convergence(cells: Sequence[Cell], folder: Path) -> list[Path]:
     """
     require_matplotlib()
     written = []
-    grouped = groups(cells)
-    for protocol in dict.fromkeys(group.protocol for group in grouped):
-        mine = [group for group in grouped if group.protocol == protocol]
+    for protocol, mine in by_protocol(groups(cells)).items():
         for (name, feature), encodings in by_data(mine):
             words = "-".join((name, feature, protocol))
             path = folder / f"convergence-{re.sub(r'[^A-Za-z0-9.-]+', '_', words)}.png"

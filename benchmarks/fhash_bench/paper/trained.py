@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from fhash_bench.paper.data import (
+    EMBEDDING_SIZE,
     RATE,
     SETS,
     USUAL_COARSEST,
+    WIDTH,
     Arrangement,
     Data,
     dense_levels,
@@ -27,9 +29,7 @@ from fhash_bench.paper.data import (
     tcnn_tables,
 )
 from fhash_bench.paper.encodings import (
-    EMBEDDING_SIZE,
     HIDDEN_LAYERS,
-    WIDTH,
     GatherModel,
     GridLevel,
     HashLevel,
@@ -177,38 +177,8 @@ class TcnnModel:
         return torch.cat([self._network(part) for part in torch.split(points, CHUNK)])
 
 
-class Model(Protocol):
-    """Tables and one network, for one or all key frames."""
-
-    @property
-    def tables(self) -> int:
-        """Trained numbers of the tables."""
-
-    @property
-    def mlp(self) -> int:
-        """Trained numbers of the network."""
-
-    @property
-    def embeddings(self) -> int:
-        """Embeddings of all levels."""
-
-    def train(self, chosen: npt.NDArray[np.int64]) -> None:
-        """Do one step of Adam on the mean squared error of some bricks of the coreset."""
-
-    def settle(self) -> None:
-        """Finish work that training put off."""
-
-    def infer(self, samples: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-        """Values (n,) at the samples of successive whole bricks, by their ascending numbers."""
-
-    def sample(self, points: Tensor) -> Tensor:
-        """Values (n,) at points (n, 4) of the box, (key, z, y, x); keys count the model's own."""
-
-    def moved(self) -> int:
-        """Embeddings that a gradient ever moved."""
-
-    def arrays(self) -> list[npt.NDArray[np.float32]]:
-        """The trained numbers; embeddings that no gradient moved are 0."""
+Model = GatherModel | LatticeModel | TcnnModel
+"""Tables and one network, for one or all key frames."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +199,10 @@ class Part:
 
 
 class TrainedEncoding:
-    """An `Encoding` made of parts that together hold every key frame once."""
+    """All key frames of one series in training: one model, or one for each key frame.
+
+    A place is (z, y, x) in vertices of the domain. A key is the number of a key frame, from 0 on.
+    """
 
     def __init__(
         self,
@@ -289,13 +262,16 @@ class TrainedEncoding:
         return max(part.plan.batches for part in self.parts)
 
     def train_epoch(self, epoch: int) -> None:
-        """Train every model on all of its samples once; epochs count from 0."""
+        """Train every model on all of its samples once; epochs count from 0.
+
+        On a GPU the work may still run when this returns.
+        """
         for part in self.parts:
             for chosen in part.plan.order(epoch):
                 part.model.train(chosen)
 
     def settle(self) -> None:
-        """Finish work that training put off."""
+        """Finish work that training put off: evaluation is then faster until the next epoch."""
         for part in self.parts:
             part.model.settle()
 
@@ -339,7 +315,7 @@ class TrainedEncoding:
         return torch.where(inside, self._low + self._span * values, self.data.background)
 
     def arrays(self) -> list[npt.NDArray[np.float32]]:
-        """The trained numbers of all models."""
+        """The trained numbers of all models; embeddings that no gradient moved are 0."""
         return [array for part in self.parts for array in part.model.arrays()]
 
 
@@ -386,7 +362,7 @@ def build(
         part_seed = seed * len(keys) + part_keys[0]
         plan = _plan(coreset, steps, epochs, part_seed, arranged.schedule)
         before = parts[-1].model if parts else None
-        model = _model(name, data, arranged, coreset, plan, part_seed, device, before)
+        model = _model(name, data, arranged, coreset, plan, device, before)
         parts.append(Part(part_keys, coreset, plan, model))
     levels = levels_of(name, data, samples, arranged) if name == "hash" else []
     hashed = [level for level in levels if isinstance(level, HashLevel)]
@@ -439,7 +415,6 @@ def _model(
     arranged: Arrangement,
     coreset: Coreset,
     plan: TrainingPlan,
-    seed: int,
     device: torch.device,
     before: Model | None,
 ) -> Model:
@@ -448,16 +423,14 @@ def _model(
     before: the model of the key frame before, whose corners it may share.
     """
     if arranged.engine == "tcnn":
-        pass
-
         coarsest = SETS[data.name].coarsest if data.name in SETS else USUAL_COARSEST
-        return TcnnModel(coreset, plan.rates, coarsest=coarsest, seed=seed, device=device)
+        return TcnnModel(coreset, plan.rates, coarsest=coarsest, seed=plan.seed, device=device)
     levels = levels_of(name, data, coreset, arranged)
     if arranged.engine == "lattice":
         grids = [level for level in levels if isinstance(level, GridLevel)]
-        return LatticeModel(grids, coreset, plan.rates, seed=seed, device=device)
+        return LatticeModel(grids, coreset, plan.rates, seed=plan.seed, device=device)
     like = before if isinstance(before, GatherModel) else None
-    return GatherModel(levels, coreset, plan.rates, seed=seed, device=device, like=like)
+    return GatherModel(levels, coreset, plan.rates, seed=plan.seed, device=device, like=like)
 
 
 def _plan(coreset: Coreset, steps: int, epochs: int, seed: int, schedule: str) -> TrainingPlan:

@@ -104,6 +104,8 @@ def _seconds(renderer: Renderer, scene: Scene) -> tuple[float, Image]:
     return time.perf_counter() - begun, image
 
 
+FIELDS = {"shell": "beside", "break-even": "break_even", "vtk": "against"}
+"""Fields of the result that have another name than their part."""
 TURNS = 5
 """Runs of each median, by default."""
 SIZE = 512
@@ -185,16 +187,7 @@ def bench_render(
         step=bench.step,
         size=size,
         turns=turns,
-        effects=results.get("effects", ()),
-        accelerations=results.get("accelerations", ()),
-        orbit=results.get("orbit", ()),
-        beside=results.get("shell", ()),
-        streams=results.get("streams", ()),
-        break_even=results.get("break-even", ()),
-        against=results.get("vtk", ()),
-        exactness=results.get("exactness", ()),
-        playback=results.get("playback", ()),
-        curves=results.get("curves", ()),
+        **{FIELDS.get(part, part): measured for part, measured in results.items()},
         refused=refused,
         machine=used,
         notes=NOTES,

@@ -235,16 +235,16 @@ class RenderBench:
     step: float
     size: int
     turns: int
-    effects: tuple[Switch, ...]
-    accelerations: tuple[Switch, ...]
-    streams: tuple[Stream, ...]
-    against: tuple[Against, ...]
-    exactness: tuple[Exactness, ...]
-    playback: tuple[Playback, ...]
-    curves: tuple[Quality, ...]
     refused: dict[str, str]
     machine: dict[str, Any]
     notes: tuple[str, ...]
+    effects: tuple[Switch, ...] = ()
+    accelerations: tuple[Switch, ...] = ()
+    streams: tuple[Stream, ...] = ()
+    against: tuple[Against, ...] = ()
+    exactness: tuple[Exactness, ...] = ()
+    playback: tuple[Playback, ...] = ()
+    curves: tuple[Quality, ...] = ()
     orbit: tuple[Switch, ...] = ()
     beside: tuple[Beside, ...] = ()
     break_even: tuple[BreakEven, ...] = ()

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_bench.pictures.results import Beside, Switch
-from fhash_bench.pictures.vtk import Drawn, VtkPeer, require_vtk, timed
+from fhash_bench.pictures.vtk import Drawn, VtkPeer, median_psnr, require_vtk, timed
 from fhash_codec.cost.uses import black, picture_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import Bricks
@@ -264,16 +264,16 @@ class OsprayPeer:
         ends = np.array([table.low, table.high], dtype=np.float32)
         library.ospSetParam(function, b"value", BOX1F, ends.ctypes.data)
         library.ospCommit(function)
-        model = self._kept(library.ospNewVolumetricModel(volume))
+        model = self._checked(library.ospNewVolumetricModel(volume))
         self._put(model, b"transferFunction", function)
         library.ospSetFloat(model, b"densityScale", densest)
         library.ospCommit(model)
-        group = self._kept(library.ospNewGroup())
+        group = self._checked(library.ospNewGroup())
         library.ospSetObjectAsData(group, b"volume", VOLUMETRIC_MODEL, model)
         library.ospCommit(group)
-        instance = self._kept(library.ospNewInstance(group))
+        instance = self._checked(library.ospNewInstance(group))
         library.ospCommit(instance)
-        self._world = self._kept(library.ospNewWorld())
+        self._world = self._checked(library.ospNewWorld())
         library.ospSetObjectAsData(self._world, b"instance", INSTANCE, instance)
         library.ospCommit(self._world)
         self._renderer = self._new("Renderer", b"scivis")
@@ -281,7 +281,7 @@ class OsprayPeer:
             self._renderer, b"volumeSamplingRate", float(np.abs(grid.spacing).min()) / step
         )
         library.ospCommit(self._renderer)
-        self._buffer = self._kept(library.ospNewFrameBuffer(*size, RGBA32F, COLOR))
+        self._buffer = self._checked(library.ospNewFrameBuffer(*size, RGBA32F, COLOR))
         library.ospCommit(self._buffer)
         self._camera: Address = None
 
@@ -327,9 +327,9 @@ class OsprayPeer:
 
     def _new(self, kind: str, name: bytes) -> Address:
         """A new object of a kind; raises InputError where this OSPRay does not have it."""
-        return self._kept(getattr(self.library, f"ospNew{kind}")(name))
+        return self._checked(getattr(self.library, f"ospNew{kind}")(name))
 
-    def _kept(self, handle: Address) -> Address:
+    def _checked(self, handle: Address) -> Address:
         """A handle that `close` releases."""
         if not handle:
             reason = self.library.ospDeviceGetLastErrorMsg(self.library.ospGetCurrentDevice())
@@ -346,7 +346,7 @@ class OsprayPeer:
         handle = self.library.ospNewSharedData(
             array.ctypes.data, kind, *(number for pair in sizes for number in pair), None, None
         )
-        data = self._kept(handle)
+        data = self._checked(handle)
         self.library.ospCommit(data)
         return data
 
@@ -420,7 +420,6 @@ def beside_shell(
                 nothing.append(empty())
                 likeness.append(picture_psnr(black(marched.rgba), drawn.pixels, 255.0))
             name = version()
-        different = [psnr for psnr in likeness if psnr is not None]
         found.append(
             Beside(
                 peer=name,
@@ -430,7 +429,7 @@ def beside_shell(
                 threads=usable_threads(),
                 ours_ms=1e3 * median(ours),
                 peer_ms=1e3 * max(median(theirs) - median(nothing), 0.0),
-                psnr=median(different) if different else None,
+                psnr=median_psnr(likeness),
             )
         )
         progress("shell", number + 1, len(variants), name)
@@ -444,18 +443,7 @@ Made = tuple[Peer, Callable[[], float], Callable[[], str]]
 @contextmanager
 def _vtk(frame: Frame, task: Task) -> Iterator[Made]:
     """VTK's fixed-point ray caster; its window takes time by itself."""
-    assert task.table is not None
-    make = partial(
-        VtkPeer,
-        frame.values,
-        task.rays.grid,
-        task.table,
-        unit=1.0,
-        size=task.rays.size,
-        step=task.step,
-        lighting=task.lighting,
-        threads=usable_threads(),
-    )
+    make = partial(VtkPeer, frame.values, task, unit=1.0, threads=usable_threads())
     peer, window = make(), make(empty=True)
     try:
         window.draw()

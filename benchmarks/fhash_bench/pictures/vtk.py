@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -84,14 +84,10 @@ class VtkPeer:
     def __init__(
         self,
         values: Single,
-        grid: Grid,
-        table: Table,
+        task: Task,
         *,
         unit: float,
-        size: tuple[int, int],
-        step: float,
         mapper: str = "cpu",
-        lighting: Lighting | None = None,
         threads: int | None = None,
         empty: bool = False,
     ) -> None:
@@ -99,30 +95,27 @@ class VtkPeer:
 
         Args:
             values: (z, y, x) of the whole domain, all finite.
-            grid: vertices and spacing of the domain.
-            table: transfer function.
+            task: what is drawn: the grid, transfer function, pixels, ray step and lighting.
             unit: length that VTK's opacities refer to, in units of the coordinates.
-            size: pixels across and down.
-            step: ray step, in units of the coordinates.
             mapper: one of MAPPERS.
-            lighting: light from the camera; None for an unlit volume.
             threads: threads of the `cpu` mapper.
             empty: the window shows nothing.
         """
+        assert task.table is not None
         self.vtk = vtk = require_vtk()
-        self.grid = grid
+        self.grid = grid = task.rays.grid
         self.image = vtk.vtkImageData()
         nx, ny, nz = grid.counts
         self.image.SetDimensions(nx, ny, nz)
         self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
         self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
         self.load(values)
-        self.mapper = self._mapper(mapper, step, threads)
+        self.mapper = self._mapper(mapper, task.step, threads)
         self.property = vtk.vtkVolumeProperty()
         self.property.SetInterpolationTypeToLinear()
         self.property.SetScalarOpacityUnitDistance(unit)
-        self._give(table, unit)
-        self.shade(lighting)
+        self._give(task.table, unit)
+        self.shade(task.lighting)
         volume = vtk.vtkVolume()
         volume.SetMapper(self.mapper)
         volume.SetProperty(self.property)
@@ -140,7 +133,7 @@ class VtkPeer:
             )
         self.window.SetOffScreenRendering(1)
         self.window.SetMultiSamples(0)
-        self.window.SetSize(*size)
+        self.window.SetSize(*task.rays.size)
         self.window.AddRenderer(self.renderer)
 
     def _mapper(self, name: str, step: float, threads: int | None) -> Any:
@@ -393,13 +386,12 @@ class Comparison:
                 self._peer(plans[0], "cpu") as peer,
                 self._peer(plans[0], "cpu", empty=True) as window,
             ):
-                for plan in plans[:1]:
-                    peer.look(plan.task.rays)
-                    peer.draw()
-                    window.draw()
-                    march(frame, plan.task, bricks=bricks)
-                    self.renderer.render(plan=plan)
-                ours, whole, theirs, nothing, likeness = [], [], [], [], []
+                peer.look(plans[0].task.rays)
+                peer.draw()
+                window.draw()
+                march(frame, plans[0].task, bricks=bricks)
+                self.renderer.render(plan=plans[0])
+                ours, whole, theirs, nothing, psnrs, ssims = [], [], [], [], [], []
                 samples = 0
                 for plan in plans:
                     marched, seconds = timed(partial(march, frame, plan.task, bricks=bricks))
@@ -410,14 +402,9 @@ class Comparison:
                     nothing.append(window.draw().seconds)
                     whole.append(timed(partial(self.renderer.render, plan=plan))[1])
                     pixels = black(marched.rgba)
-                    likeness.append(
-                        (
-                            picture_psnr(pixels, drawn.pixels, 255.0),
-                            picture_ssim(pixels, drawn.pixels),
-                        )
-                    )
+                    psnrs.append(picture_psnr(pixels, drawn.pixels, 255.0))
+                    ssims.append(picture_ssim(pixels, drawn.pixels))
                     samples = max(samples, int(marched.counters["samples"]))
-            different = [psnr for psnr, _ in likeness if psnr is not None]
             results.append(
                 Against(
                     scene=name,
@@ -427,8 +414,8 @@ class Comparison:
                     whole_ms=1e3 * median(whole),
                     vtk_ms=1e3 * max(median(theirs) - median(nothing), 0.0),
                     window_ms=1e3 * median(nothing),
-                    psnr=median(different) if different else None,
-                    ssim=median(similarity for _, similarity in likeness),
+                    psnr=median_psnr(psnrs),
+                    ssim=median(ssims),
                     samples=samples,
                 )
             )
@@ -447,13 +434,7 @@ class Comparison:
                     scene = replace(
                         scene, effects=replace(scene.effects, shading=Shading(gradient=gradient))
                     )
-                plan = self.renderer.plan(
-                    replace(scene, march=replace(scene.march, step=FINE, threshold=0.0))
-                )
-                with self._peer(plan, "gpu") as peer:
-                    peer.look(plan.task.rays)
-                    peer.draw()  # the first picture is of a frame that is not all there yet
-                    theirs = peer.draw().pixels
+                plan, theirs = self._fine(scene, FINE)
                 ours = black(march(frame, plan.task).rgba)
                 results.append(
                     Exactness(
@@ -470,16 +451,19 @@ class Comparison:
             self.progress("exactness", len(results), 3 * len(self.functions), name)
         return tuple(results)
 
-    def _explained(self, name: str, shaded: bool) -> float | None:
-        """PSNR of VTK's picture to a slow one with VTK's own samples, gradients and highlights."""
-        scene = self._scene(name, shaded, EXPLAINED_SIZE)
+    def _fine(self, scene: Scene, step: float) -> tuple[Plan, Pixels]:
+        """Plan of a scene with rays of fine steps that do not end early; VTK's picture of it."""
         plan = self.renderer.plan(
-            replace(scene, march=replace(scene.march, step=EXPLAINED, threshold=0.0))
+            replace(scene, march=replace(scene.march, step=step, threshold=0.0))
         )
         with self._peer(plan, "gpu") as peer:
             peer.look(plan.task.rays)
-            peer.draw()
-            theirs = peer.draw().pixels
+            peer.draw()  # the first picture is of a frame that is not all there yet
+            return plan, peer.draw().pixels
+
+    def _explained(self, name: str, shaded: bool) -> float | None:
+        """PSNR of VTK's picture to a slow one with VTK's own samples, gradients and highlights."""
+        plan, theirs = self._fine(self._scene(name, shaded, EXPLAINED_SIZE), EXPLAINED)
         return picture_psnr(black(vtk_picture(self.values, plan.task)), theirs, 255.0)
 
     def playback(self) -> tuple[Playback, ...]:
@@ -536,16 +520,11 @@ class Comparison:
 
     @contextmanager
     def _peer(self, plan: Plan, mapper: str, *, empty: bool = False) -> Iterator[VtkPeer]:
-        assert plan.task.table is not None
         peer = VtkPeer(
             self.values,
-            plan.task.rays.grid,
-            plan.task.table,
+            plan.task,
             unit=plan.function.unit_distance,
-            size=plan.task.rays.size,
-            step=plan.task.step,
             mapper=mapper,
-            lighting=plan.task.lighting,
             threads=usable_threads(),
             empty=empty,
         )
@@ -599,6 +578,12 @@ def transfer_functions(values: Single, units: Units) -> dict[str, TransferFuncti
             opacity=tuple((float(v), o) for v, o in zip(ends, (0.0, 0.02), strict=True))
         ),
     }
+
+
+def median_psnr(psnrs: Sequence[float | None]) -> float | None:
+    """Median in dB of the pictures that differ; None where none does."""
+    known = [psnr for psnr in psnrs if psnr is not None]
+    return median(known) if known else None
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:

@@ -250,7 +250,7 @@ def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float)
     others = {
         field.name
         for field in dataclasses.fields(EncodeConfig)
-        if field.metadata["profile"] not in ("", profile)
+        if field.metadata.get("profile", profile) != profile
     }
     promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
     own = {name: value for name, value in settings.items() if name not in others}
@@ -362,7 +362,7 @@ def speed_of(
     )
 
 
-def places(shape: Sequence[int], count: int = PLACES) -> Iterator[tuple[int, Box]]:
+def random_regions(shape: Sequence[int], count: int = PLACES) -> Iterator[tuple[int, Box]]:
     """Yield steps and regions of a series (t, z, y, x): one to warm up, and `count` others."""
     rng = np.random.default_rng(0)
     steps, *space = shape
@@ -380,7 +380,7 @@ def access_of(
 
     shape: of the series (t, z, y, x). count: of the places.
     """
-    measured = [read(step, box) for step, box in places(shape, count)][1:]
+    measured = [read(step, box) for step, box in random_regions(shape, count)][1:]
     z, y, x = (min(REGION, n) for n in shape[1:])
     return Access(
         codec=codec,
@@ -507,7 +507,7 @@ class Bench:
 
         return Search(measure, step=variant.step, fixed=variant.lossless)
 
-    def search_own(self, settings: Mapping[str, Any], profile: str) -> None:
+    def search_profile(self, settings: Mapping[str, Any], profile: str) -> None:
         """Encode with a profile for every goal; one that lacks a package is refused."""
         if profile == "paper":
             try:

@@ -92,7 +92,7 @@ def bench_rate(
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
-            bench.search_own(settings, profile)
+            bench.search_profile(settings, profile)
         if speed and targets:
             nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
             bench.measure_speed(nearest, variants)

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
 import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
 
+from fhash_bench.kept import file_name, load, of_fields, save
 from fhash_bench.rate.measuring import OWN, PEERS, Access, Bench, Best, Speed, TilePrice, shown_psnr
 from fhash_bench.rate.peers import AnyVariant
 from fhash_bench.rate.rate import NOTES, all_variants, bench_of, check, goals_of
 from fhash_codec.cost.plan import machine
 from fhash_codec.progress import Progress, silent
 from fhash_formats.series import Series
-from fhash_formats.support.files import replacing
 
 CELL_VERSION = 1
 """Number of the way in which cells are measured; cells of another number are not taken."""
@@ -47,10 +44,7 @@ class Request:
     def filename(self) -> str:
         """Name of the cell's file; another setting has another name."""
         words = (self.series, self.codec, f"{self.goal}{self.asked:g}")
-        plain = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", word) for word in words)
-        told = {**self.settings, "words": words, "version": CELL_VERSION}
-        digits = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:8]
-        return f"{plain[:120]}_{digits}.json"
+        return file_name(words, self.settings, CELL_VERSION)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +93,9 @@ class RateCell:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> RateCell:
-        """The cell of JSON values; raises TypeError or KeyError for others."""
-        if values.keys() != {field.name for field in fields(cls)}:
-            raise KeyError("not the keys of a cell")
-        return cls(**{**values, "shape": tuple(values["shape"])})
+        """The cell of JSON values; raises InputError or TypeError for others."""
+        cell = of_fields(cls, values)
+        return replace(cell, shape=tuple(cell.shape))
 
 
 def cell_of(
@@ -132,26 +125,6 @@ def cell_of(
             "tile_steps": tiles.steps,
         }
     return RateCell(**about, **figures)
-
-
-def load(folder: Path, request: Request) -> RateCell | None:
-    """A finished cell; None where there is none, or one that cannot be read."""
-    try:
-        text = (folder / request.filename).read_text(encoding="utf-8")
-        return RateCell.from_dict(json.loads(text))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return None
-
-
-def save(folder: Path, request: Request, cell: RateCell) -> None:
-    """Write a cell into a folder, which is made if it is missing: complete or not at all.
-
-    Raises OutputError where it cannot be written.
-    """
-    text = json.dumps(cell.to_dict(), indent=1, allow_nan=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / request.filename, force=True) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 TARGETS = (35.0, 45.0, 60.0)
@@ -256,7 +229,7 @@ def bench_table(
         progress("series", number, len(sources), name)
         with opened() as series:
             run = _Run(name, series, folder, settings, goals, speed=speed, progress=progress)
-            cells += run.own()
+            cells += run.of_fhash()
             for codec, several in variants.items():
                 cells += run.peer(codec, several)
             cells += [
@@ -292,7 +265,7 @@ class _Run:
             checksum = zlib.crc32(frame.tobytes(), checksum)
         self._identity = {"checksum": checksum, "shape": list(series.shape), "speed": speed}
 
-    def own(self) -> list[RateCell]:
+    def of_fhash(self) -> list[RateCell]:
         """fhash at each quality; a cell is kept before the next one begins."""
         return [
             cell
@@ -300,7 +273,7 @@ class _Run:
             for cell in self._cells(
                 f"{OWN}{COMPACT}",
                 [goal],
-                lambda bench: bench.search_own(self._settings, COMPACT),
+                lambda bench: bench.search_profile(self._settings, COMPACT),
                 self._settings,
             )
         ]
@@ -337,11 +310,12 @@ class _Run:
             )
             for goal in goals
         }
-        kept = {goal: load(self._folder, request) for goal, request in requests.items()}
+        paths = {goal: self._folder / request.filename for goal, request in requests.items()}
+        kept = {goal: load(path, RateCell.from_dict) for goal, path in paths.items()}
         missing = [goal for goal, cell in kept.items() if cell is None]
         if missing:
             for goal, cell in self._measure(codec, missing, search).items():
-                save(self._folder, requests[goal], cell)
+                save(paths[goal], cell.to_dict())
                 kept[goal] = cell
                 self.measured += 1
         return [cell for cell in kept.values() if cell is not None]

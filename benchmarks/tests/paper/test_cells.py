@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from made_cells import cell as cell_groups
 
+from fhash_bench.kept import load
 from fhash_bench.paper import bench
 from fhash_bench.paper.bench import BenchPlan, bench_paper, requests_of
 from fhash_bench.paper.cells import (
@@ -22,10 +23,6 @@ from fhash_bench.paper.cells import (
     Request,
     by_data,
     groups,
-    load,
-    load_all,
-    save,
-    settings_id,
     within,
 )
 from fhash_bench.paper.data import (
@@ -418,11 +415,6 @@ def test_the_first_point_that_reaches_a_quality() -> None:
     assert replace(CELL, curve=()).reached(5) is None
 
 
-def test_settings_identify() -> None:
-    assert settings_id({"a": 1, "b": [2]}) == settings_id({"b": [2], "a": 1})
-    assert settings_id({"a": 1}) != settings_id({"a": 2})
-
-
 def test_cells_are_joined_over_seeds_in_the_papers_order() -> None:
     grouped = groups(
         [cell_groups(seed=1), cell_groups(), cell_groups("dense"), cell_groups("hash", "published")]
@@ -473,45 +465,20 @@ REQUEST = Request(
 )
 
 
-def cell() -> Cell:
-    return Cell(
-        encoding="hash", protocol="equal", data_set="a b/c.h5", shape=(1, 2, 3, 4),
-        feature="interval:0:1", key_frames=(0,), coreset_share=1.0,
-        box=((0, 2), (0, 3), (0, 4)), seed=2, parameters={"tables": 1, "mlp": 1},
-        buckets_used=1.0, bytes=8, raw_bytes=96, samples_an_epoch=24, steps_an_epoch=1,
-        samples_per_second=1.0, training_seconds=1.0, curve=(),
-    )  # fmt: skip
+def loaded(folder: Path) -> list[Cell]:
+    """Every cell in a folder."""
+    cells = [load(path, Cell.from_dict) for path in sorted(folder.iterdir())]
+    return [cell for cell in cells if cell is not None]
 
 
-def test_a_cell_is_found_by_its_settings_alone(tmp_path: Path) -> None:
-    assert load(tmp_path, REQUEST) is None
-    save(tmp_path, REQUEST, cell())
-    assert load(tmp_path, REQUEST) == cell()
+def test_names_are_plain_and_those_of_their_settings_alone() -> None:
+    assert not set("/: ") & set(REQUEST.filename)
     for other in (
         replace(REQUEST, settings={"epochs": 4}),
         replace(REQUEST, seed=3),
         replace(REQUEST, feature="interval:0-1"),
     ):
         assert other.filename != REQUEST.filename
-        assert load(tmp_path, other) is None
-
-
-def test_names_are_plain(tmp_path: Path) -> None:
-    assert "/" not in REQUEST.filename
-    assert ":" not in REQUEST.filename
-    assert " " not in REQUEST.filename
-
-
-def test_a_damaged_cell_is_no_cell(tmp_path: Path) -> None:
-    save(tmp_path, REQUEST, cell())
-    path = tmp_path / REQUEST.filename
-    path.write_text(path.read_text()[:-20])
-    (tmp_path / "other.json").write_text("[1]")
-    (tmp_path / "more.json").write_text('{"a": 1}')
-    assert load(tmp_path, REQUEST) is None
-    assert load_all(tmp_path) == []
-    save(tmp_path, REQUEST, cell())
-    assert load_all(tmp_path) == [cell()]
 
 
 PLAN = BenchPlan.quick(
@@ -537,7 +504,7 @@ def test_every_encoding_in_every_protocol(
     ]
     assert len(result.notes) == 1
     assert "tcnn" in result.notes[0]
-    assert sorted(load_all(tmp_path), key=str) == sorted(result.cells, key=str)
+    assert sorted(loaded(tmp_path), key=str) == sorted(result.cells, key=str)
     cells = {(cell.protocol, cell.encoding): cell for cell in result.cells}
     equal = [cells["equal", name] for name in ("dense", "dense-multi", "hash", "fhash")]
     for figure in ("samples_an_epoch", "steps_an_epoch", "box", "engine"):
@@ -591,7 +558,7 @@ def test_an_interrupt_leaves_finished_cells(
     monkeypatch.setattr(bench, "train", stopped)
     with pytest.raises(KeyboardInterrupt):
         bench_paper(plan, tmp_path, series, name="blob")
-    assert [cell.encoding for cell in load_all(tmp_path)] == ["dense"]
+    assert [cell.encoding for cell in loaded(tmp_path)] == ["dense"]
     assert len(list(tmp_path.iterdir())) == 1
     assert len(bench_paper(plan, tmp_path, series, name="blob").cells) == 2
     assert len(calls) == 3

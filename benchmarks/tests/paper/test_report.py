@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 from made_cells import BETWEEN, LATENCY, answer, cell, cells
 
+from fhash_bench.kept import of_fields
 from fhash_bench.paper import files, report
-from fhash_bench.paper import files as ratios
-from fhash_bench.paper import report as plot
 from fhash_bench.paper.claims import (
     CONFIRMED,
     NOT_REACHED,
@@ -109,8 +108,8 @@ class Encodings:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.configs: list[Any] = []
-        monkeypatch.setattr(ratios.fhash_codec, "encode", self.encode)
-        monkeypatch.setattr(ratios, "open_volume", self.open)
+        monkeypatch.setattr(files.fhash_codec, "encode", self.encode)
+        monkeypatch.setattr(files, "open_volume", self.open)
 
     def encode(self, series: Series, path: Path, config: Any, *, progress: Any) -> None:
         progress("training", 1, 2, "")
@@ -143,7 +142,7 @@ def encodings(monkeypatch: pytest.MonkeyPatch) -> Encodings:
         refused={"SPERR rate": "too small"},
         raw_bytes=10_000,
     )
-    monkeypatch.setattr(ratios, "bench_rate", lambda *args, **options: bench)
+    monkeypatch.setattr(files, "bench_rate", lambda *args, **options: bench)
     return Encodings(monkeypatch)
 
 
@@ -187,7 +186,7 @@ def test_without_peers_a_line_says_so(
     def refuse(*args: Any, **options: Any) -> None:
         raise MissingDependencyError("pip install 'fhash[bench]'")
 
-    monkeypatch.setattr(ratios, "bench_rate", refuse)
+    monkeypatch.setattr(files, "bench_rate", refuse)
     results, refused = measure_files("mine", SERIES, "all")
     assert {each.kind for each in results} == {"paper", "coded", "compact"}
     assert refused == ["SZ3, SPERR, ZFP not measured: pip install 'fhash[bench]'"]
@@ -213,9 +212,9 @@ def test_results_go_through_json() -> None:
         data_set="a", feature="b", codec="c", kind="peer", whole=True, bytes=1, raw_bytes=2,
         psnr=None, reached=True, seconds=None,
     )  # fmt: skip
-    assert FileResult.from_dict(made.to_dict()) == made
+    assert of_fields(FileResult, made.to_dict()) == made
     with pytest.raises(InputError, match="needed: bytes"):
-        FileResult.from_dict({"bytes": 1})
+        of_fields(FileResult, {"bytes": 1})
 
 
 def test_the_median_decides() -> None:
@@ -382,7 +381,7 @@ def test_a_picture_for_each_data_set_and_protocol(
 ) -> None:
     drawn: list[tuple[str, list[str]]] = []
     monkeypatch.setattr(
-        plot, "_draw", lambda title, encodings, path: drawn.append((title, list(encodings)))
+        report, "_draw", lambda title, encodings, path: drawn.append((title, list(encodings)))
     )
     made = [*cells()[:2], cell(seed=1), cell(data_set="my data", feature="interval:0:1")]
     assert [path.name for path in plot_convergence(made, tmp_path)] == [
@@ -423,7 +422,7 @@ def test_without_matplotlib_one_line_says_so(
     def refuse() -> None:
         raise MissingDependencyError("a plot needs matplotlib")
 
-    monkeypatch.setattr(plot, "require_matplotlib", refuse)
+    monkeypatch.setattr(report, "require_matplotlib", refuse)
     with pytest.raises(MissingDependencyError, match="matplotlib"):
         plot_convergence([cell()], tmp_path)
 

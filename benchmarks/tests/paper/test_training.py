@@ -13,9 +13,6 @@ import pytest
 import torch
 from readable_paper import interpolate
 
-from fhash_bench.paper import (
-    data as sets,
-)
 from fhash_bench.paper import encodings as engines
 from fhash_bench.paper import (
     trained as tcnn,
@@ -124,26 +121,6 @@ def test_weights_add_up_to_one_and_buckets_are_of_the_level(level: GridLevel | H
     torch.testing.assert_close(weights.sum(1), torch.ones(300, dtype=torch.float64))
     assert weights.min() >= 0
     assert 0 <= buckets.min() <= buckets.max() < level.size
-
-
-def test_a_trained_encoding_serves_the_protocol(data: Data) -> None:
-    built: engines.Encoding = build(
-        "hash",
-        data,
-        arrangement("equal", "hash", data),
-        steps=1,
-        epochs=1,
-        seed=1,
-        device=torch.device("cpu"),
-    )
-    named = [name for name in vars(engines.Encoding) if not name.startswith("_")]
-    assert len(named) >= 11
-    assert all(hasattr(built, name) for name in named)
-
-
-def test_constants_agree() -> None:
-    assert engines.EMBEDDING_SIZE == sets.EMBEDDING_SIZE
-    assert engines.WIDTH == sets.WIDTH
 
 
 NAMES = ("dense", "dense-multi", "hash", "fhash")

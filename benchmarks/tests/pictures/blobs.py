@@ -75,17 +75,7 @@ def task(camera: Camera, *, shaded: bool, step: float) -> Task:
 
 def drawn(asked: Task, values: np.ndarray, mapper: str = "gpu") -> np.ndarray:
     """The bytes (H, W, 3) of a frame (z, y, x) that VTK draws."""
-    assert asked.table is not None
-    peer = VtkPeer(
-        values,
-        asked.rays.grid,
-        asked.table,
-        unit=1.0,
-        size=SIZE,
-        step=asked.step,
-        mapper=mapper,
-        lighting=asked.lighting,
-    )
+    peer = VtkPeer(values, asked, unit=1.0, mapper=mapper)
     try:
         peer.look(asked.rays)
         peer.draw()

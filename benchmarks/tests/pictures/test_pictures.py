@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from blobs import CAMERAS, SHAPE, SIZE, axes, drawn, field, task
+from blobs import CAMERAS, SHAPE, axes, drawn, field, task
 
 import fhash_codec
 from fhash_bench.pictures import render as render_module
@@ -338,10 +338,9 @@ def test_the_ray_caster_of_vtk_gets_the_same_scene() -> None:
 
 def test_vtk_takes_up_another_frame_and_an_empty_window_is_black() -> None:
     asked = task(CAMERAS[0], shaded=False, step=0.5)
-    assert asked.table is not None
     first, last = field()[0], field()[3]
-    peer = VtkPeer(first, asked.rays.grid, asked.table, unit=1.0, size=SIZE, step=0.5)
-    empty = VtkPeer(first, asked.rays.grid, asked.table, unit=1.0, size=SIZE, step=0.5, empty=True)
+    peer = VtkPeer(first, asked, unit=1.0)
+    empty = VtkPeer(first, asked, unit=1.0, empty=True)
     peer.look(asked.rays)
     before = peer.draw().pixels
     peer.load(last)

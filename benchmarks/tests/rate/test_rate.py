@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
+from fhash_bench.kept import load, save
 from fhash_bench.rate.generated import (
     DEFAULT,
     GENERATED,
@@ -32,15 +33,15 @@ from fhash_bench.rate.measuring import (
     RateBench,
     Spent,
     access_of,
-    places,
     promised,
+    random_regions,
     shown_psnr,
     speed_of,
     spent,
     user_seconds,
 )
 from fhash_bench.rate.rate import bench_rate, plot
-from fhash_bench.rate.table import RateCell, RateTable, Request, bench_table, load, save
+from fhash_bench.rate.table import RateCell, RateTable, Request, bench_table
 from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
 from fhash_codec.cost.peers import EXACT, Trial
@@ -292,8 +293,8 @@ def test_the_fastest_runs_count() -> None:
 
 def test_places_are_the_same_for_all_and_within_the_series() -> None:
     shape = (3, 20, 5, 40)
-    assert list(places(shape)) == list(places(shape))
-    for step, box in places(shape):
+    assert list(random_regions(shape)) == list(random_regions(shape))
+    for step, box in random_regions(shape):
         assert 0 <= step < 3
         assert box.shape == (16, 5, 16)
         assert all(0 <= low < high <= n for (low, high), n in zip(box, shape[1:], strict=True))
@@ -329,18 +330,15 @@ CELL = RateCell(
 REQUEST = Request(series="a b.h5", codec="SZ3", goal="psnr", asked=45.0, settings={"checksum": 1})
 
 
-def test_a_cell_comes_back(tmp_path: Path) -> None:
-    assert load(tmp_path, REQUEST) is None
-    save(tmp_path / "cells", REQUEST, CELL)
-    assert load(tmp_path / "cells", REQUEST) == CELL
-    save(tmp_path / "cells", REQUEST, replace(CELL, bytes=None, why="broken"))
-    assert load(tmp_path / "cells", REQUEST) == replace(CELL, bytes=None, why="broken")
-
-
-def test_what_is_no_cell_is_not_taken(tmp_path: Path) -> None:
-    for text in ("", "[]", "{}", '{"series": 1}', "\xff"):
-        (tmp_path / REQUEST.filename).write_text(text, encoding="latin-1")
-        assert load(tmp_path, REQUEST) is None
+def test_a_cell_comes_back_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "cells" / REQUEST.filename
+    assert load(path, RateCell.from_dict) is None
+    for cell in (CELL, replace(CELL, bytes=None, why="broken")):
+        save(path, cell.to_dict())
+        assert load(path, RateCell.from_dict) == cell
+    for text in ("", "[]", "{}", '{"series": 1}', "\xff", path.read_text()[:-20]):
+        path.write_text(text, encoding="latin-1")
+        assert load(path, RateCell.from_dict) is None
 
 
 def test_another_question_has_another_name() -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from fhash_cli.options import (
+    DURATION,
     BaseCommand,
-    DurationType,
     SourceOptions,
     force_option,
     json_option,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @series_options
 @click.option(
     "--budget",
-    type=DurationType(),
+    type=DURATION,
     default="2m",
     show_default=True,
     help="Time to measure for, such as 90s, 2m or 1h.",

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from fhash_cli.options import (
+    NUMBER,
+    SLICE,
     BaseCommand,
     IntervalsType,
-    NumberType,
-    SliceType,
     check_writable,
     feature_option,
     force_option,
@@ -310,7 +310,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @click.option(
     "--t",
     "steps",
-    type=SliceType(),
+    type=SLICE,
     help="Steps, half-open as in Python: 42, 40:50, ::2, -1. Default: all.",
 )
 @click.option(
@@ -367,7 +367,7 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @click.option(
     "--fill",
     metavar="V",
-    type=NumberType(),
+    type=NUMBER,
     help="Value of vertices that have none. Default: the source's own for integers, else NaN.",
 )
 @feature_option

@@ -15,6 +15,7 @@ import click
 
 from fhash_cli.options import (
     BaseCommand,
+    TextType,
     check_writable,
     force_option,
     json_option,
@@ -51,41 +52,22 @@ OVERHEAD_BYTES = 2**20
 """Bytes of a file beside its values: header, coordinates, indices of chunks."""
 
 
-class ShapeType(click.ParamType[dict[str, int]]):
-    """Vertices along z, y and x as `Z,Y,X`, or by name as `x=64,y=64,z=32`, with `t` for steps."""
-
-    name = "Z,Y,X"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> dict[str, int]:
-        """Lengths by axis."""
-        if isinstance(value, dict):
-            return value
-        text = str(value)
-        try:
-            return _shape(text)
-        except ValueError:
-            self.fail(
-                f"'{text[:60]}' is not Z,Y,X such as 54,172,200, nor x=200,y=172,z=54", param, ctx
-            )
-
-
 def _shape(text: str) -> dict[str, int]:
-    """Lengths by axis; raises ValueError for a text of another form."""
-    if "=" not in text:
-        words = text.split(",")
-        if len(words) != 3 or not all(
-            word.strip().isascii() and word.strip().isdecimal() for word in words
-        ):
-            raise ValueError
-        return dict(zip("zyx", map(int, words), strict=True))
     from fhash_formats.readers.common.file_series import parse_shape
 
-    shape = parse_shape(text)
+    words = [word.strip() for word in text.split(",")]
+    if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):
+        return dict(zip("zyx", map(int, words), strict=True))
+    shape: dict[str, int] = {}
+    with contextlib.suppress(ValueError):
+        shape = parse_shape(text)
     if not set("zyx") <= set(shape):
-        raise ValueError
+        raise ValueError(f"'{text[:60]}' is not Z,Y,X such as 54,172,200, nor x=200,y=172,z=54")
     return shape
+
+
+SHAPE = TextType("Z,Y,X", _shape)
+"""Vertices along z, y and x as `Z,Y,X`, or by name as `x=64,y=64,z=32`, with `t` for steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +121,7 @@ scene_options = option_group(
     ),
     click.option(
         "--shape",
-        type=ShapeType(),
+        type=SHAPE,
         help="Vertices along z, y and x, such as 54,172,200 or x=200,y=172,z=54. Default: a small"
         " shape of the scene's own.",
     ),

@@ -17,8 +17,8 @@ from click.core import ParameterSource
 from fhash_cli.commands.cost import check_report_folder
 from fhash_cli.commands.parts import WishedPart, encode_all_or_part
 from fhash_cli.options import (
+    DURATION,
     BaseCommand,
-    DurationType,
     SourceOptions,
     check_writable,
     force_option,
@@ -90,7 +90,7 @@ class EncodeOptions:
 )
 @click.option(
     "--time-budget",
-    type=DurationType(),
+    type=DURATION,
     help="Choose the highest effort, or with --profile paper the most epochs, that should take no "
     "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
     "that may be chosen.",

@@ -49,10 +49,10 @@ def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]
 def _occupancy(part: Mapping[str, Any]) -> str:
     """The bits, and how many features have their own."""
     apart = f"; {len(part['apart'])} features apart" if part["apart"] else ""
-    return f"bits {extent(part['shape'])}; {_place(part)}{apart}"
+    return f"bits {extent(part['shape'])}; {_stored_as(part)}{apart}"
 
 
-def _place(part: Mapping[str, Any]) -> str:
+def _stored_as(part: Mapping[str, Any]) -> str:
     """The place of a part in the file, its coding and its bytes."""
     if not part["path"]:
         return str(part["coding"])
@@ -72,7 +72,7 @@ def _config(
         if name == "profile" or name not in usual or value != usual[name]
     ]
     text = ", ".join(changed)
-    rows = [("config", f"{part['settings']} settings; {text}; {_place(part)}")]
+    rows = [("config", f"{part['settings']} settings; {text}; {_stored_as(part)}")]
     if verbose:
         rows += [(f"  {name}", _shown(value)) for name, value in config.items()]
     return rows
@@ -115,7 +115,7 @@ def _mlp(layers: list[dict[str, Any]], *, verbose: bool) -> list[tuple[str, str]
     widths = " to ".join(str(width) for width in _widths(layers))
     # Layers may share an array.
     stored = list({layer["path"]: layer for layer in layers if layer["path"]}.values())
-    place = _place(layers[0])
+    place = _stored_as(layers[0])
     if len(stored) > 1:
         total = size(sum(layer["bytes"] for layer in stored))
         place = f"{stored[0]['path']} to {stored[-1]['path']}, {stored[0]['coding']}, {total}"
@@ -128,7 +128,7 @@ def _mlp(layers: list[dict[str, Any]], *, verbose: bool) -> list[tuple[str, str]
 def _each(what: str, parts: list[dict[str, Any]]) -> list[tuple[str, str]]:
     """A row for each level or layer: shape and place."""
     return [
-        (f"  {what} {part[what]}", f"{extent(part['shape'])}; {_place(part)}") for part in parts
+        (f"  {what} {part[what]}", f"{extent(part['shape'])}; {_stored_as(part)}") for part in parts
     ]
 
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from fhash_cli.options import (
+    SLICE,
     BaseCommand,
     Command,
     IntervalsType,
     RealRange,
-    SliceType,
+    TextType,
     check_writable,
     feature_option,
     force_option,
@@ -44,89 +45,68 @@ NUMBERS = {2: "A,B", 3: "X,Y,Z"}
 """Placeholders of options that take so many numbers."""
 
 
-class NumbersType(click.ParamType[tuple[float, ...]]):
-    """A fixed count of numbers with commas between them."""
+def numbers_type(count: int) -> TextType:
+    """A fixed count of numbers with commas; the scene checks later whether they are allowed."""
 
-    def __init__(self, count: int) -> None:
-        self.count, self.name = count, NUMBERS[count]
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """The numbers; the scene checks later whether their values are allowed."""
+    def parsed(text: str) -> tuple[float, ...]:
         try:
-            numbers = tuple(float(part) for part in str(value).split(","))
+            numbers = tuple(float(part) for part in text.split(","))
         except ValueError:
             numbers = ()
-        if len(numbers) != self.count:
-            self.fail(
-                f"'{value}' is not {self.count} numbers with commas between them,"
-                f" such as {','.join('123'[: self.count])}",
-                param,
-                ctx,
+        if len(numbers) != count:
+            raise ValueError(
+                f"'{text}' is not {count} numbers with commas between them,"
+                f" such as {','.join('123'[:count])}"
             )
         return numbers
 
+    return TextType(NUMBERS[count], parsed)
 
-class SizeType(click.ParamType[tuple[int, int]]):
-    """Pixels across and down, WxH, or one number for both."""
 
-    name = "WxH"
+def _size(text: str) -> tuple[int, int]:
+    across, _, down = text.lower().partition("x")
+    try:
+        return int(across), int(down or across)
+    except ValueError:
+        raise ValueError(f"'{text}' is not a size in pixels such as 800x600") from None
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """The two numbers."""
+
+SIZE = TextType("WxH", _size)
+"""Pixels across and down, or one number for both."""
+
+
+def opacity_type(*, named: bool = True) -> TextType:
+    """Points VALUE:OPACITY with commas between them, or (`named`) the name of a preset."""
+
+    def parsed(text: str) -> Any:
+        if named and ":" not in text:
+            return text
         try:
-            across, _, down = str(value).lower().partition("x")
-            return int(across), int(down or across)
+            return [[float(end) for end in part.split(":")] for part in text.split(",")]
         except ValueError:
-            self.fail(f"'{value}' is not a size in pixels such as 800x600", param, ctx)
+            what = "neither the name of an opacity nor" if named else "not"
+            raise ValueError(f"'{text}' is {what} points such as 0:0,0.5:0.2,2:1") from None
+
+    return TextType("NAME|V:O,..." if named else "G:F,...", parsed)
 
 
-class OpacityType(click.ParamType[Any]):
-    """Points VALUE:OPACITY with commas between them, or the name of an opacity preset.
-
-    named: whether it may be a name.
-    """
-
-    def __init__(self, *, named: bool = True) -> None:
-        self.named, self.name = named, "NAME|V:O,..." if named else "G:F,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The name, or a list of points."""
-        if self.named and ":" not in str(value):
-            return value
-        try:
-            return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
-        except ValueError:
-            what = "neither the name of an opacity nor" if self.named else "not"
-            self.fail(f"'{value}' is {what} points such as 0:0,0.5:0.2,2:1", param, ctx)
+def _plane(text: str) -> dict[str, Any]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 4:
+        return {"normal": numbers[:3], "offset": numbers[3]}
+    if len(numbers) == 6:
+        return {"point": numbers[:3], "normal": numbers[3:]}
+    raise ValueError(
+        f"'{text}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
+        " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5"
+    )
 
 
-class PlaneType(click.ParamType[dict[str, Any]]):
-    """A clip plane: its normal and an offset, or a point of it and its normal."""
-
-    name = "NX,NY,NZ,D"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> dict[str, Any]:
-        """The settings of a ClipPlane."""
-        try:
-            numbers = [float(part) for part in str(value).split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) == 4:
-            return {"normal": numbers[:3], "offset": numbers[3]}
-        if len(numbers) == 6:
-            return {"point": numbers[:3], "normal": numbers[3:]}
-        self.fail(
-            f"'{value}' is neither a normal and an offset, NX,NY,NZ,D, nor a point and a normal,"
-            " X,Y,Z,NX,NY,NZ, such as 0,0,1,0.5",
-            param,
-            ctx,
-        )
+PLANE = TextType("NX,NY,NZ,D", _plane)
+"""Settings of a ClipPlane: its normal and an offset, or a point of it and its normal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +199,7 @@ class Setting(NamedTuple):
             self.name,
             metavar=self.metavar or ("N" if number is int else "X" if number is float else None),
             type=self.kind or number,
-            multiple=isinstance(self.kind, PlaneType),
+            multiple=self.kind is PLANE,
             help=text[0].upper() + text[1:] + "." * (text[-1] != "]"),
         )
 
@@ -229,29 +209,29 @@ SETTINGS = (
             " first"),
     Setting("--time", "time", "T", click.STRING, "a time instead of a step: a number, or a date"
             " such as 2001-02-10T06:00"),
-    Setting("--size", "size", kind=SizeType(), help="pixels across and down.  [default: 512x512]"),
+    Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 512x512]"),
     Setting("--view", "camera.view", "NAME"),
     Setting("--azimuth", "camera.azimuth", "DEGREES"),
     Setting("--elevation", "camera.elevation", "DEGREES"),
     Setting("--zoom", "camera.zoom"),
     Setting("--projection", "camera.projection", "NAME"),
-    Setting("--position", "camera.position", kind=NumbersType(3), help="where the camera stands, in"
-            " the coordinates of the series"),
-    Setting("--focal-point", "camera.focal_point", kind=NumbersType(3)),
-    Setting("--view-up", "camera.view_up", kind=NumbersType(3)),
-    Setting("--scale", "scale", kind=NumbersType(3), help="stretch the axes.  [default: one in"
+    Setting("--position", "camera.position", kind=numbers_type(3), help="where the camera stands,"
+            " in the coordinates of the series"),
+    Setting("--focal-point", "camera.focal_point", kind=numbers_type(3)),
+    Setting("--view-up", "camera.view_up", kind=numbers_type(3)),
+    Setting("--scale", "scale", kind=numbers_type(3), help="stretch the axes.  [default: one in"
             " other units is as long as the rest]"),
     Setting("--cmap", "transfer_function.colours", "NAME", help="colour map, or a ParaView preset"
             " (JSON)"),
-    Setting("--opacity", "transfer_function.opacity", kind=OpacityType(), help="name of a"
+    Setting("--opacity", "transfer_function.opacity", kind=opacity_type(), help="name of a"
             " preset: auto, feature, linear, geom, sigmoid, foreground or opaque; or points"),
-    Setting("--range", "transfer_function.range", kind=NumbersType(2)),
+    Setting("--range", "transfer_function.range", kind=numbers_type(2)),
     Setting("--density", "transfer_function.density"),
     Setting("--gradient-opacity", "transfer_function.gradient_opacity",
-            kind=OpacityType(named=False)),
+            kind=opacity_type(named=False)),
     Setting("--clip-box", "effects.clip", kind=IntervalsType(float), help="show only this part, in"
             " coordinates; an end may be left out"),
-    Setting("--clip-plane", "effects.clip.planes", kind=PlaneType(), help="show only what lies on"
+    Setting("--clip-plane", "effects.clip.planes", kind=PLANE, help="show only what lies on"
             " the side of the normal, where it times the place is at least D (or X,Y,Z,NX,NY,NZ);"
             " may be repeated"),
     Setting("--background", "background", "COLOUR"),
@@ -476,7 +456,7 @@ add_animation_options = option_group(
     click.option(
         "--evolution",
         metavar="A:B:S",
-        type=SliceType(),
+        type=SLICE,
         help="These steps side by side in one picture.",
     ),
     click.option(
@@ -616,10 +596,10 @@ def _draw_evolution(
         ("steps", str(len(steps))),
         ("seconds", number(image.seconds, digits=3)),
     ]
-    return result, table(rows) + ("\n\n" + _places(followed) if followed else "")
+    return result, table(rows) + ("\n\n" + _followed(followed) if followed else "")
 
 
-def _places(followed: list[dict[str, Any]]) -> str:
+def _followed(followed: list[dict[str, Any]]) -> str:
     """Size and centroid of each feature at each step."""
     header = ("step", *(entry["feature"] for entry in followed))
     rows = []

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import click
 
 from fhash_cli.options import (
+    SELECT,
     BaseCommand,
-    SelectType,
     check_writable,
     force_option,
     json_option,
@@ -47,7 +47,7 @@ class PackOptions:
 @click.option(
     "--select",
     multiple=True,
-    type=SelectType(),
+    type=SELECT,
     help="One index along a dimension that is none of t, z, y and x, such as member=2.",
 )
 @click.option("--axes", metavar="t,z,y,x", help="Which axis each dimension is, in their order.")

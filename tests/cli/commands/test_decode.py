@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 
 import fhash_codec
 from fhash_cli.commands.decode import RegionOptions, Selection, Statistics, convert
@@ -124,9 +123,6 @@ def test_the_source_s_own_fill_value_counts_where_the_type_has_it(run: Path) -> 
                 assert Selection.of(volume, RegionOptions(dtype="int16")).fill == taken
 
 
-Fhash = Callable[..., Result]
-
-
 @pytest.fixture(scope="module")
 def whole(run: Path) -> np.ndarray:
     with fhash_codec.open(run) as volume:
@@ -193,7 +189,7 @@ def test_conversions_that_would_lose_a_value_are_refused() -> None:
 
 
 def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
-    refused: Callable[..., str], fhash: Fhash, tmp_path: Path
+    refused: Refused, fhash: Fhash, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="the data have no value") as caught:
         convert(np.array([1.0, np.nan]), np.dtype(np.uint8), background=True)
@@ -253,7 +249,7 @@ def test_an_isosurface_is_written_in_physical_positions(
     ],
 )
 def test_isosurfaces_that_cannot_be_written(
-    refused: Callable[..., str],
+    refused: Refused,
     run: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,31 +11,17 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 from PIL import Image
 
 import fhash_codec
-from fhash_cli.commands.demo import SceneOptions, ShapeType
+from fhash_cli.commands.demo import SHAPE
 from fhash_codec import gallery
 from fhash_codec.gallery import PICTURES, commands, page
 from fhash_codec.simulation.scene import PRESETS
 from fhash_codec.simulation.simulate import Simulation
 
-Fhash = Callable[..., Result]
 SMALL = ("--shape", "6,7,8", "--steps", "3", "-q")
-
-
-def options(**settings: Any) -> SceneOptions:
-    return SceneOptions(
-        **{
-            "scene": "front",
-            "shape": None,
-            "steps": None,
-            "paper_shape": False,
-            "seed": 0,
-            **settings,
-        }
-    )
 
 
 @pytest.mark.parametrize(
@@ -49,7 +34,7 @@ def options(**settings: Any) -> SceneOptions:
     ],
 )
 def test_shapes_are_z_y_x_or_named(text: str, shape: dict[str, int]) -> None:
-    assert ShapeType().convert(text, None, None) == shape
+    assert SHAPE.convert(text, None, None) == shape
 
 
 @pytest.mark.parametrize(
@@ -57,23 +42,11 @@ def test_shapes_are_z_y_x_or_named(text: str, shape: dict[str, int]) -> None:
 )
 def test_other_shapes_are_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="is not Z,Y,X such as"):
-        ShapeType().convert(text, None, None)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"shape": {"z": 4, "y": 5, "x": 6, "t": 7}, "steps": 3},
-        {"paper_shape": True, "steps": 3, "scene": "flame"},
-    ],
-)
-def test_options_that_exclude_each_other_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(click.UsageError, match="exclude"):
-        options(**settings).open()
+        SHAPE.convert(text, None, None)
 
 
 def test_a_file_of_a_scene_is_simulated_and_never_replaced(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
+    fhash: Fhash, refused: Refused, tmp_path: Path
 ) -> None:
     scene = tmp_path / "wake.json"
     scene.write_text(json.dumps({"name": "dye", "effects": [{"effect": "blob"}]}))
@@ -161,7 +134,7 @@ def test_the_commands_of_the_page_give_its_pictures(
     assert Path("plane.png").read_bytes() == (folder / "plane.png").read_bytes()
 
 
-def test_a_folder_that_cannot_be_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_is_refused(refused: Refused, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "give a folder" in refused(2, "demo", "--gallery", tmp_path / "file")
 
@@ -210,6 +183,7 @@ def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, sce
         (("--scene", "none.toml"), "none.toml: no such file"),
         (("--shape", "3,4"), "is not Z,Y,X"),
         (("--shape", "0,4,5"), "shape is 0; allowed: 1 to 16384"),
+        (("--shape", "z=4,y=5,x=6,t=7", "--steps", "3"), "--steps exclude each other"),
         (("--steps", "0"), "--steps"),
         (("--seed", "-1"), "--seed"),
         (("--paper-shape",), "flame, bubble, shell do"),
@@ -218,7 +192,7 @@ def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, sce
     ],
 )
 def test_unsuitable_words_are_refused_in_one_line(
-    refused: Callable[..., str], tmp_path: Path, words: tuple[str, ...], message: str
+    refused: Refused, tmp_path: Path, words: tuple[str, ...], message: str
 ) -> None:
     assert message in refused(2, "demo", *words, "-o", tmp_path / "run.npy")
     if "--gallery" not in words:
@@ -226,7 +200,7 @@ def test_unsuitable_words_are_refused_in_one_line(
 
 
 def test_a_scene_with_a_wrong_feature_is_refused_before_it_is_simulated(
-    refused: Callable[..., str], tmp_path: Path
+    refused: Refused, tmp_path: Path
 ) -> None:
     scene = tmp_path / "s.toml"
     scene.write_text('feature = "intervall:1:2"\n[[effects]]\neffect = "blob"\n')

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 
 import fhash_codec
 from fhash_cli.output import Progress
 
-Fhash = Callable[..., Result]
 SMALL = ["--effort", "1", "--quiet"]
 PAPER = ["--profile", "paper", "--epochs", "2", "--width", "4", "--quiet"]
 KEYS = {
@@ -106,9 +104,7 @@ def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_b
     words = [
         "encode",
         data,
-        "--no-timings",
-        "--feature",
-        "interval:2:99",
+        *["--no-timings", "--feature", "interval:2:99"],
         *("6" if word == "2" else word for word in PAPER),
         "-o",
     ]
@@ -213,26 +209,8 @@ def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
 BOUNDED = ["--max-error", "0.01", "--tile", "1x6x7x8", "--effort", "1", "-q"]
 
 
-def test_parts_by_a_plan_are_the_file_of_one_command(
-    fhash: Fhash, data: Path, tmp_path: Path
-) -> None:
-    plan, whole, merged = tmp_path / "run.plan", tmp_path / "whole.fhz", tmp_path / "run.fhz"
-    result = fhash("plan", data, "-o", plan, *BOUNDED)
-    assert result.exit_code == 0, result.stderr
-    assert "3 layers, so at most as many parts" in result.stdout
-    assert "kg m-3" in result.stdout
-    parts = [tmp_path / f"{number}.fhz" for number in (1, 2, 3)]
-    for number, part in enumerate(parts, start=1):
-        words = ["--part", f"{number}/3", "--plan", plan, "-q"]
-        result = fhash("encode", data, "-o", part, *words)
-        assert result.exit_code == 0, result.stderr
-    assert fhash("merge", *parts, "-o", merged).exit_code == 0
-    assert fhash("encode", data, "-o", whole, *BOUNDED, "--no-timings").exit_code == 0
-    assert merged.read_bytes() == whole.read_bytes()
-
-
 def test_what_does_not_fit_is_refused(
-    fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path
+    fhash: Fhash, refused: Refused, data: Path, tmp_path: Path
 ) -> None:
     plan, part = tmp_path / "run.plan", tmp_path / "1.fhz"
     assert "give max_error" in refused(2, "plan", data, "-o", plan)
@@ -251,31 +229,39 @@ def test_what_does_not_fit_is_refused(
     assert "is the input itself" in refused(2, "plan", data, "-o", data, "--force", *BOUNDED)
 
 
-@pytest.fixture
-def parts(data: Path, tmp_path: Path, fhash: Fhash) -> list[Path]:
+def parts_of(fhash: Fhash, data: Path, folder: Path, *words: object) -> list[Path]:
     """The three parts of the tiny series."""
-    paths = [tmp_path / f"part{number}.fhz" for number in (1, 2, 3)]
+    paths = [folder / f"part{number}.fhz" for number in (1, 2, 3)]
     for number, path in enumerate(paths, start=1):
-        result = fhash("encode", data, "-o", path, *BOUNDED, "--part", f"{number}/3")
+        result = fhash("encode", data, "-o", path, "--part", f"{number}/3", *words)
         assert result.exit_code == 0, result.stderr
         assert fhash("verify", path).exit_code == 0
     return paths
 
 
+@pytest.mark.parametrize("planned", [False, True])
 def test_the_merged_file_is_that_of_one_command(
-    fhash: Fhash, data: Path, parts: list[Path]
+    fhash: Fhash, data: Path, tmp_path: Path, planned: bool
 ) -> None:
-    whole, merged = parts[0].with_name("whole.fhz"), parts[0].with_name("run.fhz")
-    assert fhash("encode", data, "-o", whole, *BOUNDED, "--no-timings").exit_code == 0
+    plan, whole, merged = (tmp_path / name for name in ("run.plan", "whole.fhz", "run.fhz"))
+    if planned:
+        result = fhash("plan", data, "-o", plan, *BOUNDED)
+        assert result.exit_code == 0, result.stderr
+        assert "3 layers, so at most as many parts" in result.stdout
+        assert "kg m-3" in result.stdout
+    words = ["--plan", plan, "-q"] if planned else BOUNDED
+    parts = parts_of(fhash, data, tmp_path, *words)
     result = fhash("merge", *reversed(parts), "-o", merged)
     assert result.exit_code == 0, result.stderr
     assert "3, of 3 parts with 3 tiles" in result.stdout
+    assert fhash("encode", data, "-o", whole, *BOUNDED, "--no-timings").exit_code == 0
     assert merged.read_bytes() == whole.read_bytes()
 
 
 def test_wrong_sets_of_parts_are_refused(
-    refused: Callable[..., str], data: Path, parts: list[Path]
+    fhash: Fhash, refused: Refused, data: Path, tmp_path: Path
 ) -> None:
+    parts = parts_of(fhash, data, tmp_path, *BOUNDED)
     output = parts[0].with_name("run.fhz")
     assert "parts 2/3; encode them" in refused(2, "merge", parts[0], parts[2], "-o", output)
     assert "give each part once" in refused(2, "merge", *parts, parts[1], "-o", output)
@@ -320,7 +306,7 @@ def test_steps_are_replaced(fhash: Fhash, halves: tuple[Path, Path, np.ndarray])
 
 
 def test_unsuitable_files_are_refused(
-    refused: Callable[..., str], run: Path, halves: tuple[Path, Path, np.ndarray]
+    refused: Refused, run: Path, halves: tuple[Path, Path, np.ndarray]
 ) -> None:
     _, more, values = halves
     np.save(run.with_name("other.npy"), values[:, :5])

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 
 from fhash_cli.commands.info import listing
 
@@ -41,9 +40,7 @@ def added(line: str) -> bool:
         ),
     ],
 )  # fmt: skip
-def test_the_card_names_every_part_with_its_place(
-    fhash: Callable[..., Result], name: str, said: list[str]
-) -> None:
+def test_the_card_names_every_part_with_its_place(fhash: Fhash, name: str, said: list[str]) -> None:
     path = GOLDEN / f"{name}.fhz"
     short = fhash("info", path).stdout
     for row in ("config ", "tables ", "MLP ", "occupancy "):
@@ -85,7 +82,6 @@ def test_several_variables_go_into_one_file_unless_one_can_be_read_in_two_ways()
 
 
 PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
-Fhash = Callable[..., Result]
 
 
 def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
@@ -163,7 +159,7 @@ def test_info_of_data_lists_variables_and_their_commands(
     assert shapes == [[3, 4, 5, 6], [16, 12, 12, 3], [1, 16, 12, 12]]
 
 
-def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:
+def test_options_for_data_are_refused_for_a_run(refused: Refused, run: Path) -> None:
     refusal = refused(2, "info", run, "--missing", "-9")
     assert "is encoded already; --missing is for data" in refusal
     assert "no variable 'q'; it holds density" in refused(2, "info", run, "--var", "q")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,36 +10,35 @@ from typing import Any, cast
 import click
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
+from command_line import Fhash, Refused
 from PIL import Image as Pictures
 
 import fhash_codec
 from fhash_cli.commands.render import (
+    PLANE,
     SETTINGS,
-    NumbersType,
-    OpacityType,
-    PlaneType,
+    SIZE,
     SceneOptions,
-    SizeType,
+    numbers_type,
+    opacity_type,
     scene_options,
 )
 from fhash_codec.rendering.scenes import Scene, scene_in_png
 from fhash_formats.errors import InputError
 
-Fhash = Callable[..., Result]
-
 
 @pytest.mark.parametrize(
     ("kind", "text", "value"),
     [
-        (NumbersType(2), "1,2.5", (1.0, 2.5)),
-        (SizeType(), "800x600", (800, 600)),
-        (SizeType(), "64", (64, 64)),
-        (OpacityType(), "linear", "linear"),
-        (OpacityType(), "0:0,2:1", [[0.0, 0.0], [2.0, 1.0]]),
-        (OpacityType(named=False), "0.1:1", [[0.1, 1.0]]),
-        (PlaneType(), "0,0,1,0.5", {"normal": [0.0, 0.0, 1.0], "offset": 0.5}),
-        (PlaneType(), "1,2,3,0,0,-1", {"point": [1.0, 2.0, 3.0], "normal": [0.0, 0.0, -1.0]}),
+        (numbers_type(2), "1,2.5", (1.0, 2.5)),
+        (SIZE, "800x600", (800, 600)),
+        (SIZE, "64", (64, 64)),
+        (opacity_type(), "linear", "linear"),
+        (opacity_type(), "0:0,2:1", [[0.0, 0.0], [2.0, 1.0]]),
+        (opacity_type(named=False), "0.1:1", [[0.1, 1.0]]),
+        (PLANE, "0,0,1,0.5", {"normal": [0.0, 0.0, 1.0], "offset": 0.5}),
+        (PLANE, "1,2,3,0,0,-1", {"point": [1.0, 2.0, 3.0], "normal": [0.0, 0.0, -1.0]}),
     ],
 )
 def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> None:
@@ -50,12 +48,12 @@ def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> No
 @pytest.mark.parametrize(
     ("kind", "text", "part"),
     [
-        (NumbersType(3), "1,2", "not 3 numbers"),
-        (SizeType(), "wide", "not a size"),
-        (OpacityType(), "0:a", "neither the name of an opacity nor points"),
-        (OpacityType(named=False), "linear", "not points"),
-        (PlaneType(), "0,0,1", "neither a normal and an offset"),
-        (PlaneType(), "a,b,c,d", "neither a normal and an offset"),
+        (numbers_type(3), "1,2", "not 3 numbers"),
+        (SIZE, "wide", "not a size"),
+        (opacity_type(), "0:a", "neither the name of an opacity nor points"),
+        (opacity_type(named=False), "linear", "not points"),
+        (PLANE, "0,0,1", "neither a normal and an offset"),
+        (PLANE, "a,b,c,d", "neither a normal and an offset"),
     ],
 )
 def test_other_texts_are_refused(kind: click.ParamType[Any], text: str, part: str) -> None:
@@ -204,7 +202,7 @@ def test_an_evolution_with_features(fhash: Fhash, run: Path, tmp_path: Path) -> 
     ],
 )
 def test_one_line_and_nothing_written(
-    refused: Callable[..., str], words: list[str], part: str, run: Path, tmp_path: Path
+    refused: Refused, words: list[str], part: str, run: Path, tmp_path: Path
 ) -> None:
     line = refused(2, "render", run, *SMALL, *(word.format(tmp_path) for word in words))
     assert part in line
@@ -220,13 +218,7 @@ def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Pa
             run,
             "-o",
             first,
-            "--size",
-            "32",
-            "--time",
-            "0.5",
-            "--effect",
-            "shading",
-            "--save-scene",
+            *["--size", "32", "--time", "0.5", "--effect", "shading", "--save-scene"],
             scene,
         ).exit_code
         == 0
@@ -275,13 +267,7 @@ def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Pat
         run,
         "-o",
         tmp_path / "v.png",
-        "--size",
-        "24x20",
-        "--depth",
-        "--normal",
-        "--json",
-        "--opacity",
-        "5:0,6:0.9",
+        *["--size", "24x20", "--depth", "--normal", "--json", "--opacity", "5:0,6:0.9"],
     )
     assert result.exit_code == 0, result.stderr
     names = [Path(path).name for path in json.loads(result.stdout)["paths"]]
@@ -326,7 +312,7 @@ def test_without_a_name_the_picture_is_called_as_the_run(
     ],
 )
 def test_a_bad_scene_is_one_line_and_nothing_is_written(
-    refused: Callable[..., str], run: Path, tmp_path: Path, words: list[str], said: str
+    refused: Refused, run: Path, tmp_path: Path, words: list[str], said: str
 ) -> None:
     assert said in refused(2, "render", run, "-o", tmp_path / "view.png", *words)
 

@@ -7,7 +7,6 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -16,9 +15,9 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from click.testing import Result
+from command_line import Fhash, Refused
 
-from fhash_cli.options import DurationType
+from fhash_cli.options import DURATION
 from fhash_codec.cost import cost
 from fhash_codec.cost import report as files
 from fhash_codec.cost import uses as pictures
@@ -28,13 +27,9 @@ from fhash_codec.selftest import run as workers
 from fhash_codec.selftest.case import Case, Finding
 from fhash_codec.selftest.run import CaseResult, Summary
 
-Fhash = Callable[..., Result]
-
 
 @pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.7, 0.9])
-def test_a_flipped_bit_is_found(
-    refused: Callable[..., str], run: Path, tmp_path: Path, place: float
-) -> None:
+def test_a_flipped_bit_is_found(refused: Refused, run: Path, tmp_path: Path, place: float) -> None:
     damaged = bytearray(run.read_bytes())
     damaged[int(len(damaged) * place)] ^= 16
     (tmp_path / "bad.fhz").write_bytes(damaged)
@@ -167,7 +162,7 @@ def test_the_variable_is_that_of_the_container(fhash: Fhash, tmp_path: Path) -> 
 
 
 def test_differences_beside_the_values_are_told(
-    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
+    fhash: Fhash, refused: Refused, tmp_path: Path
 ) -> None:
     data, run = both(tmp_path / "a.h5"), tmp_path / "w.fhz"
     assert fhash("encode", data, "--var", "w", "-o", run, *SMALL).exit_code == 0
@@ -203,7 +198,7 @@ def test_code_for_a_shell(fhash: Fhash, shell: str, words: tuple[str, ...]) -> N
         assert word in result.stdout
 
 
-def test_another_shell_is_refused(refused: Callable[..., str]) -> None:
+def test_another_shell_is_refused(refused: Refused) -> None:
     assert "'csh' is not one of 'bash', 'zsh', 'fish'" in refused(2, "completion", "csh")
 
 
@@ -284,7 +279,7 @@ def test_encode_writes_a_report_on_its_file(fhash: Fhash, data: Path, tmp_path: 
 
 
 def test_a_missing_library_or_folder_is_told_before_any_work(
-    refused: Callable[..., str], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    refused: Refused, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "does not exist" in refused(2, "cost", data, "-o", tmp_path / "no" / "where")
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
@@ -298,10 +293,10 @@ def test_a_missing_library_or_folder_is_told_before_any_work(
     ("text", "seconds"), [("90s", 90.0), ("2m", 120.0), ("1.5h", 5400.0), ("30", 30.0)]
 )
 def test_times_are_read(text: str, seconds: float) -> None:
-    assert DurationType().convert(text, None, None) == seconds
+    assert DURATION.convert(text, None, None) == seconds
 
 
-def test_other_times_are_refused(refused: Callable[..., str], data: Path) -> None:
+def test_other_times_are_refused(refused: Refused, data: Path) -> None:
     assert "'soon' is no time" in refused(2, "cost", data, "--budget", "soon")
     assert "allowed: 1s to 24h" in refused(2, "cost", data, "--budget", "0")
 
@@ -336,16 +331,14 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     return asked
 
 
-def test_one_case_runs_and_holds(fhash: Callable[..., Result]) -> None:
+def test_one_case_runs_and_holds(fhash: Fhash) -> None:
     result = fhash("selftest", "--case", "nothing-finite", "--processes", "1", "--quiet")
     assert result.exit_code == 0, result.output
     assert "values      1        3" in result.stdout
     assert result.stdout.endswith("everything holds\n")
 
 
-def test_a_failure_is_listed_and_exits_with_1(
-    fhash: Callable[..., Result], measured: dict[str, float]
-) -> None:
+def test_a_failure_is_listed_and_exits_with_1(fhash: Fhash, measured: dict[str, float]) -> None:
     measured["worst"] = 1.25
     result = fhash("selftest", "--group", "times", "--quiet")
     assert result.exit_code == 1
@@ -353,7 +346,7 @@ def test_a_failure_is_listed_and_exits_with_1(
     assert result.stderr == ""
 
 
-def test_json_holds_every_figure(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
+def test_json_holds_every_figure(fhash: Fhash, measured: dict[str, float]) -> None:
     result = fhash("selftest", "--case", "spike", "--case", "twos", "--json")
     printed = json.loads(result.stdout)
     assert result.exit_code == 0
@@ -369,7 +362,7 @@ def test_json_holds_every_figure(fhash: Callable[..., Result], measured: dict[st
     }
 
 
-def test_all_runs_more(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
+def test_all_runs_more(fhash: Fhash, measured: dict[str, float]) -> None:
     assert fhash("selftest", "--quiet").exit_code == 0
     few = measured["cases"]
     assert not measured["everything"]
@@ -380,7 +373,7 @@ def test_all_runs_more(fhash: Callable[..., Result], measured: dict[str, float])
 
 
 def test_the_report_is_written_once(
-    fhash: Callable[..., Result], measured: dict[str, float], tmp_path: Path
+    fhash: Fhash, measured: dict[str, float], tmp_path: Path
 ) -> None:
     path = tmp_path / "stability.md"
     assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
@@ -409,7 +402,5 @@ def test_the_report_is_written_once(
         (("--processes", "0"), "0 is not in the range"),
     ],
 )
-def test_what_cannot_be_is_refused(
-    refused: Callable[..., str], words: tuple[str, ...], message: str
-) -> None:
+def test_what_cannot_be_is_refused(refused: Refused, words: tuple[str, ...], message: str) -> None:
     assert message in refused(2, "selftest", *words)

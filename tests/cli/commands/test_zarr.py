@@ -8,18 +8,15 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from click.testing import Result
+from command_line import Fhash, Refused
 
 import fhash_codec
 from fhash_formats.transform.zarr_codec import TransformCodec
-
-Fhash = Callable[..., Result]
 
 
 @pytest.fixture
@@ -49,9 +46,7 @@ def test_variables_are_packed(fhash: Fhash, store: Path) -> None:
         assert np.array_equal(volume[...], array[...])
 
 
-def test_what_cannot_be_packed_is_refused(
-    refused: Callable[..., str], fhash: Fhash, store: Path
-) -> None:
+def test_what_cannot_be_packed_is_refused(refused: Refused, fhash: Fhash, store: Path) -> None:
     run = store.with_suffix(".fhz")
     assert "w is not coded by fhash.transform" in refused(2, "pack", store, "-o", run)
     assert "coded by bytes, zstd" in refused(2, "pack", store, "-o", run, "--var", "w")
@@ -79,9 +74,7 @@ def test_a_container_is_unpacked_and_packed_again(fhash: Fhash, data: Path, tmp_
         assert np.array_equal(other[...], volume[...])
 
 
-def test_a_feature_is_refused_with_the_way_out(
-    refused: Callable[..., str], run: Path, tmp_path: Path
-) -> None:
+def test_a_feature_is_refused_with_the_way_out(refused: Refused, run: Path, tmp_path: Path) -> None:
     told = refused(2, "unpack", run, "-o", tmp_path / "run.zarr")
     assert "a part of its domain" in told
     assert "fhash decode" in told
@@ -188,7 +181,7 @@ def test_the_file_is_released(fhash: Fhash, run: Path, monkeypatch: pytest.Monke
 
 
 def test_what_is_wrong_is_told_in_one_line_serve(
-    refused: Callable[..., str], run: Path, tmp_path: Path
+    refused: Refused, run: Path, tmp_path: Path
 ) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
