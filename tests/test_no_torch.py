@@ -18,14 +18,15 @@ BLOCK = "import sys\nsys.modules['torch'] = None\n"
 """Module that Python runs at its start: `import torch` then fails as if it were not installed."""
 SCRIPT = """
 import json, sys
+from dataclasses import replace
 from click.testing import CliRunner
 from fhash_cli.main import program
 from fhash_codec.compact import head
 
-head.TRIAL_BUDGET = head.Budget(updates=60, samples=8192)
-head.MIN_BYTES, head.MAX_OF_TRIAL = 0, 1e6  # a head is trained, whether it pays or not
 budget = head.Budget(updates=80, samples=8192)
-head.EFFORTS[5] = head.Effort(candidates=4, budget=budget, perceptron=budget)
+trial = replace(head.EFFORTS[5].trial, budget=budget)
+head.MIN_BYTES, least = 0, -1e6  # a head is trained, whether it pays or not
+head.EFFORTS[5] = replace(head.EFFORTS[5], trial=trial, perceptron=budget, least=least)
 for line in sys.stdin:
     result = CliRunner().invoke(program, json.loads(line))
     print(json.dumps([result.exit_code, result.stdout, result.stderr]))

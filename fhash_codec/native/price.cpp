@@ -243,7 +243,8 @@ struct Pricer {
         const int along = halvings[3], shift = other.shift - band.shift;
         for (int i = 0; i < band.blocks; i++) {
             const int j = min(i >> along, other.blocks - 1);
-            const int beside = along ? filled[i & 1 ? j + 1 : j - 1] : filled[j - 1] | filled[j + 1];
+            const int beside =
+                along ? filled[i & 1 ? j + 1 : j - 1] : filled[j - 1] | filled[j + 1];
             near[i] |= filled[j] | beside;
         }
         const uint8_t* from = other.magnitudes_of(row);
@@ -450,7 +451,8 @@ FHASH_EXPORT int64_t fhash_price(const float* coefficients, const int64_t* shape
         pricer->shape = shape;
         pricer->scale = (float)scale;
         pricer->bands.resize((size_t)count);
-        for (int64_t n = 0; n < count; n++) read_band(table + n * COLUMNS, pricer->bands[(size_t)n]);
+        for (int64_t n = 0; n < count; n++)
+            read_band(table + n * COLUMNS, pricer->bands[(size_t)n]);
         for (int level = 0; level < LEVELS; level++) {
             // Bits of a 1 and its sign less those of a 0, in a geometric distribution of the mean.
             const double mean = level ? std::exp2((level - 0.5) / 2 - LOWEST) : std::exp2(-8);

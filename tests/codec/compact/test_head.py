@@ -29,7 +29,6 @@ from fhash_codec.compact.head import (
     EFFORTS,
     PERCEPTRON,
     Budget,
-    Effort,
     Shape,
     _coarsened,
     _side_by_side,
@@ -319,8 +318,9 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     # Prediction would be smaller still.
     monkeypatch.setattr("fhash_codec.compact.predictor.best_predictor", lambda *_, **__: None)
     budget = Budget(updates=200, samples=40_000)
-    monkeypatch.setattr("fhash_codec.compact.head.TRIAL_BUDGET", budget)
-    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget, perceptron=budget))
+    trial = replace(EFFORTS[6].trial, budget=budget)
+    spent = replace(EFFORTS[6], trial=trial, budget=budget, perceptron=budget)
+    monkeypatch.setitem(EFFORTS, 5, spent)
     source, sizes, calls = fronts(), {}, []
 
     def progress(stage: str, done: int, total: int, note: str) -> None:
@@ -391,13 +391,21 @@ def test_tiles_are_coarsened_by_what_a_head_gains(lost: float, share: float) -> 
 
 def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:
     def shapes(size: float, gain: float) -> list[Shape]:
-        return likely_heads(size, gain, 4.5, effort=5)
+        return likely_heads(size, gain, 4.5, EFFORTS[6])
 
     # Few weights pay where little is to be gained, many where much is.
     assert shapes(1_000, 0.5) == []
     assert shapes(120_000, 0.14) == [PERCEPTRON]
     assert [shape.cross for shape in shapes(1e6, 3.0)] == [True]
     assert [shape.cross for shape in shapes(60_000, 0.5)] == [True, False]
+
+
+def test_at_effort_5_a_perceptron_must_save_a_share_of_the_whole_file() -> None:
+    spent = EFFORTS[5]
+    assert likely_heads(60_000, 3.0, 4.5, spent) == [PERCEPTRON]
+    assert likely_heads(60_000, 0.1, 4.5, spent) == [PERCEPTRON]
+    assert likely_heads(60_000, 0.1, 4.5, spent, besides=300_000) == []
+    assert likely_heads(60_000, 0.04, 4.5, spent) == []
 
 
 def test_weights_and_products_of_a_head() -> None:

@@ -37,7 +37,7 @@ from fhash_codec.compact.goal import (
     remarks,
     search,
 )
-from fhash_codec.compact.head import EFFORTS, Budget, Effort
+from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.plan import CodingPlan, holds_beside, plan, rank_share
 from fhash_codec.compact.predictor import IntegerTile, best_predictor, fit_weights
 from fhash_codec.compact.sample import Sample
@@ -407,7 +407,7 @@ def test_more_effort_is_no_larger_and_keeps_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
 ) -> None:
     budget = Budget(updates=200, samples=40_000)
-    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget, perceptron=budget))
+    monkeypatch.setitem(EFFORTS, 5, replace(EFFORTS[5], perceptron=budget))
     source = field((4, 12, 16, 16))
     reports = [
         fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))
