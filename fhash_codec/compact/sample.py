@@ -301,33 +301,30 @@ WIDE = 8.0
 distribution of numbers that are not rounded."""
 
 
-class PricedSample:
+class PricedSample(Sample):
     """A sample whose tiles are priced, and not coded.
 
     Sizes and errors are those that fhash_codec/native/price.cpp foretells, for all vertices of a
-    tile. Only transforms are compared by them.
+    tile. Transforms and tiles are compared by them.
 
     Attributes:
-        sample: the sample, which codes its tiles.
-        tiles, grams, allows_bases, map_all: see `Sample`.
+        sample: the same sample, which codes its tiles.
     """
 
     def __init__(self, sample: Sample) -> None:
+        vars(self).update(vars(sample))
         self.sample = sample
-        self.tiles, self.grams, self.allows_bases = sample.tiles, sample.grams, sample.allows_bases
-        self.map_all = sample.map_all
 
     def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
         """Return what is foretold of the series for each pair of settings and coding."""
-        sample = self.sample
         return [
-            total(sample.map(partial(_price, settings=settings, coding=coding)), sample.weights)
+            total(self.map(partial(_price, settings=settings, coding=coding)), self.weights)
             for settings, coding in trials
         ]
 
 
-def priced(sample: Sample, settings: TileSettings, effort: int) -> Sample | PricedSample:
-    """Return a sample on which transforms are compared: a priced one where that can be.
+def priced(sample: Sample, settings: TileSettings, effort: int) -> Sample:
+    """Return a sample on which choices are compared: a priced one where that can be.
 
     That is up to MAX_PRICED_EFFORT, where all vertices count and are coded by transform in float32.
     """

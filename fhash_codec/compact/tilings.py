@@ -123,7 +123,7 @@ class Trials:
         """Return settings with a transform, and the outcome of the series if it was coded."""
         sample = self._sample(tile, PICKED_VERTICES)
         settings, tried = rough_transform(
-            priced(sample, self._settings, self._task.config.effort),
+            sample,
             self._settings,
             self._coding,
             self._known_transforms(tile),
@@ -137,7 +137,7 @@ class Trials:
         blocks = self._blocks.retile(tile)
         settings = replace(self._settings, transform=usual_transform(blocks.tile))
         sample = Sample(blocks, vertices, self._task.workers, tick=self._task.parts.tick)
-        return sample.filled(settings, 1)
+        return priced(sample.filled(settings, 1), settings, self._task.config.effort)
 
     def _known_transforms(self, tile: Shape) -> dict[int, AxisTransform]:
         """Return the transforms that need no trial: those of axes as long, and wavelets along z."""

@@ -266,7 +266,7 @@ def rough_transform(
 ) -> tuple[TileSettings, Outcome | None]:
     """Return settings with a good transform by very few trials, to compare tilings with.
 
-    Beside them is their outcome on the sample; None where nothing was coded.
+    Beside them is their outcome on the sample; None where nothing was tried.
 
     known: transforms of axes that need no trial, such as those of the same axis elsewhere.
     lines: of each tile, that the data's own bases are fitted on.
@@ -292,8 +292,7 @@ def rough_transform(
             # A basis along time may be good with bases in space alone.
             trials.append((bases.along(0), *own[1:]))
         best = min([best, *_tried(sample, settings, trials, coding)], key=itemgetter(0))
-    outcome = None if isinstance(sample, PricedSample) else best[2]
-    return _along(settings, best[1]), outcome
+    return _along(settings, best[1]), best[2]
 
 
 def adapted_transform(
