@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.readers.common.cf import (
-    MAX_LETTERS,
     Column,
     Packing,
     beside,
@@ -24,6 +23,7 @@ from fhash_formats.readers.common.cf import (
     real_time,
     role_of_coordinate,
     role_of_name,
+    texts_along,
     usable,
     written_times,
 )
@@ -504,20 +504,6 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
                     yield str(key), array
 
 
-def _texts(
-    dimension: str, length: int, scope: Sequence[xr.Dataset]
-) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
-    """Variables of texts along one dimension, or of letters: name, texts and attributes."""
-    for dataset in scope:
-        for name, array in dataset.variables.items():
-            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
-            texts = array.ndim == 1 and array.dtype.kind in "SUO"
-            if (letters or texts) and array.dims[0] == dimension and len(array) == length:
-                found = array.to_numpy()
-                rows = [b"".join(row) for row in found.tolist()] if letters else found
-                yield str(name), np.asarray(rows), array.attrs
-
-
 def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
     for name, array in _along(dimension, scope):
         role = role_of_coordinate(name, array.attrs)
@@ -572,7 +558,12 @@ def _coordinates(
         found = real_time(named, others) if axis == "t" else named
         found = found or next(roles, None)
         if axis == "t" and (found is None or only_counts(found)):
-            written = written_times(dimension, _texts(dimension, length, scope))
+            arrays = (
+                (str(name), array, array.dims)
+                for dataset in scope
+                for name, array in dataset.variables.items()
+            )
+            written = written_times(dimension, texts_along(dimension, length, arrays))
             if written is not None:
                 coords[axis] = written
                 continue

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf import (
-    MAX_LETTERS,
     SCALING,
     Column,
     Packing,
@@ -26,6 +25,7 @@ from fhash_formats.readers.common.cf import (
     real_time,
     role_of_coordinate,
     role_of_name,
+    texts_along,
     usable,
     written_times,
 )
@@ -363,8 +363,14 @@ class ZarrTree(FileOfArrays):
         )
         time, dimension = found.get("t"), dict(named).get("t")
         if dimension is not None and (time is None or not time.numeric or only_counts(time)):
-            texts = self._texts(variable.handle[0], str(dimension.name), dimension.length)
-            written = written_times(str(dimension.name), texts)
+            places = (parent(variable.handle[0]), "")
+            near = (
+                (name, array, dimension_names(array))
+                for name, array in self.arrays.items()
+                if parent(name) in places
+            )
+            along = str(dimension.name)
+            written = written_times(along, texts_along(along, dimension.length, near))
             coords |= {} if written is None else {"t": written}
         return coords
 
@@ -372,19 +378,6 @@ class ZarrTree(FileOfArrays):
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]
-
-    def _texts(
-        self, path: str, dimension: str, length: int
-    ) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
-        """Arrays of texts along one dimension, or of letters: name, texts and attributes."""
-        for name, array in self.arrays.items():
-            letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
-            texts = array.ndim == 1 and array.dtype.kind in "SUTO"
-            near = parent(name) in (parent(path), "") and (letters or texts)
-            if near and dimension_names(array)[0] == dimension and array.shape[0] == length:
-                found = np.asarray(array[...])
-                rows = [b"".join(row) for row in found.tolist()] if letters else found
-                yield name, np.asarray(rows), dict(array.attrs)
 
     def _columns(self, group: str) -> dict[str, Column]:
         columns = _columns(self.source, self.arrays, group)

@@ -448,7 +448,7 @@ def text(form: str) -> Callable[[Path, str], None]:
     """A file that names the other where OTHER or, as a pattern of numbers, PATTERN stands."""
 
     def make(path: Path, other: str) -> None:
-        named = form.replace("OTHER", other).replace("PATTERN", other.replace("0", "%d"))
+        named = form.replace("OTHER", other).replace("PATTERN", other.replace("s0.", "s%d."))
         path.write_text(named)
 
     return make

@@ -6,7 +6,7 @@ import base64
 import math
 import re
 import struct
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -484,6 +484,22 @@ def with_times(metadata: SourceMetadata, time: Coordinate) -> SourceMetadata:
         )
         variables.insert(0, stamp)
     return replace(metadata, variables=tuple(variables))
+
+
+def texts_along(
+    dimension: str, length: int, arrays: Iterable[tuple[str, Any, Sequence[object]]]
+) -> Iterator[tuple[str, npt.NDArray[Any], Mapping[str, Any]]]:
+    """Arrays of texts along one dimension, or of letters: name, texts and attributes.
+
+    arrays: name, array and names of the dimensions of each.
+    """
+    for name, array, dimensions in arrays:
+        letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
+        texts = array.ndim == 1 and array.dtype.kind in "SUTO"
+        if (letters or texts) and dimensions[0] == dimension and array.shape[0] == length:
+            found = np.asarray(array[...])
+            rows = [b"".join(row) for row in found.tolist()] if letters else found
+            yield name, np.asarray(rows), array.attrs
 
 
 def written_times(
