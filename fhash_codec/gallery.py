@@ -11,9 +11,9 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
-from fhash_codec.rendering.grid import Floats
 from fhash_codec.simulation.simulate import simulate
 from fhash_formats.series import ArraySeries, Coordinate, Series
+from fhash_formats.support.arrays import Double
 
 DAY = 86400.0
 """Seconds of a day."""
@@ -122,7 +122,7 @@ def _jet() -> ArraySeries:
     )
 
 
-def _series(values: Floats, name: str, units: str, **coords: Coordinate) -> ArraySeries:
+def _series(values: Double, name: str, units: str, **coords: Coordinate) -> ArraySeries:
     return ArraySeries(values.astype(np.float32), name=name, units=units, coords=coords)
 
 

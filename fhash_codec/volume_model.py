@@ -20,10 +20,10 @@ from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
+from fhash_formats.support.arrays import Mask
 
 Positions = npt.NDArray[np.float64]
 """Positions (n,) of points along one axis."""
-Mask = npt.NDArray[np.bool_]
 Decoded = tuple[npt.NDArray[Any], Mask]
 """Values of a part of the box, and the mask of those in the coreset."""
 

@@ -34,6 +34,7 @@ from fhash_codec.paper.train import plan_training
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
+from fhash_formats.support.arrays import Mask
 
 POINTS = 1 << 19
 """Points of a measurement."""
@@ -127,8 +128,6 @@ DECODE_TURNS = 5
 """Turns in which both ways decode."""
 KEY_FRAMES = 4
 """Largest number of key frames that are decoded in a turn."""
-
-Mask = npt.NDArray[np.bool_]
 
 
 class _ZeroTable:

@@ -21,7 +21,7 @@ from fhash_codec.compact.tiles import Coding, Outcome, Tile, Worked, code, code_
 from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_quality, full_header, write_coordinates
 from fhash_codec.measure.errors import Errors, ErrorSums, error_sums
-from fhash_codec.measure.value_range import ValueRange, Values, power_of_two
+from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_formats.container import (
     SOURCE,
     Container,
@@ -35,6 +35,7 @@ from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, S
 from fhash_formats.container.zip_file import damage_named
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
+from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import exact_number, is_within
 from fhash_formats.transform.decoding import decode_tile

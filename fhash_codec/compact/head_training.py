@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.measure.errors import pointer
-from fhash_codec.measure.value_range import Doubles, Floats
+from fhash_formats.support.arrays import Double, Single
 from fhash_formats.transform.coder import checked
 from fhash_formats.transform.head import (
     CROSS,
@@ -44,7 +44,7 @@ MAX_TARGET = 1 << 30
 class Pair(NamedTuple):
     """A decoded tile (t, z, y, x) with its original."""
 
-    decoded: Floats
+    decoded: Single
     original: npt.NDArray[Any]
     counted: npt.NDArray[np.bool_] | None
     """Mask of the voxels that count; None if all count."""
@@ -55,7 +55,7 @@ class Voxels(NamedTuple):
 
     places: npt.NDArray[np.int64]
     """Coordinates (4, n)."""
-    values: Floats
+    values: Single
     """Clipped decoded values (n,)."""
     originals: npt.NDArray[Any]
     """Original values (n,)."""
@@ -166,7 +166,7 @@ def batches(
 def _fill_slots(
     inputs: npt.NDArray[np.int16],
     slots: npt.NDArray[np.int64],
-    decoded: Floats,
+    decoded: Single,
     places: npt.NDArray[np.int64],
     offsets: Sequence[tuple[int, ...]],
     value_range: ErrorRange,
@@ -214,7 +214,7 @@ MIN_SCALE = 1e-6
 """Least unit of weights and biases in the file."""
 
 
-def adam_factors(rates: Doubles) -> tuple[Doubles, Doubles]:
+def adam_factors(rates: Double) -> tuple[Double, Double]:
     """Return the learning rates and the factors of Adam's root, corrected for its start.
 
     rates: learning rate of each update from the first one on, (updates,).
@@ -249,15 +249,15 @@ class Network:
             weights = random.uniform(-1, 1, size=out * count) * reach
             biases = random.uniform(-1, 1, size=out) * reach
             parts += [weights * 0.1 if last else weights, biases * 0.0 if last else biases]
-        self.parameters: Doubles = np.concatenate(parts)
+        self.parameters: Double = np.concatenate(parts)
         self.means, self.squares = np.zeros((2, len(self.parameters)))
 
     def learn(
         self,
         voxels: Batches,
         first: int,
-        rates: Doubles,
-        roots: Doubles,
+        rates: Double,
+        roots: Double,
         *,
         as_in_file: bool,
     ) -> None:
@@ -312,7 +312,7 @@ class Network:
         return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
 
 
-def _as_in_file(values: Doubles, most: int) -> Scaled:
+def _as_in_file(values: Double, most: int) -> Scaled:
     """Return weights or biases as the integers of the file, at most `most` either way.
 
     Their unit is a float16 that maps the largest magnitude to at most `most`.
@@ -461,7 +461,7 @@ def _optimise(
     networks: list[Network],
     training: Batches,
     held_out: Batches,
-    rates: Doubles,
+    rates: Double,
     progress: Callable[[float], None] | None,
 ) -> tuple[list[tuple[float, int, float]], Network]:
     """Train networks, from some update on only the best; return its gains on the way and it.
@@ -501,7 +501,7 @@ def _optimise(
     return history, networks[0]
 
 
-def _rates(updates: int, highest: float) -> Doubles:
+def _rates(updates: int, highest: float) -> Double:
     """Return the learning rate of each update: a linear rise, then a smooth fall to 0.
 
     The fall is the cubic 1 - f**2 (3 - 2 f), within 0.01 of a half cosine. The last bit of a

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
 from fhash_codec.features.occupancy import read_occupancy
-from fhash_codec.measure.value_range import Doubles
 from fhash_formats.container import Container, StoredArray
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Double
 from fhash_formats.support.threads import chunk_region, common_part
 from fhash_formats.transform.head import Layer, NeighbourHead
 from fhash_formats.transform.tile_format import TileSettings
@@ -366,14 +366,14 @@ class CompactModel:
             raise InputError(f"level of detail {lod}; a plain file has 0 to {len(self.tables) - 1}")
         return cast(self.tables[lod][step, *region.slices(), 0], self._array.dtype)
 
-    def sample(self, steps: Doubles, space: list[Doubles]) -> Doubles:
+    def sample(self, steps: Double, space: list[Double]) -> Double:
         """Return the values at points, quadrilinear.
 
         steps, space: steps and (z, y, x) of the points, in vertices of the box, all inside.
         """
         return self._interpolated(steps, space)[0]
 
-    def sample_with_gradient(self, steps: Doubles, space: list[Doubles]) -> tuple[Doubles, Doubles]:
+    def sample_with_gradient(self, steps: Double, space: list[Double]) -> tuple[Double, Double]:
         """Return the values at points, and their derivatives (points, 4) by step, z, y and x.
 
         On the border of two cells the derivatives are those of the cell after it.
@@ -397,8 +397,8 @@ class CompactModel:
         return values, slopes
 
     def _interpolated(
-        self, steps: Doubles, space: list[Doubles]
-    ) -> tuple[Doubles, Doubles, list[Doubles]]:
+        self, steps: Double, space: list[Double]
+    ) -> tuple[Double, Double, list[Double]]:
         """Return the values at points, and what they are interpolated from.
 
         That is the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the

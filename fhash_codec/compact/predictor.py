@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Tile
 from fhash_codec.compact.transform import gram_of, usual_transform
-from fhash_codec.measure.value_range import Mask
+from fhash_formats.support.arrays import Mask
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.coder import encode_block
 from fhash_formats.transform.predict import (

@@ -30,7 +30,7 @@ from fhash_codec.compact.tiles import (
     recoded,
     total,
 )
-from fhash_codec.measure.value_range import Values
+from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.coder import array_arguments, checked
 from fhash_formats.transform.decoding import transform_for

@@ -16,8 +16,9 @@ import numpy as np
 
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
-from fhash_codec.measure.value_range import Mask, Values, power_of_two
+from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.series import ArraySeries, Series
+from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
 from fhash_formats.transform.decoding import decode_tile

@@ -21,8 +21,7 @@ from fhash_codec.progress import Progress
 from fhash_codec.volume import decoded_type
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import Series
-
-Values = npt.NDArray[Any]
+from fhash_formats.support.arrays import Values
 
 LAYOUTS = {
     "frame": "(z, y, x) of each step",

@@ -20,7 +20,6 @@ from fhash_codec.cost.results import Picture, Read
 from fhash_codec.measure.errors import psnr
 from fhash_codec.measure.metrics import ssim
 from fhash_codec.progress import Progress
-from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.image import Image
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, complete, warped
@@ -39,6 +38,7 @@ from fhash_codec.rendering.scenes import (
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series
+from fhash_formats.support.arrays import Single, Values
 
 REGION = 16
 """Vertices of a region along each axis."""
@@ -46,8 +46,6 @@ PLACES = 5
 """Random places of each kind of read; one more is a warm-up."""
 LEVELS = (1, 2, 3)
 """Levels of detail."""
-
-Values = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)

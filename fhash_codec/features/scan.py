@@ -13,18 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.measure.errors import range_and_sum
-from fhash_codec.measure.value_range import (
-    Mean,
-    Ranks,
-    RanksSpan,
-    ValueRange,
-    Values,
-    pieces,
-    power_of_two,
-)
+from fhash_codec.measure.value_range import Mean, Ranks, RanksSpan, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, warn_defaults
+from fhash_formats.support.arrays import Values
 from fhash_formats.support.values import exact_number
 
 MOST = 2.0

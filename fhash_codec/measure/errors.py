@@ -14,16 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.measure.value_range import (
-    Doubles,
-    Mask,
-    Ranks,
-    ValueRange,
-    Values,
-    pieces,
-    power_of_two,
-)
+from fhash_codec.measure.value_range import Ranks, ValueRange, pieces, power_of_two
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double, Mask, Values
 from fhash_formats.support.values import exact_number, is_wide_integer
 
 LANES = 256
@@ -167,7 +160,7 @@ def pointer(array: Values | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
-def _lane_sum(values: Doubles) -> float:
+def _lane_sum(values: Double) -> float:
     """The sum of at most PIECE values in the fixed order.
 
     A running sum adds in one order on every machine; `np.sum` does not.
@@ -214,7 +207,7 @@ def _numpy_sums(
     return total
 
 
-def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> Doubles:
+def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> Double:
     """(original - decoded) * scale; exact for 64-bit integers."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)

@@ -25,9 +25,10 @@ from fhash_codec.measure.errors import (
     pointer,
     range_and_sum,
 )
-from fhash_codec.measure.value_range import Doubles, Mask, ValueRange, Values, pieces, power_of_two
+from fhash_codec.measure.value_range import ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double, Mask, Values
 from fhash_formats.support.threads import share_out, usable_threads
 
 SIGMA = 1.5
@@ -177,10 +178,10 @@ def _cuts(start: int, stop: int, limit: int) -> list[tuple[int, int]]:
 
 
 @lru_cache(maxsize=1)
-def _weights() -> Doubles:
+def _weights() -> Double:
     """The Gaussian window along one axis (WINDOW,); its sum is 1."""
     weights = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
-    normalised: Doubles = weights / weights.sum()
+    normalised: Double = weights / weights.sum()
     return normalised
 
 

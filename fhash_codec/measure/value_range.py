@@ -15,12 +15,6 @@ from fhash_formats.errors import InputError
 from fhash_formats.support.values import exact_number, integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
 
-Values = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-Floats = npt.NDArray[np.float32]
-Doubles = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-
 PIECE = 2**20
 """Values that are converted to float64 at a time; they take 8 MiB."""
 

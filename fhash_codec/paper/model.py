@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import CORNERS, Box, Mlp, Spans, Table
 from fhash_codec.features.occupancy import read_occupancy
-from fhash_codec.measure.value_range import Doubles, Floats, ValueRange
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.native import network as native
 from fhash_codec.paper.network import Network, RankedBits, Resolution, SparseFrame, row_bits
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
+from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import share_out, usable_threads
 
 AXES = ("key_index", "z", "y", "x")
@@ -47,7 +48,7 @@ class Patch:
         first: vertex (t, z, y, x) of the level at which the part begins.
     """
 
-    values: Floats
+    values: Single
     first: tuple[int, ...]
 
     @classmethod
@@ -63,7 +64,7 @@ class Patch:
         _, z, y, x, _ = self.values.shape
         return z * y * x, y * x, x, 1
 
-    def at_one_time(self, values: Floats) -> Patch:
+    def at_one_time(self, values: Single) -> Patch:
         """Return the same part with other values (1, z, y, x, E), those of one time."""
         return replace(self, values=values, first=(0, *self.first[1:]))
 
@@ -273,7 +274,7 @@ def sample_points(
     *,
     gradient: Literal[False] = ...,
     threads: int | None = ...,
-) -> Floats: ...
+) -> Single: ...
 
 
 @overload
@@ -286,7 +287,7 @@ def sample_points(
     *,
     gradient: Literal[True],
     threads: int | None = ...,
-) -> tuple[Floats, Floats]: ...
+) -> tuple[Single, Single]: ...
 
 
 def sample_points(
@@ -298,7 +299,7 @@ def sample_points(
     *,
     gradient: bool = False,
     threads: int | None = None,
-) -> Floats | tuple[Floats, Floats]:
+) -> Single | tuple[Single, Single]:
     """Return the normalised values float32 (n,) at n points.
 
     With `gradient`, also return the derivatives float32 (n, 4) by key index, z, y and x, per key
@@ -354,7 +355,7 @@ def decode_region(
     *,
     requested: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
-) -> Floats:
+) -> Single:
     """Return the normalised values float32 (z, y, x) at the vertices of a region.
 
     They are those of `sample_points`, so that a region holds the bits of that part of the frame.
@@ -454,9 +455,9 @@ class PointSampler:
 
     def sample(
         self,
-        columns: Sequence[Doubles],
-        values: Floats,
-        slopes: Floats | None,
+        columns: Sequence[Double],
+        values: Single,
+        slopes: Single | None,
         threads: int,
     ) -> None:
         """Write the normalised values and, unless `slopes` is None, the derivatives at points.
@@ -478,10 +479,10 @@ class PointSampler:
 
     def evaluate(
         self,
-        columns: Sequence[Doubles],
-        values: Floats,
-        slopes: Floats | None = None,
-        input_slopes: Floats | None = None,
+        columns: Sequence[Double],
+        values: Single,
+        slopes: Single | None = None,
+        input_slopes: Single | None = None,
     ) -> None:
         """Write the values, and the derivatives that are asked for, at points, in one thread.
 
@@ -511,7 +512,7 @@ class PointSampler:
         _check_status(status)
 
 
-def input_slopes(network: Network, points: Doubles) -> Floats:
+def input_slopes(network: Network, points: Double) -> Single:
     """Return the derivatives float32 (inputs, n) of the value by each input of the network.
 
     The inputs are the interpolated embeddings, in the order of `Network`. The value is normalised.
@@ -535,7 +536,7 @@ def _check_status(status: int) -> None:
         raise MemoryError("not enough memory to evaluate points")
 
 
-def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[Doubles], int]:
+def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[Double], int]:
     """Return coordinates as arrays (n,), or (1,) where one stands for all points, and n."""
     columns = [np.atleast_1d(np.asarray(array, dtype=np.float64)) for array in arrays]
     lengths = {len(column) for column in columns if np.ndim(column) == 1} - {1}
@@ -547,7 +548,7 @@ def _columns(arrays: Sequence[npt.ArrayLike]) -> tuple[list[Doubles], int]:
     return columns, lengths.pop() if lengths else 1
 
 
-def _check(network: Network, columns: Sequence[Doubles]) -> None:
+def _check(network: Network, columns: Sequence[Double]) -> None:
     """Raise RegionError for the first point that is outside the box."""
     for axis, column, size in zip(
         AXES, columns, (network.key_frames, *network.box_size), strict=True
@@ -560,17 +561,17 @@ def _check(network: Network, columns: Sequence[Doubles]) -> None:
             )
 
 
-def _chosen(column: Doubles, chosen: npt.NDArray[np.intp]) -> Doubles:
+def _chosen(column: Double, chosen: npt.NDArray[np.intp]) -> Double:
     """Return a coordinate of chosen points, in ascending order; one number stands for all."""
     return column if len(column) in (1, len(chosen)) else column[chosen]
 
 
-def _extremes(columns: Sequence[Doubles]) -> tuple[list[float], list[float]]:
+def _extremes(columns: Sequence[Double]) -> tuple[list[float], list[float]]:
     """Return the smallest and the largest of each coordinate."""
     return [float(c.min()) for c in columns], [float(c.max()) for c in columns]
 
 
-def _one_time(tables: PointTables, columns: Sequence[Doubles], count: int) -> float | None:
+def _one_time(tables: PointTables, columns: Sequence[Double], count: int) -> float | None:
     """Return the time that all points share, if interpolating the tables there once pays."""
     times = columns[0]
     if tables.vertices > READ_PER_POINT * count or times.min() != times.max():
@@ -579,7 +580,7 @@ def _one_time(tables: PointTables, columns: Sequence[Doubles], count: int) -> fl
 
 
 def _groups(
-    columns: Sequence[Doubles], chosen: npt.NDArray[np.intp]
+    columns: Sequence[Double], chosen: npt.NDArray[np.intp]
 ) -> Iterator[npt.NDArray[np.intp]]:
     """Split chosen points into groups that each span a part of the finest table fit to be read.
 
@@ -646,7 +647,7 @@ class PaperModel:
         """
         return self._occupancy(first, last, features)[region.slices()]
 
-    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> Doubles:
+    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> Double:
         """Return the values (z, y, x) of a region.
 
         Vertices that are not requested are NaN and cost nothing.
@@ -660,11 +661,11 @@ class PaperModel:
             "decode it whole"
         )
 
-    def sample(self, keys: Doubles, space: list[Doubles]) -> Doubles:
+    def sample(self, keys: Double, space: list[Double]) -> Double:
         """Return the values (n,) at points inside the box."""
         return self._range.from_unit(sample_points(self.network, keys, *space))
 
-    def sample_with_gradient(self, keys: Doubles, space: list[Doubles]) -> tuple[Doubles, Doubles]:
+    def sample_with_gradient(self, keys: Double, space: list[Double]) -> tuple[Double, Double]:
         """Return the values (n,) and analytic derivatives (n, 4) by key index, z, y and x."""
         unit, slopes = sample_points(self.network, keys, *space, gradient=True)
         return self._range.from_unit(unit), slopes.astype(np.float64) * (

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import TableSource
-from fhash_codec.measure.value_range import Floats, Integers, Mask
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Longs, Mask, Single
 
 Resolution = tuple[int, int, int, int]
 """Vertices per axis of one level, (t, z, y, x)."""
@@ -201,7 +201,7 @@ class RankedBits:
         """Number of ones."""
         return int(self.blocks[-1])
 
-    def lookup(self, positions: Integers) -> Integers:
+    def lookup(self, positions: Longs) -> Longs:
         """Return the place of each position among the ones, `count` where its bit is 0.
 
         Args:
@@ -226,7 +226,7 @@ class RankedBits:
         """The bitmap as bytes, in the order of `of_octets`, filled up to whole words."""
         return self.words.astype("<u8", copy=False).view(np.uint8)
 
-    def positions(self) -> Integers:
+    def positions(self) -> Longs:
         """Return the positions of all ones, ascending."""
         return np.flatnonzero(np.unpackbits(self.octets, bitorder="little"))
 
@@ -260,7 +260,7 @@ class SparseFrame:
         """Bits of a row along x; vertex (z, y, x) has bit (z * shape[1] + y) * row + x."""
         return row_bits(self.shape[2])
 
-    def take(self, z: Integers, y: Integers, x: Integers) -> npt.NDArray[Any]:
+    def take(self, z: Longs, y: Longs, x: Longs) -> npt.NDArray[Any]:
         """Return the embeddings (..., E) of vertices, whose indices broadcast to (...)."""
         positions = (z * self.shape[1] + y) * self.row + x
         return self.values.take(self.bits.lookup(positions), axis=0)
@@ -288,7 +288,7 @@ def row_bits(vertices: int) -> int:
     return -(-vertices // 8) * 8
 
 
-Layer = tuple[Floats, Floats]
+Layer = tuple[Single, Single]
 """Weight (out, in) and bias (out,)."""
 
 
@@ -353,7 +353,7 @@ class Network:
         return all(isinstance(table, SparseSource) for table in self.tables)
 
     @cached_property
-    def matrices(self) -> tuple[Floats, ...]:
+    def matrices(self) -> tuple[Single, ...]:
         """Layers as matrices (out + 1, in + 1) that include the biases.
 
         They act on vectors whose last number is 1: the bias is the last column, and the last row
@@ -451,7 +451,7 @@ class NumberType:
     offset: float = 0.0
 
     @classmethod
-    def of(cls, values: Floats, kind: str) -> NumberType:
+    def of(cls, values: Single, kind: str) -> NumberType:
         """Return the number type named `kind` with the scale and offset that fit some embeddings.
 
         Raises InputError where the embeddings are not finite or do not fit in the type.
@@ -481,7 +481,7 @@ class NumberType:
         )
         return cls(dtype=dtype, scale=scale, offset=low)
 
-    def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
+    def stored(self, embeddings: Single) -> npt.NDArray[Any]:
         """Return embeddings as numbers of the type, of the same shape."""
         if self.dtype.kind == "f":
             return embeddings.astype(self.dtype)

@@ -17,11 +17,11 @@ from fhash_codec.boxes import TABLE_AXES, Box, Sizes, TableSource
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import Bits, read_bits, write_bits
-from fhash_codec.measure.value_range import Floats, Integers, Mask
 from fhash_codec.paper.network import Architecture, Network, NumberType, Resolution, SparseFrame
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Longs, Mask, Single
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -58,11 +58,11 @@ class Bricks:
         window = self._window(key, box)
         return self._region(self._in_coreset(window.numbers), window, box)
 
-    def samples(self, key: int, box: Box) -> Floats:
+    def samples(self, key: int, box: Box) -> Single:
         """Return the normalised values (z, y, x) of a region at a key frame."""
         return self.embeddings(self._coreset.values[None], key, box)[..., 0]
 
-    def embeddings(self, fine: Floats, key: int, box: Box) -> Floats:
+    def embeddings(self, fine: Single, key: int, box: Box) -> Single:
         """Return the finest embeddings (z, y, x, E) of a region at a key frame.
 
         Args:
@@ -80,7 +80,7 @@ class Bricks:
             regions.append(self._region(contents, window, box))
         return np.stack(regions, axis=-1)
 
-    def _brick_index(self, key: Integers, z: Integers, y: Integers, x: Integers) -> Integers:
+    def _brick_index(self, key: Longs, z: Longs, y: Longs, x: Longs) -> Longs:
         """Return the place of bricks in the grids of all key frames, in C order."""
         grid = self._coreset.brick_grid
         return ((key * grid[0] + z) * grid[1] + y) * grid[2] + x
@@ -193,7 +193,7 @@ def needed_by(architecture: Architecture, coreset: Coreset) -> Needed:
     )
 
 
-def corners(length: int, resolution: int) -> tuple[Integers, Integers]:
+def corners(length: int, resolution: int) -> tuple[Longs, Longs]:
     """Return the vertices of a level before and after each vertex of the box, along one axis.
 
     They are the same where a vertex of the box lies on a vertex of the level.
@@ -335,7 +335,7 @@ frames, and three quarters of the bytes that the fringe had added.
 """
 
 
-def fringe_step(coreset: Coreset, key_frames: int, finest: Callable[[int], Floats]) -> float | None:
+def fringe_step(coreset: Coreset, key_frames: int, finest: Callable[[int], Single]) -> float | None:
     """Return the step to which finest embeddings of the fringe are rounded, a power of two.
 
     None where there is no fringe, or nothing in it was trained.
@@ -355,7 +355,7 @@ def fringe_step(coreset: Coreset, key_frames: int, finest: Callable[[int], Float
     return float(2.0 ** math.floor(math.log2(STEP_SHARE * math.sqrt(squares / count))))
 
 
-def round_fringe(coreset: Coreset, key: int, embeddings: Floats, step: float | None) -> Floats:
+def round_fringe(coreset: Coreset, key: int, embeddings: Single, step: float | None) -> Single:
     """Return the finest embeddings (z, y, x, E) of a key frame with its fringe rounded.
 
     Args:
@@ -369,7 +369,7 @@ def round_fringe(coreset: Coreset, key: int, embeddings: Floats, step: float | N
     rounded = np.rint(embeddings / np.float32(step)) * np.float32(step)
     outside = _outside(coreset, key)[..., None]
     # Adding 0 turns -0 into 0: one pattern of bits for the most frequent number.
-    result: Floats = np.where(outside, rounded + np.float32(0), embeddings)
+    result: Single = np.where(outside, rounded + np.float32(0), embeddings)
     return result
 
 
@@ -383,7 +383,7 @@ GRIDS = 16
 
 
 def write_model(
-    writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Floats, Floats]]
+    writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Single, Single]]
 ) -> None:
     """Write the occupancy of the features of a coreset, and the layers (weight, bias)."""
     for number, (weight, bias) in enumerate(layers, start=1):
@@ -403,8 +403,8 @@ def write_tables(
     writer: ContainerWriter,
     architecture: Architecture,
     coreset: Coreset,
-    fine: Floats,
-    tables: list[Floats],
+    fine: Single,
+    tables: list[Single],
     kind: str,
     *,
     sparse: bool = False,
@@ -431,10 +431,10 @@ def write_tables(
         coreset, architecture.key_frames, lambda key: bricks.embeddings(fine, key, box)
     )
 
-    def finest(key: int) -> Floats:
+    def finest(key: int) -> Single:
         return round_fringe(coreset, key, bricks.embeddings(fine, key, box), step)
 
-    nodes: list[Callable[[int], Floats]] = [
+    nodes: list[Callable[[int], Single]] = [
         finest,
         *(
             table.reshape(*level, size).__getitem__
@@ -496,7 +496,7 @@ def component_name(level: int, component: int) -> str:
     return f"{table_name(level)}/component_{component}"
 
 
-def mix_components(components: Sequence[Floats], mixing: Floats) -> Floats:
+def mix_components(components: Sequence[Single], mixing: Single) -> Single:
     """Return embeddings float32 (..., E) from E components (...) (FORMAT.md, Coded tables).
 
     Embedding e is the sum of component j times mixing[j, e]. Each product and each sum is rounded
@@ -601,7 +601,7 @@ def _needed(container: Container) -> Needed:
     return Needed(levels, grid, fringe=model.get("sparse") == FRINGE)
 
 
-def _stored(number_type: NumberType, read: Callable[[int], Floats], node: int) -> npt.NDArray[Any]:
+def _stored(number_type: NumberType, read: Callable[[int], Single], node: int) -> npt.NDArray[Any]:
     """Return the embeddings (z, y, x, E) of a time node as numbers of a type."""
     return number_type.stored(read(node))
 

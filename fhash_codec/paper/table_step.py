@@ -16,7 +16,6 @@ from fhash_codec.compact.goal import Bracket, geometric_mean, search
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome, Tile, code
 from fhash_codec.compact.transform import Gram, Result, choose_transform, usual_transform
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.measure.value_range import Floats
 from fhash_codec.paper.fit import TrainedModel
 from fhash_codec.paper.network import Architecture, Layer, Network
 from fhash_codec.paper.storage import Bricks, component_name
@@ -39,6 +38,7 @@ from fhash_codec.paper.tables import (
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.array import transform_codecs
+from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.encoding import OFFSETS, WEIGHT
 from fhash_formats.transform.tile_format import TileSettings
@@ -59,7 +59,7 @@ def choose_codings(
     architecture: Architecture,
     samples: int,
     tables: Sequence[TrainedTable],
-    slopes: Floats,
+    slopes: Single,
     quantiser_step: float,
     workers: ThreadPoolExecutor,
     *,
@@ -112,7 +112,7 @@ def squared_weights(length: int, resolution: int) -> float:
     return float((after_weight**2 + (1 - after_weight) ** 2).mean())
 
 
-def _needed_embeddings(table: TrainedTable) -> Iterator[Floats]:
+def _needed_embeddings(table: TrainedTable) -> Iterator[Single]:
     """Yield the needed embeddings (n, E) of each time node."""
     space = tuple(slice(0, n) for n in table.shape[1:4])
     for node in range(table.shape[0]):
@@ -152,7 +152,7 @@ def _coding(
 
 def _mixing(
     table: TrainedTable, importance: Matrix, floor: float
-) -> tuple[Floats, Matrix, npt.NDArray[np.float64]]:
+) -> tuple[Single, Matrix, npt.NDArray[np.float64]]:
     """Return mixing (E, E), unmixing (E, E) and the mean of each component (E,) of a level."""
     values, axes = np.linalg.eigh(importance)
     roots = np.sqrt(np.maximum(values, max(MIN_IMPORTANCE * float(values[-1]), floor)))

@@ -19,7 +19,6 @@ from fhash_codec.compact.sample import spread_order
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import unpack
-from fhash_codec.measure.value_range import Floats, Mask
 from fhash_codec.paper.model import decode_region, input_slopes
 from fhash_codec.paper.network import Architecture, Layer, Network
 from fhash_codec.paper.storage import Bricks, mix_components, needed_by, write_occupancy
@@ -27,6 +26,7 @@ from fhash_formats.container import ContainerWriter, shard_shape
 from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.header import MASK_ARRAY, MASK_FEATURES
 from fhash_formats.container.stored import ChunkCache
+from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import WEIGHT, Coding, encode_tile
@@ -44,7 +44,7 @@ class TrainedTable(Protocol):
         """Lengths of the axes (t, z, y, x, E)."""
         ...
 
-    def read(self, region: Region) -> Floats:
+    def read(self, region: Region) -> Single:
         """Return the embeddings (t, z, y, x, E) of a region of 5 slices."""
         ...
 
@@ -59,7 +59,7 @@ class TrainedTable(Protocol):
 class FinestTable:
     """A `TrainedTable` of the finest level, out of its samples."""
 
-    def __init__(self, coreset: Coreset, bricks: Bricks, fine: Floats) -> None:
+    def __init__(self, coreset: Coreset, bricks: Bricks, fine: Single) -> None:
         """Take the embeddings (E, samples), in the order of `Coreset.values`."""
         self._bricks, self._fine = bricks, fine
         self.shape: tuple[int, ...] = (
@@ -68,7 +68,7 @@ class FinestTable:
             len(fine),
         )
 
-    def read(self, region: Region) -> Floats:
+    def read(self, region: Region) -> Single:
         """Return the embeddings of a region."""
         keys, box = _keys_and_box(region)
         return np.stack([self._bricks.embeddings(self._fine, key, box) for key in keys])[
@@ -84,12 +84,12 @@ class FinestTable:
 class CoarseTable:
     """A `TrainedTable` of a coarser level, in memory."""
 
-    def __init__(self, values: Floats, needed: Mask) -> None:
+    def __init__(self, values: Single, needed: Mask) -> None:
         """Take embeddings (t, z, y, x, E) and the mask (t, z, y, x) of the needed vertices."""
         self._values, self._needed = values, needed
         self.shape: tuple[int, ...] = values.shape
 
-    def read(self, region: Region) -> Floats:
+    def read(self, region: Region) -> Single:
         """Return the embeddings of a region."""
         return self._values[region]
 
@@ -99,7 +99,7 @@ class CoarseTable:
 
 
 def trained_tables(
-    architecture: Architecture, coreset: Coreset, bricks: Bricks, fine: Floats, tables: list[Floats]
+    architecture: Architecture, coreset: Coreset, bricks: Bricks, fine: Single, tables: list[Single]
 ) -> list[TrainedTable]:
     """Return the tables of all levels, finest first.
 
@@ -157,7 +157,7 @@ class LevelCoding:
     """
 
     tile: Shape
-    mixing: Floats
+    mixing: Single
     unmixing: npt.NDArray[np.float64]
     settings: tuple[TileSettings, ...]
 
@@ -187,7 +187,7 @@ class TiledTable:
         self._streams: dict[Index, list[bytes]] = {}
         self._decoded = ChunkCache(CACHE_BYTES)
 
-    def read(self, region: Region) -> Floats:
+    def read(self, region: Region) -> Single:
         """Return the embeddings (t, z, y, x, E) of a region of 5 slices, as the file has them."""
         tile = self.coding.tile
         spans = [
@@ -221,7 +221,7 @@ class TiledTable:
             pass
         return (self._streams[index][component] for index in indices)
 
-    def _tiles(self, indices: Sequence[Index]) -> Iterator[tuple[Index, Floats]]:
+    def _tiles(self, indices: Sequence[Index]) -> Iterator[tuple[Index, Single]]:
         """Yield decoded tiles (t, z, y, x, E), all of full size; a few are worked on at a time."""
         for start in range(0, len(indices), BATCH):
             batch = indices[start : start + BATCH]
@@ -234,14 +234,14 @@ class TiledTable:
                     self._decoded.put(("", index, 0), tile)
                 yield index, tile
 
-    def _begin(self, index: Index) -> Future[tuple[list[bytes], Floats]]:
+    def _begin(self, index: Index) -> Future[tuple[list[bytes], Single]]:
         """Start the work on a tile; its result is the stream of each component, and the tile."""
         if index in self._streams:
             return self._workers.submit(self._decode, self._streams[index])
         region = tile_region(index, self.coding.tile, self.shape)
         return self._workers.submit(self._code, *components_of(self.table, self.coding, region))
 
-    def _code(self, components: list[Floats], needed: Mask) -> tuple[list[bytes], Floats]:
+    def _code(self, components: list[Single], needed: Mask) -> tuple[list[bytes], Single]:
         coded = [
             code_tile(component, needed, settings)
             for component, settings in zip(components, self.coding.settings, strict=True)
@@ -250,7 +250,7 @@ class TiledTable:
             [decoded for _, decoded in coded], self.coding.mixing
         )
 
-    def _decode(self, streams: list[bytes]) -> tuple[list[bytes], Floats]:
+    def _decode(self, streams: list[bytes]) -> tuple[list[bytes], Single]:
         components = [
             decode_tile(data, self.coding.tile, np.float32, settings)
             for data, settings in zip(streams, self.coding.settings, strict=True)
@@ -281,7 +281,7 @@ def tile_region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:
 
 def components_of(
     table: TrainedTable, coding: LevelCoding, region: Region
-) -> tuple[list[Floats], Mask]:
+) -> tuple[list[Single], Mask]:
     """Return the components of a region, padded to a whole tile, and the needed vertices.
 
     The components repeat their border values beyond the table; vertices there are not needed.
@@ -296,7 +296,7 @@ def components_of(
 
 
 def code_tile(
-    component: Floats, needed: Mask, settings: TileSettings
+    component: Single, needed: Mask, settings: TileSettings
 ) -> tuple[bytes, npt.NDArray[Any]]:
     """Return the stream of one component of a tile, and the values that it decodes to."""
     complete = bool(needed.all())
@@ -370,7 +370,7 @@ class Samples:
                     count += len(decoded)
         return fsum(squares), count
 
-    def slopes(self, network: Network, tiles: Sequence[Index]) -> Floats:
+    def slopes(self, network: Network, tiles: Sequence[Index]) -> Single:
         """Return the derivatives (inputs, n) of the value by each input of the network.
 
         They are taken at evenly spread samples of some of the tiles.
@@ -505,7 +505,7 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
     )
 
 
-def _weight_settings(weight: Floats, share: float) -> TileSettings | None:
+def _weight_settings(weight: Single, share: float) -> TileSettings | None:
     """Return the settings of a matrix for a step, as a share of the root mean square."""
     size = float(np.sqrt(np.square(weight, dtype=np.float64).mean()))
     if weight.size < MIN_WEIGHTS or not size > 0:
@@ -519,7 +519,7 @@ def _weight_settings(weight: Floats, share: float) -> TileSettings | None:
     )
 
 
-def _decoded(weight: Floats, settings: TileSettings) -> Floats:
+def _decoded(weight: Single, settings: TileSettings) -> Single:
     """Return a matrix as a reader of the file gets it."""
     shape = weight.shape
     tile = encode_tile(weight.reshape(1, 1, *shape), settings, Coding())

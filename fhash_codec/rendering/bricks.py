@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
-from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.march_task import NUMPY, Array, Arrays, Frame, Table, Task
+from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import in_threads
 
 
@@ -93,7 +93,6 @@ class Palette:
         return before, entry - before
 
 
-Mask = npt.NDArray[np.bool_]
 Result = TypeVar("Result")
 
 SIDE = 4

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.grid import Floats, Grid, vector
+from fhash_codec.rendering.grid import Grid, vector
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double
 
 VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "iso": ((1, 1, 1), (0, 0, 1)),
@@ -55,10 +56,10 @@ class Rays:
         grid: the vertices that the index space is of.
     """
 
-    eye: Floats
-    right: Floats
-    up: Floats
-    forward: Floats
+    eye: Double
+    right: Double
+    up: Double
+    forward: Double
     parallel: bool
     size: tuple[int, int]
     grid: Grid
@@ -112,7 +113,7 @@ class Rays:
             grid=grid,
         )
 
-    def rays(self, u: npt.ArrayLike, w: npt.ArrayLike) -> tuple[Floats, Floats]:
+    def rays(self, u: npt.ArrayLike, w: npt.ArrayLike) -> tuple[Double, Double]:
         """Origins and directions (..., 3) in index space of places in the picture.
 
         Args:
@@ -127,14 +128,14 @@ class Rays:
             return self.eye + across, np.broadcast_to(self.forward, across.shape)
         return np.broadcast_to(self.eye, across.shape), self.forward + across
 
-    def pixels(self) -> tuple[Floats, Floats]:
+    def pixels(self) -> tuple[Double, Double]:
         """Origins and directions (H, W, 3) of the rays through the middle of every pixel."""
         width, height = self.size
         u = 2 * (np.arange(width) + 0.5) / width - 1
         w = 1 - 2 * (np.arange(height) + 0.5) / height
         return self.rays(*np.meshgrid(u, w))
 
-    def project(self, points: Floats) -> tuple[Floats, Floats]:
+    def project(self, points: Double) -> tuple[Double, Double]:
         """Project points (..., 3) of index space into the picture.
 
         A point that is not in front of a perspective camera has a distance of at most 0 and pixels
@@ -177,8 +178,8 @@ def _half_height(grid: Grid, view: str, aspect: float) -> float:
 
 
 def _towards_camera(
-    camera: Camera, view: str, focal: Floats, radius: float, distance: float
-) -> tuple[Floats, float]:
+    camera: Camera, view: str, focal: Double, radius: float, distance: float
+) -> tuple[Double, float]:
     """The unit vector from the focal point towards the camera, before it turns, and its distance.
 
     Args:
@@ -202,7 +203,7 @@ def _towards_camera(
     return away / np.linalg.norm(away), distance
 
 
-def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
+def _upright(away: Double, upward: Double) -> tuple[Double, Double]:
     """The upward direction as given and the direction to the right, as unit vectors.
 
     Raises InputError for an upward direction without a length or along the direction of view.
@@ -221,7 +222,7 @@ def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
     return unit, right / np.linalg.norm(right)
 
 
-def _turned(given: Floats, axis: Floats, degrees: float) -> Floats:
+def _turned(given: Double, axis: Double, degrees: float) -> Double:
     """Turn a vector about a unit axis, by Rodrigues' formula."""
     angle = np.radians(degrees)
     return np.asarray(
@@ -232,11 +233,11 @@ def _turned(given: Floats, axis: Floats, degrees: float) -> Floats:
     )
 
 
-def _text(numbers: Floats) -> str:
+def _text(numbers: Double) -> str:
     return ", ".join(f"{number:g}" for number in numbers)
 
 
-def pchip(at: Floats, values: Floats, share: float) -> Floats:
+def pchip(at: Double, values: Double, share: float) -> Double:
     """Interpolate values by a cubic that stays between the values on either side.
 
     Source: Fritsch and Butland, A Method for Constructing Local Monotone Piecewise Cubic
@@ -279,7 +280,7 @@ SMALL = 1e-12
 """Angle in radians below which the sine is taken for the angle."""
 
 
-def spline(at: Floats, rotations: Floats, share: float) -> Floats:
+def spline(at: Double, rotations: Double, share: float) -> Double:
     """Interpolate rotations smoothly, by the shorter turn between each two.
 
     The curve consists of cubic Bezier curves on the sphere of quaternions (Shoemake, Animating
@@ -324,7 +325,7 @@ def spline(at: Floats, rotations: Floats, share: float) -> Floats:
     return np.asarray(points[0], dtype=np.float64)
 
 
-def from_matrix(matrix: Floats) -> Floats:
+def from_matrix(matrix: Double) -> Double:
     """Convert a rotation matrix (3, 3), by its largest component, which is never near 0.
 
     Source: Shepperd, Quaternion from Rotation Matrix, 1978.
@@ -351,7 +352,7 @@ def from_matrix(matrix: Floats) -> Floats:
     return np.asarray(rotation / np.linalg.norm(rotation), dtype=np.float64)
 
 
-def to_matrix(rotation: Floats) -> Floats:
+def to_matrix(rotation: Double) -> Double:
     """Convert a quaternion to a rotation matrix (3, 3)."""
     w, x, y, z = rotation / np.linalg.norm(rotation)
     return np.array(
@@ -363,22 +364,22 @@ def to_matrix(rotation: Floats) -> Floats:
     )
 
 
-def _between(first: Floats, second: Floats, t: float) -> Floats:
+def _between(first: Double, second: Double, t: float) -> Double:
     """The rotation at `t`, 0..1, of the turn from one rotation to another."""
     return _product(first, _exp(t * _log(_product(_inverse(first), second))))
 
 
-def _product(a: Floats, b: Floats) -> Floats:
+def _product(a: Double, b: Double) -> Double:
     return np.array(
         [a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))]
     )
 
 
-def _inverse(a: Floats) -> Floats:
+def _inverse(a: Double) -> Double:
     return np.asarray(a * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
 
 
-def _log(a: Floats) -> Floats:
+def _log(a: Double) -> Double:
     """Half the angle of a rotation, as a vector (3,) along its axis."""
     sine = float(np.linalg.norm(a[1:]))
     return np.asarray(
@@ -386,7 +387,7 @@ def _log(a: Floats) -> Floats:
     )
 
 
-def _exp(half: Floats) -> Floats:
+def _exp(half: Double) -> Double:
     """The rotation of twice the angle of a vector (3,) along its axis."""
     angle = float(np.linalg.norm(half))
     return np.array([np.cos(angle), *(half * (np.sin(angle) / angle if angle > SMALL else 1.0))])
@@ -401,9 +402,9 @@ STEEP = 0.9998
 class _Pose(NamedTuple):
     """Physical focal point (3,), distance from it, and rotation (4,) as a quaternion."""
 
-    focal: Floats
+    focal: Double
     distance: float
-    rotation: Floats
+    rotation: Double
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -419,7 +420,7 @@ class CameraPath:
         size: W, H of the picture.
     """
 
-    at: Floats
+    at: Double
     cameras: tuple[Camera, ...]
     grid: Grid
     size: tuple[int, int]
@@ -466,7 +467,7 @@ class CameraPath:
             "view_up": vector(up),
         }
 
-    def _upright(self, rotations: Floats, share: float) -> tuple[Floats, Floats] | None:
+    def _upright(self, rotations: Double, share: float) -> tuple[Double, Double] | None:
         """The direction towards a camera that goes around the upward direction and rises, and up.
 
         None unless all poses have the same upward direction and none looks along it.

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from PIL import ImageColor
 
 from fhash_codec.rendering.colour_maps import COLOUR_MAPS
-from fhash_codec.rendering.grid import Floats
 from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.support.arrays import Double
 
 WHITE = (0.9505, 1.0, 1.089)
 """The white point D65 in XYZ, rounded as in VTK."""
@@ -28,7 +28,7 @@ FROM_XYZ = np.array(
 """Matrix from XYZ to linear RGB."""
 
 
-def rgb_to_hsv(rgb: Floats) -> Floats:
+def rgb_to_hsv(rgb: Double) -> Double:
     """Convert to hue, saturation and value, each 0..1."""
     value = rgb.max(axis=-1)
     spread = value - rgb.min(axis=-1)
@@ -45,14 +45,14 @@ def rgb_to_hsv(rgb: Floats) -> Floats:
     )
 
 
-def hsv_to_rgb(hsv: Floats) -> Floats:
+def hsv_to_rgb(hsv: Double) -> Double:
     """Invert `rgb_to_hsv`."""
     hue, saturation, value = (channel[..., None] for channel in np.moveaxis(hsv, -1, 0))
     pure = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0.0, 1.0)
     return np.asarray(value * (1 + saturation * (pure - 1)), dtype=np.float64)
 
 
-def rgb_to_lab(rgb: Floats) -> Floats:
+def rgb_to_lab(rgb: Double) -> Double:
     """Convert to CIE Lab: lightness 0..100, a and b."""
     linear = np.where(rgb > 0.04045, ((rgb + 0.055) / 1.055) ** 2.4, rgb / 12.92)
     xyz = linear @ TO_XYZ.T / WHITE
@@ -60,7 +60,7 @@ def rgb_to_lab(rgb: Floats) -> Floats:
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
-def lab_to_rgb(lab: Floats) -> Floats:
+def lab_to_rgb(lab: Double) -> Double:
     """Invert `rgb_to_lab`.
 
     A colour that no screen has is dimmed until its brightest channel is 1, and channels below 0
@@ -79,7 +79,7 @@ def lab_to_rgb(lab: Floats) -> Floats:
     )
 
 
-def mix_diverging(first: Floats, second: Floats, share: Floats) -> Floats:
+def mix_diverging(first: Double, second: Double, share: Double) -> Double:
     """Mix two colours on Moreland's diverging scale.
 
     The scale passes through white where both colours are saturated and their hues are far apart.
@@ -115,7 +115,7 @@ def mix_diverging(first: Floats, second: Floats, share: Floats) -> Floats:
     )
 
 
-def _lab_to_msh(lab: Floats) -> Floats:
+def _lab_to_msh(lab: Double) -> Double:
     """Convert to Moreland's polar Lab: magnitude, saturation angle and hue angle."""
     m = np.sqrt((lab**2).sum(axis=-1))
     s = np.where(
@@ -125,7 +125,7 @@ def _lab_to_msh(lab: Floats) -> Floats:
     return np.stack([m, s, h], axis=-1)
 
 
-def _hue(msh: Floats, unsaturated: Floats) -> Floats:
+def _hue(msh: Double, unsaturated: Double) -> Double:
     """Choose the hue of an unsaturated colour so that the scale to a saturated one is even.
 
     Args:
@@ -157,12 +157,12 @@ class ColourMap:
         nan: colour of NaN.
     """
 
-    positions: Floats
-    points: Floats
+    positions: Double
+    points: Double
     space: str = "RGB"
     nan: tuple[float, float, float] = NAN
 
-    def __call__(self, values: npt.ArrayLike) -> Floats:
+    def __call__(self, values: npt.ArrayLike) -> Double:
         """Look up values of any shape; colours (..., 3), 0..1.
 
         Values beyond the ends have the colours of the ends.
@@ -185,7 +185,7 @@ class ColourMap:
         mixed[np.isnan(array)] = self.nan
         return mixed
 
-    def _mix(self, before: npt.NDArray[np.intp], share: Floats) -> Floats:
+    def _mix(self, before: npt.NDArray[np.intp], share: Double) -> Double:
         """Mix each point `before` (...) with the next one at `share` (..., 1)."""
         if self.space == "Step":
             return np.where(share < 1, self.points[before], self.points[before + 1])
@@ -226,7 +226,7 @@ class ColourMap:
         )
 
 
-def stretched(positions: Floats, low: float, high: float) -> Floats:
+def stretched(positions: Double, low: float, high: float) -> Double:
     """Move ascending positions so that they reach exactly from `low` to `high`.
 
     A single position moves to `low`.
@@ -285,7 +285,7 @@ def parse_colour(text: str) -> tuple[float, float, float]:
     )
 
 
-def colour_code(colour: Floats) -> str:
+def colour_code(colour: Double) -> str:
     """Write red, green and blue, 0..1, as '#rrggbb'."""
     return "#" + "".join(f"{round(255 * float(channel)):02x}" for channel in colour)
 
@@ -312,7 +312,7 @@ class Preset:
 
     name: str
     colours: ColourMap
-    opacity: Floats | None
+    opacity: Double | None
 
     @property
     def is_relative(self) -> bool:
@@ -383,7 +383,7 @@ def _preset(path: Path, preset: dict[str, Any]) -> Preset:
     return Preset(name=str(preset.get("Name", path.stem)), colours=colours, opacity=opacity)
 
 
-def _rows(path: Path, key: str, values: Any, columns: int = 4) -> Floats:
+def _rows(path: Path, key: str, values: Any, columns: int = 4) -> Double:
     """The flat list of a key as rows of finite numbers; raises InputError for anything else."""
     is_list = isinstance(values, list) and all(
         isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
@@ -394,7 +394,7 @@ def _rows(path: Path, key: str, values: Any, columns: int = 4) -> Floats:
     return np.array(values, dtype=np.float64).reshape(-1, columns)
 
 
-def _opacity(path: Path, rows: Floats) -> Floats:
+def _opacity(path: Path, rows: Double) -> Double:
     """Opacities as straight pieces (n, 2); a curved piece becomes PIECES of them.
 
     Args:
@@ -413,7 +413,7 @@ def _opacity(path: Path, rows: Floats) -> Floats:
     return np.concatenate(pieces)
 
 
-def _between(first: Floats, second: Floats) -> Floats:
+def _between(first: Double, second: Double) -> Double:
     """Points (n, 2) of the curve between two rows, without its ends; values strictly ascending."""
     share = np.arange(1, PIECES) / PIECES
     values = first[0] * (1 - share) + second[0] * share
@@ -425,7 +425,7 @@ def _between(first: Floats, second: Floats) -> Floats:
     return np.asarray(np.stack([values, opacities], axis=-1)[ascending], dtype=np.float64)
 
 
-def _curve(share: Floats, first: float, second: float, midpoint: float, sharpness: float) -> Floats:
+def _curve(share: Double, first: float, second: float, midpoint: float, sharpness: float) -> Double:
     """Opacities between `first` and `second` at shares 0..1, as vtkPiecewiseFunction::GetTable."""
     midpoint = min(max(midpoint, 1e-5), 1 - 1e-5)
     share = np.where(

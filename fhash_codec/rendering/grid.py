@@ -12,9 +12,8 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
+from fhash_formats.support.arrays import Double
 
-Floats = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
 Vector = tuple[float, float, float]
 
 TOLERANCE = 1e-3
@@ -61,9 +60,9 @@ class Warp:
     """
 
     counts: tuple[int, int, int]
-    places: tuple[Floats | None, Floats | None, Floats | None]
+    places: tuple[Double | None, Double | None, Double | None]
 
-    def to_series(self, axis: int, drawn: npt.ArrayLike) -> Floats:
+    def to_series(self, axis: int, drawn: npt.ArrayLike) -> Double:
         """Places in drawn vertices along x, y or z (0, 1, 2) as places in the series' vertices."""
         places = self.places[axis]
         given = np.asarray(drawn, dtype=np.float64)
@@ -80,7 +79,7 @@ class Axis:
         problem: reason why the positions of the series are not drawn, '' if they are.
     """
 
-    values: Floats
+    values: Double
     even: bool
     problem: str = ""
 
@@ -130,7 +129,7 @@ class Axis:
             return 1.0
         return float(np.max(np.abs(np.diff(self.values))) / abs(self.spacing))
 
-    def places(self, count: int) -> Floats:
+    def places(self, count: int) -> Double:
         """The places of `count` evenly drawn vertices, in vertices of the series."""
         ascending = self.values if self.spacing > 0 else -self.values
         evenly = np.linspace(ascending[0], ascending[-1], count)
@@ -180,7 +179,7 @@ def downward(coordinate: Coordinate) -> bool:
     )
 
 
-def proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
+def proportions(coords: Sequence[Coordinate], spacing: Double) -> Double:
     """Factors (3,) that draw vertices of axes in uncommon units as far apart as the others.
 
     Axes in the commonest units keep their lengths. Where an axis has no units, all do.
@@ -209,7 +208,7 @@ def _plain_units(coordinate: Coordinate) -> str:
     return "degrees" if units.lower().startswith("degree") else units
 
 
-def _unwrapped(degrees: Floats) -> Floats:
+def _unwrapped(degrees: Double) -> Double:
     """Longitudes without their jump by 360 degrees; others as they are."""
     steps = np.abs(np.diff(degrees))
     return np.unwrap(degrees, period=360.0) if np.any(np.abs(steps - 360) < 180) else degrees
@@ -241,8 +240,8 @@ class Grid:
     """
 
     counts: tuple[int, int, int]
-    origin: Floats
-    spacing: Floats
+    origin: Double
+    spacing: Double
     scale: Vector = (1.0, 1.0, 1.0)
     warp: Warp | None = None
     coarseness: Vector = (1.0, 1.0, 1.0)
@@ -333,14 +332,14 @@ class Grid:
         return float(np.exp(np.mean(np.log(np.abs(self.spacing)))))
 
     @property
-    def bounds(self) -> Floats:
+    def bounds(self) -> Double:
         """The box that is drawn in index space: float64 (3, 2), x, y, z."""
         return np.array(
             [[-0.5, 0.5] if count == 1 else [0.0, count - 1.0] for count in self.counts]
         )
 
     @property
-    def corners(self) -> Floats:
+    def corners(self) -> Double:
         """The drawn box in physical coordinates (3, 2); descending on descending axes."""
         return self.origin[:, None] + self.bounds * self.spacing[:, None]
 
@@ -359,7 +358,7 @@ def _finer(counts: Sequence[int], series_counts: Sequence[int]) -> list[float]:
     ]
 
 
-def _thickness(spacing: Floats, axes: Sequence[Axis]) -> float:
+def _thickness(spacing: Double, axes: Sequence[Axis]) -> float:
     """The thickness of axes of one vertex; spacing: mean ones (3,), stretched, NaN for one vertex.
 
     It is the mean spacing of the other axes, 1 without any.
@@ -374,7 +373,7 @@ def _thickness(spacing: Floats, axes: Sequence[Axis]) -> float:
     return thickness
 
 
-def _check_lengths(spacing: Floats, counts: Sequence[int]) -> None:
+def _check_lengths(spacing: Double, counts: Sequence[int]) -> None:
     """Raise InputError where one axis is too long for the vertex spacing of another."""
     longest = float(np.max(np.abs(spacing) * counts))
     shortest = float(np.min(np.abs(spacing)))

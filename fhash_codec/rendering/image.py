@@ -21,7 +21,6 @@ import numpy.typing as npt
 from fhash_codec import times
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import ColourMap, parse_colour
-from fhash_codec.rendering.grid import Floats, Single
 from fhash_codec.rendering.layout import (
     TITLE_GAP,
     Bar,
@@ -41,6 +40,7 @@ from fhash_codec.rendering.scenes import DIGEST_KEY, SCENE_KEY, SOURCE_KEY, Effe
 from fhash_codec.rendering.view import Body, Edge, edges, outer_edges
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
+from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.files import check_output, replacing_all
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ class Image:
         return f"<fhash Image {width}x{height} of {source} in {self.seconds:.3g} s>"
 
 
-Layer = tuple[Floats, Single]
+Layer = tuple[Double, Single]
 """Colour and opacity."""
 
 DARK = np.array([28, 30, 36]) / 255
@@ -321,10 +321,10 @@ class _Canvas:
     """A layer that rectangles are filled in."""
 
     def __init__(self, width: int, height: int) -> None:
-        self.colours: Floats = np.zeros((height, width, 3))
+        self.colours: Double = np.zeros((height, width, 3))
         self.opacity: Single = np.zeros((height, width), dtype=np.float32)
 
-    def fill(self, rectangle: tuple[int, int, int, int], colour: Floats) -> None:
+    def fill(self, rectangle: tuple[int, int, int, int], colour: Double) -> None:
         """Fill a rectangle, as far as it lies on the canvas.
 
         Args:
@@ -439,20 +439,20 @@ def time_text(step: float, time: float, coordinate: Coordinate) -> str:
     return f"step {step:g}   t = {text}"
 
 
-def _paint_before(picture: Single, colour: Floats, opacity: Single) -> None:
+def _paint_before(picture: Single, colour: Double, opacity: Single) -> None:
     """Put a layer before a picture (H, W, 4), in place."""
     where = opacity > 0
     front = _multiplied(colour if colour.ndim == 1 else colour[where], opacity[where])
     picture[where] = front + (1 - front[:, 3:]) * picture[where]
 
 
-def _paint_behind(picture: Single, colour: Floats, opacity: Single) -> None:
+def _paint_behind(picture: Single, colour: Double, opacity: Single) -> None:
     """Put a layer of one colour (3,) behind a picture (H, W, 4), in place."""
     where = opacity > 0
     picture[where] += (1 - picture[where][:, 3:]) * _multiplied(colour, opacity[where])
 
 
-def _multiplied(colour: Floats, opacity: Single) -> Single:
+def _multiplied(colour: Double, opacity: Single) -> Single:
     """Pixels (n, 4): colours (3,) or (n, 3), multiplied by the opacities (n,), and these."""
     return np.concatenate([opacity[..., None] * colour, opacity[..., None]], axis=-1).astype(
         np.float32

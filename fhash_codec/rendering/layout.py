@@ -13,10 +13,11 @@ import numpy as np
 
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import ColourMap
-from fhash_codec.rendering.grid import Floats, Grid
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Effects, LegendEntry, Scene
 from fhash_codec.rendering.view import Edge, outer_edges
 from fhash_formats.series import Coordinate
+from fhash_formats.support.arrays import Double
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont
@@ -291,7 +292,7 @@ def _of_edge(
         abs(float(along[1])) > STEEP and max(length(line, size) for line in lines) > LONG * size
     )
 
-    def beside(place: Floats, label: Label) -> Label:
+    def beside(place: Double, label: Label) -> Label:
         """The label outside the edge, at a place of it."""
         wide, tall = label.extent
         reach = abs(float(outward[0])) * wide / 2 + abs(float(outward[1])) * tall / 2
@@ -332,7 +333,7 @@ def _covered(label: Label, others: Sequence[Label]) -> bool:
     )
 
 
-def _clipped(ends: Floats, view: Rectangle) -> tuple[Floats, tuple[bool, bool]] | None:
+def _clipped(ends: Double, view: Rectangle) -> tuple[Double, tuple[bool, bool]] | None:
     """The part of a line (2, 2) within a rectangle, and whether each end is in it; None if none is.
 
     Liang and Barsky's method.

@@ -13,7 +13,7 @@ import numpy as np
 from fhash_codec import native
 from fhash_codec.rendering.bricks import Bricks
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Floats, Grid, Single
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.march_task import (
     GRADES,
     Frame,
@@ -37,6 +37,7 @@ from fhash_codec.rendering.transfer_function import about
 from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import in_threads
 
 FLATTEST = 1e-6
@@ -95,7 +96,7 @@ def smoothing(span: float, noise: float) -> float:
     return float(np.clip(deviation ** (1 / FALL), *DEVIATIONS))
 
 
-def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
+def slope_scale(grid: Grid, span: float, least: float, most: float) -> Double:
     """Factors (3,), x, y, z, from differences between vertices to gradients.
 
     A gradient is a share of `span` in the distance of two vertices. The factors are clipped so that
@@ -105,7 +106,7 @@ def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
     """
     with np.errstate(over="ignore", divide="ignore"):
         limit = STEEPEST / np.float64(most - least)
-        factors: Floats = np.clip(grid.vertex_spacing / (span * grid.spacing), -limit, limit)
+        factors: Double = np.clip(grid.vertex_spacing / (span * grid.spacing), -limit, limit)
     return factors
 
 
@@ -143,7 +144,7 @@ def grading_of(
     )
 
 
-def factors_at_vertices(values: Single, grading: Grading, spacing: Floats) -> Single:
+def factors_at_vertices(values: Single, grading: Grading, spacing: Double) -> Single:
     """Factors (z, y, x) of the extinction at the vertices of a frame, 0 where a value is missing.
 
     Gradients are central differences. Where a neighbour is missing they are the difference to the
@@ -198,7 +199,7 @@ def light_grid(
     task: Task,
     *,
     shadows: Shadows | None = None,
-    lamp: Floats | None = None,
+    lamp: Double | None = None,
     ambient_occlusion: AmbientOcclusion | None = None,
     bricks: Bricks | None = None,
 ) -> LightGrid:
@@ -266,7 +267,7 @@ class _Cache:
 
 def _extinction_of(
     frame: Frame, grid: Grid, table: Table, across: int, body: Body | None, grading: Grading | None
-) -> tuple[Single, Floats]:
+) -> tuple[Single, Double]:
     """Extinctions on the grid with a point every `across` vertices, and the first point (x, y, z).
 
     Gradients are those of the whole frame: a clip makes none.
@@ -315,11 +316,11 @@ class _Points:
     """
 
     extinction: Single
-    spacing: Floats
+    spacing: Double
     cell: float
     unit: float
 
-    def from_lamp(self, lamp: Floats) -> Single:
+    def from_lamp(self, lamp: Double) -> Single:
         """Shares of a lamp's light that reach the points; lamp: unit vector towards it."""
         step = np.asarray(lamp, dtype=np.float64) / (self.spacing * self.cell)
         step /= np.abs(step).max()
@@ -335,13 +336,13 @@ class _Points:
             around += self._passed(side * radius / (count * self.cell), count)
         return around / np.float32(len(SIDES))
 
-    def _passed(self, step: Floats, count: int) -> Single:
+    def _passed(self, step: Double, count: int) -> Single:
         """Share of the light that passes `count` steps (x, y, z, in cells) from each point."""
         sums = _sums(self.extinction, step, count)
         return _left(sums, float(np.linalg.norm(step * self.spacing * self.cell)) / self.unit)
 
 
-def _sums(extinction: Single, step: Floats, count: int) -> Single:
+def _sums(extinction: Single, step: Double, count: int) -> Single:
     """Sums of the extinction in the middle of `count` steps from each point."""
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
@@ -418,7 +419,7 @@ def secondary_light(scene: Scene, grid: Grid) -> tuple[Shadows | None, AmbientOc
     )
 
 
-def lamp_of(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Floats | None:
+def lamp_of(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Double | None:
     """The unit vector (x, y, z) towards the light, in the coordinates.
 
     None for the camera's light: it lies behind the camera, and its shadows cannot be seen.
@@ -442,7 +443,7 @@ def lamp_of(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Flo
     return None if shadows is None else _shoulder_lamp(rays)
 
 
-def _shoulder_lamp(rays: Rays) -> Floats:
+def _shoulder_lamp(rays: Rays) -> Double:
     """The unit vector (x, y, z) towards the default light of shadows, beside the camera."""
     spacing = rays.grid.spacing
     right, up, away = (
@@ -473,7 +474,7 @@ def shading_of(effects: Effects) -> Shading | None:
     return None if effects.projections else effects.shading
 
 
-def lighting_of(shading: Shading, lamp: Floats | None) -> Lighting:
+def lighting_of(shading: Shading, lamp: Double | None) -> Lighting:
     """The coefficients of a shading, with its lamp; the camera's light if that is None."""
     return Lighting(
         ambient=shading.ambient,

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
-from fhash_codec.rendering.grid import Single
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
     GRADES,
@@ -28,6 +27,7 @@ from fhash_codec.rendering.march_task import (
     extinctions_in,
 )
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import in_threads, usable_threads
 
 MAX_SURFACES = 64

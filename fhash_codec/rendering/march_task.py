@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Floats, Grid, Single, Warp
+from fhash_codec.rendering.grid import Grid, Warp
 from fhash_codec.rendering.transfer_function import about
 from fhash_codec.rendering.view import Body
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double, Single
 
 Array = Any
 """An array of numpy or a tensor of torch."""
@@ -136,7 +137,7 @@ class Table:
     low: float
     high: float
     colours: Single
-    extinctions: Floats
+    extinctions: Double
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,7 +157,7 @@ class Lighting:
     diffuse: float
     specular: float
     specular_power: float
-    lamp: Floats | None
+    lamp: Double | None
     central: bool = False
 
 
@@ -165,7 +166,7 @@ class Surface:
     """An isosurface: value in marched units, colour (3,), 0..1, and opacity 0..1."""
 
     value: float
-    colour: Floats
+    colour: Double
     opacity: float
 
 
@@ -178,7 +179,7 @@ class Grading:
         top: gradient of the last one, above 0, in marched units per unit of the coordinates.
     """
 
-    factors: Floats
+    factors: Double
     top: float
 
 
@@ -190,7 +191,7 @@ DENSEST = 1e30
 """Largest extinction per length: its smallest part is opaque already."""
 
 
-def extinctions_in(extinctions: Floats, length: float) -> Floats:
+def extinctions_in(extinctions: Double, length: float) -> Double:
     """Extinctions per `length` from those per unit of the coordinates, DENSEST at most.
 
     Infinite extinctions would give NaN between the entries of a table.
@@ -213,7 +214,7 @@ class Frame:
     first: tuple[int, int, int]
     stride: int = 1
 
-    def bounds(self, grid: Grid) -> Floats:
+    def bounds(self, grid: Grid) -> Double:
         """The box (3, 2), x, y, z, in vertices of the domain, in which the frame has values.
 
         It reaches to the end of the domain where no further vertex of the frame would fit.
@@ -240,7 +241,7 @@ class LightGrid:
     """
 
     shares: Single
-    first: Floats
+    first: Double
     cell: float
     secondary_rays: int = 0
 
@@ -292,12 +293,12 @@ class Task:
     error: float = math.inf
 
     @property
-    def bounds(self) -> Floats:
+    def bounds(self) -> Double:
         """The box (3, 2), x, y, z, in vertices, that is drawn and in which steps are counted."""
         return self.rays.grid.bounds if self.body is None else self.body.bounds
 
     @property
-    def planes(self) -> Floats:
+    def planes(self) -> Double:
         """The planes (n, 4) that cut the box, as `Body` has them."""
         return np.empty((0, 4)) if self.body is None else self.body.planes
 
@@ -420,7 +421,7 @@ class Units:
             shift=low / 2 + high / 2, factor=math.ldexp(1.0, -max(-1000, min(1000, exponent)))
         )
 
-    def to(self, values: npt.ArrayLike) -> Floats:
+    def to(self, values: npt.ArrayLike) -> Double:
         """Convert data units to marched units, float64."""
         return np.asarray(
             (np.asarray(values, dtype=np.float64) - self.shift) * self.factor, dtype=np.float64

@@ -16,7 +16,7 @@ from fhash_codec.boxes import MAX_LOD, Box
 from fhash_codec.devices import choose_device, has_torch
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
-from fhash_codec.rendering.grid import Floats, Grid
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.layout import Layout, lay_out, quantity_of
 from fhash_codec.rendering.light import (
     coding_noise,
@@ -32,6 +32,7 @@ from fhash_codec.rendering.transfer_function import Histogram, TransferFunction,
 from fhash_codec.rendering.view import Body, pixel_vertices, region_in_view, region_of_body
 from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.support.arrays import Double
 
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 """File name of the driver of CUDA."""
@@ -524,7 +525,7 @@ def _task(
     rays: Rays,
     function: TransferFunction,
     units: Units,
-    lamp: Floats | None,
+    lamp: Double | None,
     lod: int,
     noise: float,
 ) -> Task:

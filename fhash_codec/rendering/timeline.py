@@ -15,11 +15,12 @@ import numpy as np
 from fhash_codec.records import Record, limits
 from fhash_codec.rendering.cameras import CameraPath
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Floats, Grid
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.times import time_range
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, RegionError
+from fhash_formats.support.arrays import Double
 
 TIME_AND_CAMERA = ("camera", "step", "time")
 """Fields of a scene that an animation sets by itself."""
@@ -80,13 +81,13 @@ class Clock:
         physical: whether the values are physical times.
     """
 
-    at: Floats
-    values: Floats
+    at: Double
+    values: Double
     physical: bool
 
     @classmethod
     def of(
-        cls, at: Floats, scenes: Sequence[Scene], volume: Volume, *, physical: bool = False
+        cls, at: Double, scenes: Sequence[Scene], volume: Volume, *, physical: bool = False
     ) -> Clock:
         """A clock through the steps, or the times, of scenes; raises RegionError outside."""
         steps = [_step(scene, volume) for scene in scenes]

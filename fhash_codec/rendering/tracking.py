@@ -23,12 +23,13 @@ from fhash_codec.features.features import (
 from fhash_codec.features.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.colours import colour_code, parse_colour
-from fhash_codec.rendering.grid import Floats, Grid
+from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.scenes import Isosurface, LegendEntry, Scene, TransferFunctionSpec
 from fhash_codec.rendering.transfer_function import opacity_preset, raised
 from fhash_codec.volume import Volume, feature_names, holds_features_apart
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
+from fhash_formats.support.arrays import Double
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#555555")
 """Default colours of features: Okabe and Ito chose them to be told apart by colour-blind people."""
@@ -208,7 +209,7 @@ def _colours(tracked: Sequence[Tracked], low: float, high: float) -> tuple[tuple
     colours = np.array([parse_colour(item.colour) for item in tracked])
     edge = EDGE * (high - low) or max(abs(low) * 1e-6, 1e-30)
     bounds = sorted({end for span in spans for end in span})
-    points: dict[float, Floats] = {}
+    points: dict[float, Double] = {}
     colour = colours[0]
     for first, last in itertools.pairwise(bounds):
         inside = [span[0] < last and span[1] > first for span in spans]
@@ -255,7 +256,7 @@ def follow(
     ]
 
 
-def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
+def _extent(selected: npt.NDArray[np.bool_], axes: Sequence[Double]) -> dict[str, Any]:
     """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
     indices = np.nonzero(selected)[::-1]
     count = len(indices[0])

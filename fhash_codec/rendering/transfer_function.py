@@ -22,9 +22,9 @@ from fhash_codec.rendering.colours import (
     parse_colour,
     read_preset,
 )
-from fhash_codec.rendering.grid import Floats
 from fhash_codec.rendering.scenes import TransferFunctionSpec
 from fhash_formats.errors import FhashWarning, InputError, suggestion
+from fhash_formats.support.arrays import Double
 
 Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
@@ -73,7 +73,7 @@ def opacity_preset(
     features: Sequence[str],
     histogram: Histogram | None,
     thinnest: Thinnest | None = None,
-) -> Floats:
+) -> Double:
     """Find a preset by name: points (value, opacity), float64 (n, 2), values strictly ascending.
 
     Args:
@@ -109,7 +109,7 @@ def opacity_preset(
     return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
 
 
-def raised(points: Floats, thinnest: Thinnest) -> Floats:
+def raised(points: Double, thinnest: Thinnest) -> Double:
     """Raise opacities (n, 2) of a thin volume, so that its thickness is as opaque as THIN spacings.
 
     The points of other volumes stay as they are.
@@ -122,7 +122,7 @@ def raised(points: Floats, thinnest: Thinnest) -> Floats:
     return np.stack([points[:, 0], -np.expm1(depth)], axis=-1)
 
 
-def _of_thin(thinnest: Thinnest, features: Sequence[str], value_range: Range) -> Floats:
+def _of_thin(thinnest: Thinnest, features: Sequence[str], value_range: Range) -> Double:
     """The points of a thin volume: a plane is opaque, of a thicker one every value is seen."""
     everything = _over(value_range, np.array([0.0, 1.0]), np.array([BACKGROUND, BACKGROUND]))
     if thinnest[0] == 1:
@@ -131,7 +131,7 @@ def _of_thin(thinnest: Thinnest, features: Sequence[str], value_range: Range) ->
     return raised(everything if points is None else points, thinnest)
 
 
-def _pyvista(name: str, shown: Range) -> Floats:
+def _pyvista(name: str, shown: Range) -> Double:
     """The points of PyVista's presets over the values shown."""
     if name == "opaque":
         return np.array([[shown[0], 1.0]])
@@ -190,14 +190,14 @@ def _inside(text: str, value_range: Range) -> Range | None:
     return (low, high) if low < high else None
 
 
-def _of_features(texts: Sequence[str], value_range: Range) -> Floats | None:
+def _of_features(texts: Sequence[str], value_range: Range) -> Double | None:
     """The largest opacity of several features; None unless all of them tell values apart."""
     curves = [_of_feature(text, value_range) for text in texts]
     drawn = [curve for curve in curves if curve is not None]
     return None if not drawn or len(drawn) < len(curves) else _largest(drawn)
 
 
-def _of_feature(text: str, value_range: Range) -> Floats | None:
+def _of_feature(text: str, value_range: Range) -> Double | None:
     """The points of one feature; None if it does not tell values apart."""
     feature = parse_feature(text)
     low, high = value_range
@@ -223,14 +223,14 @@ def _of_feature(text: str, value_range: Range) -> Floats | None:
     return np.array(rise + fall)
 
 
-def _tent(value: float, value_range: Range) -> Floats:
+def _tent(value: float, value_range: Range) -> Double:
     """The points of a peak at a value; those beyond float64 are left out."""
     half = _share_of(value_range, TENT) or max(abs(value_range[0]) * 1e-6, 1e-30)
     points = [[value - half, 0.0], [value, SURFACE], [value + half, 0.0]]
     return np.array([point for point in points if math.isfinite(point[0])])
 
 
-def _largest(curves: list[Floats]) -> Floats:
+def _largest(curves: list[Double]) -> Double:
     """The largest of several piecewise linear curves, with the points where two of them cross."""
     values = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
     heights = np.array([np.interp(values, *curve.T) for curve in curves])
@@ -249,7 +249,7 @@ def _largest(curves: list[Floats]) -> Floats:
     )
 
 
-def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
+def _away_from_background(histogram: Histogram, value_range: Range) -> Double:
     """Make the most frequent value, the background, transparent and values far from it opaque.
 
     The opacity is 0 within the distance from the background that holds half of the vertices. It
@@ -289,7 +289,7 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     return points
 
 
-def _over(shown: Range, shares: Floats, opacities: Floats) -> Floats:
+def _over(shown: Range, shares: Double, opacities: Double) -> Double:
     """Points with opacities (n,) at shares (n,) of a range."""
     low, high = shown
     if not low < high:
@@ -303,7 +303,7 @@ ENTRIES = 4096
 """Entries of the table of a transfer function."""
 
 
-def extinction_of(opacity: npt.ArrayLike, distance: float) -> Floats:
+def extinction_of(opacity: npt.ArrayLike, distance: float) -> Double:
     """Convert an opacity 0..1 after `distance` to extinction per length.
 
     Opacity 1 has the extinction OPAQUE / distance, the largest possible.
@@ -328,7 +328,7 @@ class TransferFunction:
     """
 
     colours: ColourMap
-    points: Floats
+    points: Double
     unit_distance: float
     density: float
     span: tuple[float, float]
@@ -396,11 +396,11 @@ class TransferFunction:
             )
         return function
 
-    def colour(self, values: npt.ArrayLike) -> Floats:
+    def colour(self, values: npt.ArrayLike) -> Double:
         """Look up the colours (..., 3), 0..1 in sRGB, of values of any shape; NaN has a grey."""
         return self.colours(values)
 
-    def opacity(self, values: npt.ArrayLike) -> Floats:
+    def opacity(self, values: npt.ArrayLike) -> Double:
         """Look up the opacity 0..1 after the unit distance, without the density; 0 for NaN."""
         array = np.asarray(values, dtype=np.float64)
         # Scaled by a power of two, 1 for ordinary values: the distance of two points may overflow,
@@ -409,11 +409,11 @@ class TransferFunction:
         opacity = np.interp(scale * array, scale * self.points[:, 0], self.points[:, 1])
         return np.where(np.isnan(array), 0.0, opacity)
 
-    def extinction(self, values: npt.ArrayLike) -> Floats:
+    def extinction(self, values: npt.ArrayLike) -> Double:
         """Look up the extinction per length of the coordinates, finite; 0 for NaN."""
         return self.density * extinction_of(self.opacity(values), self.unit_distance)
 
-    def table(self, n: int = ENTRIES) -> tuple[float, float, npt.NDArray[np.float32], Floats]:
+    def table(self, n: int = ENTRIES) -> tuple[float, float, npt.NDArray[np.float32], Double]:
         """Tabulate the function at n values spread evenly over `span`.
 
         A table is linear between its entries, and beyond the ends it is that of the ends. Warns
@@ -496,7 +496,7 @@ def _colour_points(rows: Sequence[tuple[float, str]]) -> ColourMap:
     return ColourMap(positions=np.array(values, dtype=np.float64), points=points)
 
 
-def _checked_points(rows: Sequence[tuple[float, float]]) -> Floats:
+def _checked_points(rows: Sequence[tuple[float, float]]) -> Double:
     """Points (value, opacity) as float64 (n, 2); raises InputError for what they may not be."""
     if not rows:
         raise InputError(
@@ -514,7 +514,7 @@ def _checked_points(rows: Sequence[tuple[float, float]]) -> Floats:
 
 
 def _span(
-    points: Floats, colours: ColourMap, value_range: tuple[float, float]
+    points: Double, colours: ColourMap, value_range: tuple[float, float]
 ) -> tuple[float, float]:
     """The values that a table has to cover.
 

@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.rendering.cameras import Rays
-from fhash_codec.rendering.grid import Floats, Grid, Warp
+from fhash_codec.rendering.grid import Grid, Warp
 from fhash_codec.rendering.scenes import Clip
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double
 
 SNAP = 1e-6
 """Distance from a vertex, in vertices, at which a clip's end is taken for the vertex: coordinates
@@ -31,8 +32,8 @@ class Body:
             numbers is at least the fourth. They are normals of length 1.
     """
 
-    bounds: Floats
-    planes: Floats
+    bounds: Double
+    planes: Double
 
     @classmethod
     def of(cls, clip: Clip, grid: Grid) -> Body:
@@ -72,7 +73,7 @@ class Body:
         return cls(bounds=grid.bounds, planes=np.empty((0, 4)))
 
     @property
-    def half_spaces(self) -> tuple[Floats, Floats]:
+    def half_spaces(self) -> tuple[Double, Double]:
         """Normals (n, 3) inwards and offsets (n,) of all faces.
 
         Places whose product with the normal plus the offset is at least 0 are inside. The first six
@@ -83,23 +84,23 @@ class Body:
         return normals, offsets
 
     @property
-    def corners(self) -> Floats:
+    def corners(self) -> Double:
         """The corners (n, 3) of the body; some may be there several times."""
         return corners_of(*self.half_spaces, 1e-9 * max(1.0, float(np.abs(self.bounds).max())))
 
     @property
-    def extent(self) -> Floats:
+    def extent(self) -> Double:
         """The smallest box (3, 2), x, y, z, around the body."""
         corners = self.corners
         return np.stack([corners.min(axis=0), corners.max(axis=0)], axis=-1)
 
-    def holds(self, places: Floats) -> npt.NDArray[np.bool_]:
+    def holds(self, places: Double) -> npt.NDArray[np.bool_]:
         """Whether places (..., 3) of index space lie in the body or on its faces."""
         normals, offsets = self.half_spaces
         return np.asarray(np.all(places @ normals.T + offsets >= -SNAP, axis=-1))
 
 
-def corners_of(normals: Floats, offsets: Floats, tolerance: float) -> Floats:
+def corners_of(normals: Double, offsets: Double, tolerance: float) -> Double:
     """The corners (m, 3) of a convex body: where three faces meet and no other cuts them off.
 
     Args:
@@ -220,7 +221,7 @@ def region_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin:
     return _chunks_around(body.extent, volume, warp, margin)
 
 
-def _chunks_around(extent: Floats, volume: Volume, warp: Warp | None, margin: int) -> Box:
+def _chunks_around(extent: Double, volume: Volume, warp: Warp | None, margin: int) -> Box:
     """The region (z, y, x) of the chunks around places (3, 2), x, y, z, and a margin."""
     if warp is not None:
         extent = np.stack([warp.to_series(axis, ends) for axis, ends in enumerate(extent)])
@@ -237,7 +238,7 @@ def _chunks_around(extent: Floats, volume: Volume, warp: Warp | None, margin: in
     return Box.of(region)
 
 
-def _seen(rays: Rays, body: Body | None) -> Floats | None:
+def _seen(rays: Rays, body: Body | None) -> Double | None:
     """Bounds (3, 2) of the part of the box that is in view, x, y, z in vertices; None if none is.
 
     The part is convex and bounded by the planes of the box, of a clip and of the view.
@@ -259,7 +260,7 @@ def _seen(rays: Rays, body: Body | None) -> Floats | None:
     return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1)
 
 
-def _view_planes(rays: Rays) -> tuple[list[Floats], list[float]]:
+def _view_planes(rays: Rays) -> tuple[list[Double], list[float]]:
     """The planes through the four edges of the picture: unit normals (3,) inwards, and offsets."""
     normals, offsets = [], []
     for side, other in ((rays.right, rays.up), (rays.up, rays.right)):
@@ -296,7 +297,7 @@ class Edge:
     """
 
     axis: int
-    ends: Floats
+    ends: Double
     fronts: int
     uncut: bool
 
@@ -345,7 +346,7 @@ def _lowest_then_leftmost(edge: Edge) -> tuple[float, float]:
     return round(float(edge.ends[:, 1].max()), 3), -float(edge.ends[:, 0].min())
 
 
-def _clipped(rays: Rays, ends: Floats) -> Floats | None:
+def _clipped(rays: Rays, ends: Double) -> Double | None:
     """Cut a line (2, 3) of index space off behind a perspective camera.
 
     The line itself if all of it is before the camera, None if nothing is.

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +17,8 @@ from fhash_codec.compact.goal import promise
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Check, Finding, Run, environment
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.values import is_wide_integer
-
-Values = npt.NDArray[Any]
 
 N_REGIONS = 6
 """Random regions of each run."""
@@ -170,9 +168,6 @@ def _region(generator: np.random.Generator, shape: tuple[int, ...]) -> Box:
         low, high = sorted(generator.choice(length + 1, 2, replace=False).tolist())
         spans.append((int(low), int(high)))
     return Box.of(spans)
-
-
-Mask = npt.NDArray[np.bool_]
 
 
 def presence(run: Run) -> Iterator[Finding]:

@@ -11,25 +11,24 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Finding, Run
 from fhash_formats.errors import FhashError, RegionError
 from fhash_formats.series import AXIS_NAMES, ArraySeries, Coordinate
+from fhash_formats.support.arrays import Double, Values
 
 Shape = tuple[int, int, int, int]
-Values = npt.NDArray[Any]
 
 SHAPE: Shape = (4, 9, 10, 11)
 """Shape (t, z, y, x) of most cases: 3,960 values; only the number of steps is a power of two."""
 
 
-def lattice(shape: Shape = SHAPE) -> tuple[Floats, Floats, Floats, Floats]:
+def lattice(shape: Shape = SHAPE) -> tuple[Double, Double, Double, Double]:
     """The indices t, z, y and x of every vertex, each as an array of the given shape."""
     t, z, y, x = np.meshgrid(*(np.arange(float(n)) for n in shape), indexing="ij")
     return t, z, y, x
 
 
-def waves(shape: Shape = SHAPE) -> Floats:
+def waves(shape: Shape = SHAPE) -> Double:
     """A smooth moving field with values in 0..1; 0 and 1 both occur unless the shape has one value
     only."""
     t, z, y, x = (index / max(n - 1, 1) for index, n in zip(lattice(shape), shape, strict=True))
@@ -38,7 +37,7 @@ def waves(shape: Shape = SHAPE) -> Floats:
     return np.asarray((values - low) / (high - low if high > low else 1.0))
 
 
-def noise(shape: Shape = SHAPE, seed: int = 0) -> Floats:
+def noise(shape: Shape = SHAPE, seed: int = 0) -> Double:
     """White noise from a normal distribution with standard deviation 1."""
     return np.random.default_rng(seed).standard_normal(shape)
 
@@ -59,7 +58,7 @@ def series(
     *,
     times: Sequence[float] | npt.NDArray[np.float64] | None = None,
     units: str = "1",
-    **axes: Floats,
+    **axes: Double,
 ) -> ArraySeries:
     """A series in memory.
 

@@ -17,11 +17,11 @@ from fhash_codec.encoding import encode
 from fhash_codec.paper.model import decode_region, sample_points
 from fhash_codec.paper.network import ArrayTable, Network, NumberType
 from fhash_codec.paper.storage import load_network
-from fhash_codec.rendering.grid import Floats
 from fhash_codec.selftest.case import Case, Check, Finding, Run, as_floats
 from fhash_codec.selftest.field_cases import Settings, noise, single, spike, waves
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Double
 
 UNIT = 2.0**-24
 """Largest relative error of one float32 rounding."""
@@ -61,7 +61,7 @@ class Oracle:
         ]
 
     @cached_property
-    def tables(self) -> list[Floats]:
+    def tables(self) -> list[Double]:
         """The table (t, z, y, x, embedding) of each level."""
         regions = [
             tuple(slice(0, length) for length in table.shape[:4]) for table in self.network.tables
@@ -95,7 +95,7 @@ class Oracle:
             hidden = weight @ hidden + bias
         return Answer(value=float(hidden[0]), rounding=float(rounding[0]), active=tuple(active))
 
-    def _embedding(self, table: Floats, point: Sequence[float]) -> tuple[Floats, Floats]:
+    def _embedding(self, table: Double, point: Sequence[float]) -> tuple[Double, Double]:
         """The quadrilinear mean of the embeddings at the 16 corners around a point, and the largest
         magnitude among these."""
         before, share = [], []

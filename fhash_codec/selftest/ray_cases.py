@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.rendering.grid import Floats
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Task, warped
 from fhash_codec.rendering.plan import Plan, plan_picture
@@ -19,6 +18,7 @@ from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest.case import Case, Check, Finding, Run
 from fhash_codec.selftest.field_cases import Settings, Shape, series, single, waves
 from fhash_formats.series import ArraySeries
+from fhash_formats.support.arrays import Double
 
 SNAP = 1e-9
 """Distance from a vertex, in vertex spacings, below which a coordinate is that of the vertex."""
@@ -26,7 +26,7 @@ HALVINGS = 60
 """Bisections of the search for the position of a surface."""
 
 
-def reference_picture(frame: Frame, task: Task) -> Floats:
+def reference_picture(frame: Frame, task: Task) -> Double:
     """The picture (H, W, 4) of an unshaded volume and surfaces of one colour each, with
     premultiplied opacity.
 
@@ -40,7 +40,7 @@ def reference_picture(frame: Frame, task: Task) -> Floats:
     return picture
 
 
-def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
+def _ray(frame: Frame, task: Task, eye: Double, direction: Double) -> Double:
     grid = task.rays.grid
     direction = direction / np.linalg.norm(direction * grid.spacing)
     enter, leave = _within(eye, direction, grid.bounds)
@@ -61,7 +61,7 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
     )
     entered, left_at = _within(eye, direction, seen)
 
-    def value(distances: npt.NDArray[np.floating[Any]]) -> Floats:
+    def value(distances: npt.NDArray[np.floating[Any]]) -> Double:
         return _trilinear(
             frame,
             np.clip(eye + distances[:, None] * direction, grid.bounds[:, 0], grid.bounds[:, 1]),
@@ -103,7 +103,7 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
     return np.array([*colour, 1 - left])
 
 
-def _within(eye: Floats, direction: Floats, bounds: Floats) -> tuple[float, float]:
+def _within(eye: Double, direction: Double, bounds: Double) -> tuple[float, float]:
     """The distances at which a ray enters a box (3, 2) in front of the eye and leaves it; both 0 if
     it misses the box."""
     enter, leave = 0.0, np.inf
@@ -120,8 +120,8 @@ def _within(eye: Floats, direction: Floats, bounds: Floats) -> tuple[float, floa
 
 
 def _crossings(
-    value: Callable[[Floats], Floats], ends: Floats, values: Floats, level: float
-) -> Floats:
+    value: Callable[[Double], Double], ends: Double, values: Double, level: float
+) -> Double:
     """The position of an isosurface in each interval of a ray, (n - 1,); infinite where there is
     none or values are missing.
 
@@ -147,7 +147,7 @@ def _crossings(
     return places
 
 
-def _trilinear(frame: Frame, places: Floats) -> Floats:
+def _trilinear(frame: Frame, places: Double) -> Double:
     """Values (n,) at places (n, 3), which are x, y, z in vertices of the domain.
 
     A value is NaN outside the frame, and where a vertex with a weight above 0 is NaN.
@@ -171,7 +171,7 @@ def _trilinear(frame: Frame, places: Floats) -> Floats:
     return np.where(outside, np.nan, corners)
 
 
-def _between(one: Floats, other: Floats, share: Floats) -> Floats:
+def _between(one: Double, other: Double, share: Double) -> Double:
     """Linear interpolation from one value to another; a NaN with the weight 0 does not matter."""
     return np.where(share == 0, one, np.where(share == 1, other, one + share * (other - one)))
 

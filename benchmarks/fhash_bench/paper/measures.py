@@ -31,6 +31,7 @@ from fhash_codec.rendering.stream_fields import CoresetField
 from fhash_codec.rendering.stream_march import stream
 from fhash_codec.rendering.torch_arrays import TorchArrays
 from fhash_codec.rendering.transfer_function import TransferFunction
+from fhash_formats.support.arrays import Mask, Single
 
 if TYPE_CHECKING:
     from fhash_bench.paper.trained import TrainedEncoding
@@ -284,8 +285,6 @@ def _psnr(errors: list[npt.NDArray[np.float64]]) -> float | None:
     return -10 * math.log10(mean) if 0 < mean < math.inf else None
 
 
-Single = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 Range = tuple[float, float]
 
 PICTURE_SIZE = 192

@@ -26,6 +26,7 @@ from fhash_codec.rendering.march import march
 from fhash_codec.rendering.march_task import Frame, Lighting, Marched, Table, Task
 from fhash_codec.rendering.scenes import Camera
 from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import usable_threads
 
 SIDE = 256
@@ -97,7 +98,6 @@ def view_of_shell(side: int, size: int, azimuth: float, shaded: bool) -> Task:
     )
 
 
-Single = npt.NDArray[np.float32]
 Address = int | None
 
 DATA = 0x8000000 + 100

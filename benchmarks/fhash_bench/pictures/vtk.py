@@ -29,9 +29,9 @@ from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scenes import GRADIENTS, Scene, Shading, TransferFunctionSpec
 from fhash_codec.volume import Volume
 from fhash_formats.errors import MissingDependencyError
+from fhash_formats.support.arrays import Double, Single
 from fhash_formats.support.threads import usable_threads
 
-Single = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.uint8]
 
 MAPPERS = ("cpu", "gpu")
@@ -238,8 +238,6 @@ class VtkPeer:
         self.window.Finalize()
 
 
-Floats = npt.NDArray[np.float64]
-
 DARK = 1e-5
 """Share of the light at which a ray ends."""
 
@@ -291,7 +289,7 @@ def vtk_picture(values: Single, task: Task) -> Single:
     return rgba.reshape(rays.size[1], rays.size[0], 4).astype(np.float32)
 
 
-def _trilinear(values: Single, places: Floats) -> Floats:
+def _trilinear(values: Single, places: Double) -> Double:
     """Values at places (n, 3), x, y, z in vertices, clamped to the frame."""
     last = np.array(values.shape[::-1]) - 1
     at = np.clip(places, 0, last)
@@ -305,7 +303,7 @@ def _trilinear(values: Single, places: Floats) -> Floats:
     return total
 
 
-def _central(values: Single, places: Floats) -> Floats:
+def _central(values: Single, places: Double) -> Double:
     """Differences (n, 3) over the vertex before and the vertex behind, per vertex."""
     return np.stack(
         [
@@ -316,7 +314,7 @@ def _central(values: Single, places: Floats) -> Floats:
     )
 
 
-def _lit(shade: Floats, gradient: Floats, along: Floats, lighting: Lighting) -> Floats:
+def _lit(shade: Double, gradient: Double, along: Double, lighting: Lighting) -> Double:
     """Phong's model with the light at the eye.
 
     The mirrored ray and the way back to the eye enclose twice the angle to the normal.

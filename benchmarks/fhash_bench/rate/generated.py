@@ -11,11 +11,11 @@ import numpy.typing as npt
 from fhash_codec.simulation.simulate import Simulation, simulate
 from fhash_formats.errors import InputError, suggestion
 from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.support.arrays import Single
 
 PREFIX = "generated:"
 """Beginning of the name of a generated series where a file could stand."""
 
-Floats = npt.NDArray[np.float32]
 Grid = tuple[npt.NDArray[np.float64], ...]
 
 
@@ -24,7 +24,7 @@ def _grid(*shape: int) -> Grid:
     return np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij", sparse=True)
 
 
-def _plateau(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _plateau(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """A blast: a plateau outside, a thin wavy shell, a hollow inside; 21 x 80^3.
 
     The first step is constant, and the times are uneven.
@@ -49,13 +49,13 @@ def _plateau(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
     return values, times
 
 
-def _noise(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _noise(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """White noise: nothing to predict; 10 x 24 x 40 x 40."""
     values = np.random.default_rng(seed).normal(size=(10, 24, 40, 40))
     return values.astype(np.float32), np.arange(10.0)
 
 
-def _labels(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _labels(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Numbers of basins that move: few values, sharp edges; 12 x 16 x 64 x 64."""
     rng = np.random.default_rng(seed)
     t, z, y, x = _grid(12, 16, 64, 64)
@@ -70,7 +70,7 @@ def _labels(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
     return labels, np.arange(12.0)
 
 
-def _waves(seed: int, shape: tuple[int, ...], finest: float, power: float) -> Floats:
+def _waves(seed: int, shape: tuple[int, ...], finest: float, power: float) -> Single:
     """A sum of moving plane waves.
 
     finest: the shortest waves' number across the box. power: amplitude falls as frequency to it.
@@ -87,17 +87,17 @@ def _waves(seed: int, shape: tuple[int, ...], finest: float, power: float) -> Fl
     return values.astype(np.float32)
 
 
-def _smooth(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _smooth(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Long waves that drift slowly; 16 x 32 x 48 x 48."""
     return _waves(seed, (16, 32, 48, 48), 3.0, 1.5), np.linspace(0, 1, 16)
 
 
-def _thin(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _thin(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Turbulence in three layers: one thin axis; 20 x 3 x 96 x 112."""
     return _waves(seed, (20, 3, 96, 112), 24.0, 1.0), np.linspace(0, 1, 20)
 
 
-def _long(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _long(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Many steps of few vertices, at uneven times; 600 x 6 x 10 x 14."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.2, 1.8, 600))
@@ -112,14 +112,14 @@ def _long(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
     return values.astype(np.float32), times
 
 
-def _short(seed: int) -> tuple[Floats, npt.NDArray[np.float64]]:
+def _short(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Two steps of many vertices: turbulence with a front; 2 x 80 x 96 x 96."""
     values = _waves(seed, (2, 80, 96, 96), 20.0, 1.0)
     t, _, _, x = _grid(2, 80, 96, 96)
     return (values + np.where(x < 0.4 + 0.1 * t, 2, 0)).astype(np.float32), np.arange(2.0)
 
 
-GENERATED: dict[str, Callable[[int], tuple[Floats, npt.NDArray[np.float64]]]] = {
+GENERATED: dict[str, Callable[[int], tuple[Single, npt.NDArray[np.float64]]]] = {
     "plateau": _plateau,
     "noise": _noise,
     "labels": _labels,

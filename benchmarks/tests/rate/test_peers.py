@@ -38,7 +38,6 @@ from fhash_bench.rate.rate import bench_rate
 from fhash_codec.boxes import Box
 from fhash_codec.cost.peers import (
     LAYOUTS,
-    Values,
     Variant,
     filled,
     joined,
@@ -48,6 +47,7 @@ from fhash_codec.cost.peers import (
     stored_bytes,
 )
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Values
 
 Script = Callable[[str, str], str]
 VALUES = np.random.default_rng(0).normal(size=(3, 4, 5, 6)).astype(np.float32)

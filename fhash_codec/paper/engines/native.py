@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.measure.value_range import Floats
 from fhash_codec.native.network import PATHS, library, machine_paths
 from fhash_codec.paper.engines.parameters import (
     BETA1,
@@ -36,6 +35,7 @@ from fhash_codec.paper.engines.parameters import (
 )
 from fhash_codec.paper.network import Architecture
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Single
 
 GROUP = 16
 """Vertices along x that are interpolated together; FHASH_GROUP in bricks.hpp."""
@@ -324,7 +324,7 @@ class NativeEngine:
         self.blocks = np.zeros(-(-self.lazy // BLOCK), np.int64)
         self._stamps, self._touched = np.zeros_like(self.blocks), np.zeros_like(self.blocks)
         self._gaps: _GapTables | None = None
-        self._current: tuple[int, list[Floats]] | None = None
+        self._current: tuple[int, list[Single]] | None = None
         self._memory: dict[str, npt.NDArray[Any]] = {}
         self._task = self._new_task()
 
@@ -485,7 +485,7 @@ class NativeEngine:
             self._native.fhash_bricks_gaps(ctypes.byref(self._task), tables.step + 1, self.step)
             tables.step = self.step
 
-    def _settled_flat(self) -> list[Floats]:
+    def _settled_flat(self) -> list[Single]:
         """Return `flat` and its moments with all blocks caught up; the engine's own stay behind."""
         if self._current is None or self._current[0] != self.step:
             self._catch_up_gaps()
@@ -496,7 +496,7 @@ class NativeEngine:
         return self._current[1]
 
 
-def _padded(numbers: Floats) -> Floats:
+def _padded(numbers: Single) -> Single:
     """Return a copy of numbers with PAD more behind them in memory, for a last vector's sake."""
     memory = np.zeros(numbers.size + PAD, np.float32)
     copy = memory[: numbers.size].reshape(numbers.shape)
@@ -532,7 +532,7 @@ class _GapTables:
 
     def settle(
         self,
-        arrays: list[Floats],
+        arrays: list[Single],
         visited: npt.NDArray[np.int64],
         step: int,
         lengths: npt.NDArray[np.int64] | int,

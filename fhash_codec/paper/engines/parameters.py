@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.measure.value_range import Doubles, Floats, Integers
 from fhash_codec.paper.network import Architecture
+from fhash_formats.support.arrays import Double, Longs, Single
 
 BETA1 = 0.9
 """Decay of the mean of gradients per step."""
@@ -28,7 +28,7 @@ WINDOW = 200
 (BETA1 / sqrt(BETA2))**200 is 8e-10.
 """
 
-Chosen = Integers
+Chosen = Longs
 """Numbers (n,) of some bricks of the coreset, without repetition."""
 
 
@@ -39,10 +39,10 @@ class CatchUp(NamedTuple):
     -factor * m / (sqrt(v) + epsilon). Then m decays by `mean_decay` and v by `square_decay`.
     """
 
-    factor: Floats
-    epsilon: Floats
-    mean_decay: Floats
-    square_decay: Floats
+    factor: Single
+    epsilon: Single
+    mean_decay: Single
+    square_decay: Single
 
 
 def corrections(step: int, rate: float) -> tuple[float, float]:
@@ -106,7 +106,7 @@ def _average(gradient: Tensor, mean: Tensor, square: Tensor) -> None:
     square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
 
 
-def catch_up(visited: Integers, step: int, rates: Doubles) -> CatchUp:
+def catch_up(visited: Longs, step: int, rates: Double) -> CatchUp:
     """Return the effect of the steps visited + 1 .. step, all with a gradient of zero.
 
     At step j = visited + i Adam moves a parameter by
@@ -282,10 +282,10 @@ class LevelAxes:
             (corners t z x y, E), int64.
     """
 
-    starts: tuple[Integers, ...]
-    matrices: tuple[Doubles, ...]
+    starts: tuple[Longs, ...]
+    matrices: tuple[Double, ...]
     shapes: tuple[tuple[int, ...], ...]
-    offsets: Integers
+    offsets: Longs
 
 
 class Upsampling:
@@ -423,7 +423,7 @@ class Lattices:
             flat_gradient.index_add_(0, self.index.reshape(-1), torch.cat(levels, dim=1).view(-1))
 
 
-def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Integers, Doubles]:
+def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Longs, Double]:
     """Return the sub-lattice and the weights of each run of vertices along an axis.
 
     The first and the last vertex of the axis are the first and the last corner
@@ -455,7 +455,7 @@ def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Int
 
 def level_matrices(
     architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...]
-) -> list[tuple[Integers, Doubles]]:
+) -> list[tuple[Longs, Double]]:
     """Return `axis_matrices` of a level along t, z, y and x; a key frame is a run along time."""
     lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
     return [

@@ -14,6 +14,7 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.zip_file import check_major
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 from fhash_formats.series import AXIS_NAMES, Coordinate
+from fhash_formats.support.arrays import Double
 from fhash_formats.support.values import DTYPES
 from fhash_formats.transform.head import MAX_HIDDEN
 from fhash_formats.transform.head import MAX_WIDTH as MAX_HEAD_WIDTH
@@ -34,8 +35,6 @@ TYPES = ("float64", "float32")
 
 _DIGITS = (*range(1, 16), 17)
 """Numbers of significant decimal digits that guesses of a step are rounded to."""
-
-Floats = npt.NDArray[np.float64]
 
 
 def describe_coordinates(
@@ -76,7 +75,7 @@ def described_coordinate(description: Mapping[str, Any], dimension: str, length:
     )
 
 
-def describe_positions(values: Floats) -> dict[str, Any] | None:
+def describe_positions(values: Double) -> dict[str, Any] | None:
     """The header's description of positions, float64 (n,); None where only an array will do.
 
     `positions` turns the description into the same positions, bit by bit.
@@ -108,7 +107,7 @@ def describe_positions(values: Floats) -> dict[str, Any] | None:
     )
 
 
-def positions(description: Mapping[str, Any], length: int) -> Floats:
+def positions(description: Mapping[str, Any], length: int) -> Double:
     """The positions that a description stands for, float64 (length,).
 
     The description is one that `check_positions` has passed.
@@ -148,7 +147,7 @@ def check_positions(record: Record, length: int) -> None:
         record.record("attributes")
 
 
-def _nearly_ruled(values: Floats, kinds: Sequence[str]) -> dict[str, Any] | None:
+def _nearly_ruled(values: Double, kinds: Sequence[str]) -> dict[str, Any] | None:
     """A rule and how far each position is from it, in units in the last place; None without one.
 
     Of several rules the one from which the fewest positions differ is taken.
@@ -168,7 +167,7 @@ def _nearly_ruled(values: Floats, kinds: Sequence[str]) -> dict[str, Any] | None
     return best
 
 
-def _moved_rule(values: Floats, start: float, step: float, kind: str) -> dict[str, Any] | None:
+def _moved_rule(values: Double, start: float, step: float, kind: str) -> dict[str, Any] | None:
     """A rule and how far positions are from it, in units in the last place; None if too far."""
     rule: dict[str, Any] = {}
     if start != 0 or np.signbit(start):
@@ -209,7 +208,7 @@ def _moved(values: npt.NDArray[Any], ulps: npt.NDArray[np.int64]) -> npt.NDArray
     return np.where(ulps == 0, values, bits.view(values.dtype))
 
 
-def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:
+def _candidates(values: Double, kind: str) -> Iterator[tuple[float, float]]:
     """Yield starts and steps that the source may have used, those of few digits first."""
     starts = list(dict.fromkeys((_shortest(values[0], kind), float(values[0]))))
     if values.size == 1:

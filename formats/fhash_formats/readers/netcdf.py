@@ -50,7 +50,8 @@ from fhash_formats.readers.common.variables import (
 )
 from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.series import AXES, Coordinate, SourceMetadata, shown_name
-from fhash_formats.support.values import STORED, Values, is_wide_integer, json_attributes, text_of
+from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import STORED, is_wide_integer, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr

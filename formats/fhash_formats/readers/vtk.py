@@ -34,7 +34,8 @@ from fhash_formats.readers.hdf5 import is_hdf5, require_filters
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, NotStored
-from fhash_formats.support.values import PLUMBING, Values, json_attributes, text_of
+from fhash_formats.support.arrays import Values
+from fhash_formats.support.values import PLUMBING, json_attributes, text_of
 
 XML_SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")

@@ -12,13 +12,6 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
 
-Values = npt.NDArray[Any]
-"""An array of numbers of any type."""
-Mask = npt.NDArray[np.bool_]
-"""An array that says of each vertex whether it counts."""
-Integers = npt.NDArray[np.int32]
-"""An array of the integers that are coded."""
-
 
 def is_number(text: str) -> bool:
     """Whether a text is a number as `float` reads it, infinities and NaN included."""

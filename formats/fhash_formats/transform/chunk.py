@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.support.values import Mask, Values, exact_number, integer_origin
+from fhash_formats.support.arrays import Mask, Values
+from fhash_formats.support.values import exact_number, integer_origin
 from fhash_formats.transform.coder import MAX_LABELS
 from fhash_formats.transform.decoding import decode_tile, transform_for
 from fhash_formats.transform.encoding import (

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.values import Integers, Mask
+from fhash_formats.support.arrays import Integers, Mask
 
 Table = npt.NDArray[np.int32]
 """Bands in the order in which they are coded, int32 of shape (bands, COLUMNS)."""

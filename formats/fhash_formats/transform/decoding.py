@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.support.threads import in_threads
-from fhash_formats.support.values import Integers, Mask, Values
 from fhash_formats.transform.coder import decode_integers, single_band
 from fhash_formats.transform.lifting import Transform, band_table
 from fhash_formats.transform.predict import Predictor, decode_predicted, values_of

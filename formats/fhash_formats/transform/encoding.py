@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
-from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.transform.coder import (
     HIGH,
     LOW,

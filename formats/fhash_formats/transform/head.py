@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.arrays import Single
 from fhash_formats.support.threads import in_threads, row_parts, usable_threads
 
 OFFSETS: tuple[tuple[int, int, int, int], ...] = (
@@ -148,8 +149,6 @@ _WIDEST_LANES = 0
 _MAX_WEIGHT_BYTES = 3
 """Bytes that a weight takes at most (22 bits), which bounds the work on hostile bytes."""
 
-Floats = npt.NDArray[np.float32]
-
 
 def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
     """The number of inputs of each layer, the last one included.
@@ -185,7 +184,7 @@ class Layer:
     bias_scale: float
 
     @property
-    def parameters(self) -> tuple[Floats, Floats]:
+    def parameters(self) -> tuple[Single, Single]:
         """Weights (out, in) and biases (out,), float32.
 
         They are exact: whole numbers of 6 and 8 bits times scales of 11 bits.
@@ -210,9 +209,9 @@ class _Constants(NamedTuple):
     1024 over the length of the clip range.
     """
 
-    weights: list[Floats]
+    weights: list[Single]
     scales: list[np.float32]
-    biases: list[Floats]
+    biases: list[Single]
     low: np.float32
     high: np.float32
     inverse: np.float32
@@ -299,7 +298,7 @@ class NeighbourHead:
             unit = np.float32(0)
         return _Constants(weights, scales, biases, low, high, np.float32(0.5) / sigma, unit)
 
-    def apply(self, decoded: Floats, *, in_place: bool = False) -> Floats:
+    def apply(self, decoded: Single, *, in_place: bool = False) -> Single:
         """The decoded values, each corrected and clipped to [low, high]; a new array.
 
         Args:

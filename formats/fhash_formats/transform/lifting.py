@@ -15,7 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.support.values import Integers, Values
+from fhash_formats.support.arrays import Integers, Values
 from fhash_formats.transform.coder import COLUMNS, NO_REFERENCE, Table
 from fhash_formats.transform.spec import AXES, KINDS, AxisTransform, TransformSpec
 

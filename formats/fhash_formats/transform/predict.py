@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.transform.coder import State, array_arguments, checked, state_arguments
 from fhash_formats.transform.values import pieces
 

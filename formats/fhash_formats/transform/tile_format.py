@@ -14,7 +14,8 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.support.values import Integers, Mask, Values, is_wide_integer, is_within
+from fhash_formats.support.arrays import Integers, Mask, Values
+from fhash_formats.support.values import is_wide_integer, is_within
 from fhash_formats.transform.coder import (
     MAX_LABELS,
     Levels,

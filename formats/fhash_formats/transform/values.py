@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.support.values import Integers, Mask, Values
+from fhash_formats.support.arrays import Integers, Mask, Values
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""

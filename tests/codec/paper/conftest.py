@@ -20,7 +20,6 @@ from fhash_codec.boxes import Box
 from fhash_codec.features.bricks import Coreset, build_coreset
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
 from fhash_codec.features.scan import scan
-from fhash_codec.measure.value_range import Floats
 from fhash_codec.paper.encode import Selection, select
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.network import Architecture, ArrayTable, Network, level_resolutions
@@ -29,6 +28,7 @@ from fhash_codec.paper.tables import TrainedTable, trained_tables
 from fhash_codec.paper.train import Probe, TrainingProgress, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
+from fhash_formats.support.arrays import Single
 
 Points = list[npt.NDArray[np.float64]]
 """Key indices, z, y and x of points, each (n,)."""
@@ -276,9 +276,9 @@ class RandomModel:
     field: npt.NDArray[np.float32]
     selection: Selection
     bricks: Bricks
-    fine: Floats
-    tables: list[Floats]
-    layers: tuple[tuple[Floats, Floats], ...]
+    fine: Single
+    tables: list[Single]
+    layers: tuple[tuple[Single, Single], ...]
     trained: list[TrainedTable]
 
     def network(self, fill: float | None = None) -> Network:
