@@ -43,7 +43,7 @@ class PsnrSearch:
 
     def __init__(self, min_step: float, max_step: float) -> None:
         """Begin a search between two steps."""
-        self._ends = math.log(min_step), math.log(max_step)
+        self._ends = min_step, max_step
         self._before: tuple[float, float] | None = None
 
     def after(self, step: float, psnr: float, target: float) -> float:
@@ -53,7 +53,7 @@ class PsnrSearch:
             fall = -(psnr - self._before[1]) / (log_step - self._before[0])
             slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
         self._before = log_step, psnr
-        low, high = self._ends
+        low, high = map(math.log, self._ends)  # 0 where nothing but a first trial is made
         return math.exp(min(max(log_step + (psnr - target) / slope, low), high))
 
 

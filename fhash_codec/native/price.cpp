@@ -147,7 +147,8 @@ struct Pricer {
         int some = 0;
         FHASH_INDEPENDENT
         for (int x = 0; x < length; x++) {
-            const float size = min(std::fabs(from[x] * scale), 1e9F);
+            const float any = std::fabs(from[x] * scale);
+            const float size = any < 1e9F ? any : 1e9F;  // also for NaN
             const int whole = (int)(size + ROUNDING);
             const float rest = size - (float)whole;
             to[x] = whole;

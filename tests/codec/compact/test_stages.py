@@ -488,7 +488,7 @@ def test_a_search_ends_where_nothing_follows_and_gives_the_best() -> None:
     assert tried == [3, 5, 2, 4, 6, 6, 8, 10]
 
 
-@pytest.mark.parametrize("options", [{}, {"middle": geometric_mean}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"middle": geometric_mean}], ids=["middle", "geometric"])
 @pytest.mark.parametrize("target", [1.5, 40.0, 99.0])
 def test_bisection_in_a_bracket_converges(options: dict[str, Any], target: float) -> None:
     bracket = Bracket(1.0, 100.0, **options)

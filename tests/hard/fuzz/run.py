@@ -46,7 +46,9 @@ SOURCES = (
     *("lifting", "head", "quantise", "values", "crc32c"),
 )
 """Files of NATIVE that are always fuzzed."""
-CODEC_SOURCES = ("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head")
+CODEC_SOURCES = (
+    *("gram", "head_inputs", "march_light", "march_slopes", "price", "quality", "train_head"),
+)
 """Files of CODEC that are always fuzzed."""
 NETWORK_SOURCES = ("peak", "points")
 """Files of NETWORK that are always fuzzed."""

@@ -160,6 +160,17 @@ std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vect
     return levels;
 }
 
+// Coefficients with a few hostile ones have a price.
+void of_price(Reader& in) {
+    const Bands& with = setups().bands[in.word() % setups().bands.size()];
+    const std::vector<float> coefficients = repeated<float>(in, volume(with.shape));
+    double results[2];
+    require(fhash_price(coefficients.data(), with.shape.data(), with.table.data(), bands_of(with),
+                        std::ldexp(1.0, static_cast<int>(in.within(-60, 60))), results) == 0,
+            "coefficients without a price");
+    require(results[0] >= 0 && results[1] >= 0, "a price below 0");
+}
+
 // Integers of two quantisers: those of a path come back.
 template <class T> void of_path(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
@@ -233,11 +244,12 @@ void of_predicted(Reader& in) {
 }  // namespace
 
 void round_trip(Reader& in) {
-    switch (in.byte() % 5) {
+    switch (in.byte() % 6) {
         case 0: of_integers(in); break;
         case 1: of_masks(in); break;
         case 2: of_predicted(in); break;
         case 3: of_path<float>(in); break;
+        case 4: of_price(in); break;
         default: of_path<double>(in);
     }
 }
