@@ -305,7 +305,7 @@ class PricedSample(Sample):
     """A sample whose tiles are priced, and not coded.
 
     Sizes and errors are those that fhash_codec/native/price.cpp foretells, for all vertices of a
-    tile. Transforms and tiles are compared by them.
+    tile. Only transforms are compared by them.
 
     Attributes:
         sample: the same sample, which codes its tiles.
@@ -324,7 +324,7 @@ class PricedSample(Sample):
 
 
 def priced(sample: Sample, settings: TileSettings, effort: int) -> Sample:
-    """Return a sample on which choices are compared: a priced one where that can be.
+    """Return a sample on which transforms are compared: a priced one where that can be.
 
     That is up to MAX_PRICED_EFFORT, where all vertices count and are coded by transform in float32.
     """

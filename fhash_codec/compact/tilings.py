@@ -122,8 +122,9 @@ class Trials:
     def _picked(self, tile: Shape) -> tuple[TileSettings, Outcome | None]:
         """Return settings with a transform, and the outcome of the series if it was coded."""
         sample = self._sample(tile, PICKED_VERTICES)
+        trials = priced(sample, self._settings, self._task.config.effort)
         settings, tried = rough_transform(
-            sample,
+            trials,
             self._settings,
             self._coding,
             self._known_transforms(tile),
@@ -131,13 +132,14 @@ class Trials:
         )
         for axis in (0, 1):
             self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
-        return settings, tried if sample.complete else None
+        # Prices of tilings are too far apart from their bytes, where tiles are few or small.
+        return settings, tried if sample.complete and trials is sample else None
 
     def _sample(self, tile: Shape, vertices: int) -> Sample:
         blocks = self._blocks.retile(tile)
         settings = replace(self._settings, transform=usual_transform(blocks.tile))
         sample = Sample(blocks, vertices, self._task.workers, tick=self._task.parts.tick)
-        return priced(sample.filled(settings, 1), settings, self._task.config.effort)
+        return sample.filled(settings, 1)
 
     def _known_transforms(self, tile: Shape) -> dict[int, AxisTransform]:
         """Return the transforms that need no trial: those of axes as long, and wavelets along z."""
