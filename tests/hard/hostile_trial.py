@@ -41,16 +41,22 @@ from fhash_formats.transform.tile_format import PREDICTED, TRANSFORMED, TileSett
 
 MEMORY = 512 << 20
 """Bytes that the process may allocate beyond what it has before; larger allocations fail."""
-SECONDS = 10.0
-"""Longest processor time of one command in seconds, on a shared machine. An idle machine takes less
-than 2."""
+WARM_UPS = 2.0
+"""Longest processor time of one command, as a multiple of that of all commands on all goldens,
+which a worker runs first (12 s on an EPYC): a limit in seconds would be that of one machine."""
 LARGE = 1 << 22
 """Most vertices of a series that is decoded as a whole; of larger ones, a region is decoded."""
 OWN_WARNING = "fhash: warning: "
 
 
 class Trial:
-    """One mutated file and the commands on it."""
+    """One mutated file and the commands on it.
+
+    Attributes:
+        limit: longest processor time of one command in seconds.
+    """
+
+    limit = 60.0
 
     def __init__(self, mutation: mutations.Mutation, folder: Path) -> None:
         self.mutation = mutation
@@ -164,8 +170,8 @@ class Trial:
         said = err.getvalue()
         if wrong is None:
             wrong = self._judged(name, code, said)
-        if wrong is None and seconds > SECONDS:
-            wrong = f"{seconds:.1f} s of processor time"
+        if wrong is None and seconds > self.limit:
+            wrong = f"{seconds:.1f} s of processor time, of at most {self.limit:.1f}"
         end = {0: "decoded", 4: "refused", 1: "too large", 2: "nothing to show"}.get(
             code, f"exit {code}"
         )
@@ -370,7 +376,7 @@ def _bound_time() -> None:
     limits counts ticks, and in an hour it runs away from the clock that `getrusage` tells, so that
     commands of a second were ended.
     """
-    signal.setitimer(signal.ITIMER_PROF, 3 * SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, 3 * Trial.limit)
 
 
 def _bound_memory(limit: int) -> None:
@@ -386,6 +392,7 @@ def worker(folder: Path) -> None:
         same = mutations.Mutation(number=0, golden=golden, kind="none", sealed=True, data=data)
         wrong = [end for end in Trial(same, folder).run()["ends"] if end["wrong"]]
         assert not wrong, wrong
+    Trial.limit = WARM_UPS * time.process_time()
     limit = _resident("VmData") + MEMORY
     # Where a command does not end, the log tells where it was.
     faulthandler.register(signal.SIGPROF, all_threads=True, chain=True)
