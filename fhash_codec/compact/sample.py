@@ -34,7 +34,7 @@ from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.coder import array_arguments, checked
 from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import SHARE, filled
+from fhash_formats.transform.encoding import filled, plain_step
 from fhash_formats.transform.lifting import band_table
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import all_finite
@@ -339,7 +339,7 @@ def _price(tile: Tile, settings: TileSettings, coding: Coding) -> Outcome:
     if not all_finite(values):
         np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     coefficients = transform_for(settings, values.shape).forward(values)
-    step = settings.step / SHARE if settings.trellis else settings.step
+    step = plain_step(settings)
     results = (ctypes.c_double * 2)()
     code = native.library().fhash_price(
         ctypes.c_void_p(coefficients.ctypes.data),

@@ -23,7 +23,13 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import MIN_STEP_SHARE, Coding, Outcome
 from fhash_formats.errors import InputError
-from fhash_formats.transform.encoding import OFFSETS, SHARE, TRELLIS_WEIGHT, WEIGHT, with_trellis
+from fhash_formats.transform.encoding import (
+    OFFSETS,
+    TRELLIS_WEIGHT,
+    WEIGHT,
+    plain_step,
+    with_trellis,
+)
 from fhash_formats.transform.tile_format import TileSettings
 
 
@@ -83,11 +89,6 @@ def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, C
     """Return settings and coding with the plain quantiser, at about the same error."""
     settings = replace(settings, trellis=False, step=plain_step(settings), offsets=OFFSETS)
     return settings, replace(coding, weight=WEIGHT)
-
-
-def plain_step(settings: TileSettings) -> float:
-    """Return the step with which the plain quantiser errs about as much, in units of the values."""
-    return settings.step / SHARE if settings.trellis else settings.step
 
 
 def step_after(settings: TileSettings, outcome: Outcome, goal: Goal) -> float:

@@ -1,5 +1,5 @@
 // Approximate bytes and error of quantised coefficients, without coding them: by these, transforms
-// and steps are compared.
+// are compared.
 //
 // Integers are looked at as a coder with fixed statistics would: band by band, row by row, in
 // blocks of 16 along x, the even places of a block before the odd ones, which lie between them. A

@@ -190,6 +190,11 @@ def with_trellis(settings: TileSettings) -> TileSettings:
     return replace(settings, trellis=True, step=settings.step * SHARE, offsets=TRELLIS_OFFSETS)
 
 
+def plain_step(settings: TileSettings) -> float:
+    """The step with which the plain quantiser errs about as much, in units of the values."""
+    return settings.step / SHARE if settings.trellis else settings.step
+
+
 def choose_integers(
     coefficients: Values, settings: TileSettings, weight: float, passes: int = 1
 ) -> Integers | None:

@@ -53,7 +53,6 @@ from fhash_codec.compact.step import (
     is_smaller,
     off_trellis,
     on_trellis,
-    plain_step,
     with_step,
 )
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome, Tile
@@ -65,7 +64,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
-from fhash_formats.transform.encoding import OFFSETS, encode_tile
+from fhash_formats.transform.encoding import OFFSETS, encode_tile, plain_step
 from fhash_formats.transform.encoding import Coding as Coding_step
 from fhash_formats.transform.predict import Predictor, encode_predicted, passes_of
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
