@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +33,8 @@ from fhash_formats.writers.common import (
 from fhash_formats.writers.labelled import COMPRESSION
 
 SPACE = ("z", "y", "x")
+ENTITIES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;"})
+"""Characters that have a meaning in XML; xml.sax.saxutils would import HTTP and TLS."""
 
 
 def _vti_outputs(path: Path, region: Region) -> list[Path]:
@@ -139,7 +140,7 @@ def _write_grid(
         origin = " ".join(repr(float(coords[axis][0])) for axis in "xyz")
         spacing = " ".join(repr(even_spacing(coords[axis])) for axis in "xyz")
         kind, place = "ImageData", f' Origin="{origin}" Spacing="{spacing}"'
-    name = quoteattr(printable(region.name))
+    name = _quoted(region.name)
     units = _units(region.units)
     sizes = (
         [frame.size * dtype.itemsize]
@@ -199,7 +200,11 @@ def _time_units(coordinate: Coordinate) -> str:
 def _units(text: str) -> str:
     """The information key that holds units; "" without them."""
     key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">'
-    return f"{key}{escape(printable(text))}</InformationKey>" if text else ""
+    return f"{key}{printable(text).translate(ENTITIES)}</InformationKey>" if text else ""
+
+
+def _quoted(text: str) -> str:
+    return f'"{printable(text).translate(ENTITIES)}"'
 
 
 def _axis(axis: str, offset: int) -> str:
@@ -214,7 +219,7 @@ def _vtk_type(dtype: np.dtype[Any]) -> str:
 def _collection(region: Region, files: Sequence[Path]) -> str:
     times = region.coords["t"].values.tolist()
     rows = [
-        f'<DataSet timestep="{time!r}" group="" part="0" file={quoteattr(file.name)}/>\n'
+        f'<DataSet timestep="{time!r}" group="" part="0" file={_quoted(file.name)}/>\n'
         for time, file in zip(times, files, strict=True)
     ]
     head = (
@@ -401,7 +406,7 @@ def _write_ply(handle: BinaryIO, mesh: Mesh) -> None:
 
 
 def _write_vtp(handle: BinaryIO, mesh: Mesh) -> None:
-    name = quoteattr(printable(mesh.name))
+    name = _quoted(mesh.name)
     arrays = [
         np.full(len(mesh.vertices), mesh.value, dtype="<f8"),
         mesh.vertices.astype("<f8"),
