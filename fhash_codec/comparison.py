@@ -203,7 +203,8 @@ def measure(
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
     source = volume.value_type.source
     origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
-    read = partial(_differences, series, origin) if far else series.read
+    held = series.read if series.held is None else series.held.__getitem__
+    read = partial(_differences, series, origin) if far else held
     bulk = _bulk(series, volume)
     about_bulk = None if bulk is None else bulk.moved(-origin)
     quality = measure_quality(

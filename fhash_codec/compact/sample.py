@@ -170,9 +170,11 @@ class Sample:
         indices = list(blocks.indices())
         count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
         chosen = _choose_tiles(len(indices), count, costs)
+        places = [indices[number] for number, _ in chosen]
+        read = (pool.map if blocks.in_memory else map)(blocks.read, places)
         tiles = [
-            (index, blocks.read(index), weight * blocks.weight(index))
-            for index, weight in ((indices[number], weight) for number, weight in chosen)
+            (index, tile, weight * blocks.weight(index))
+            for index, tile, (_, weight) in zip(places, read, chosen, strict=True)
         ]
         # At least one tile, even if no vertex counts.
         tiles = [entry for entry in tiles if not entry[1].is_empty] or tiles[:1]

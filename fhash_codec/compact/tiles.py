@@ -17,7 +17,7 @@ import numpy as np
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
-from fhash_formats.series import ArraySeries, Series
+from fhash_formats.series import Series
 from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
@@ -257,7 +257,7 @@ class Blocks:
 
     def _load(self, steps: range) -> Tile:
         """Read the box at some steps from the series; an array in memory is not copied."""
-        held = self._series.values if isinstance(self._series, ArraySeries) else None
+        held = self._series.held
         if held is not None and held.dtype == self.source_dtype and not self.origin:
             values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
             values.flags.writeable = False  # it is the caller's

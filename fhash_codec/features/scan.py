@@ -18,7 +18,17 @@ from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, warn_defaults
 from fhash_formats.support.arrays import Values
+from fhash_formats.support.threads import map_ahead, thread_pool
 from fhash_formats.support.values import exact_number
+
+HELD_BYTES = 1 << 28
+"""Bytes of a series in files whose frames stay in memory after the scan, at most."""
+
+LARGE = 1 << 16
+"""Values of a frame from which on another thread looks at it."""
+
+FRAMES_AHEAD = 2
+"""Frames that are looked at while the next one is read, at most."""
 
 MOST = 2.0
 """Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
@@ -269,14 +279,33 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     figures = _Figures(series)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
     last_bits: npt.NDArray[np.uint8] | None = None
-    steps = series.shape[0]
-    for step, frame in enumerate(series.frames()):
-        if figures.add(frame) < frame.size:
-            missing[step] = last_bits = _missing_bits(frame, last_bits)
-        if ranks is not None:
-            ranks.add(frame)
-        progress("scanning", step + 1, steps, "")
+    steps, size = series.shape[0], prod(series.shape) * series.dtype.itemsize
+    # the encoder and the measurement read all frames once more
+    held = np.empty(series.shape, series.dtype) if series.files and size <= HELD_BYTES else None
+    large = prod(series.shape[1:]) >= LARGE
+
+    def look(at: tuple[int, Values]) -> tuple[Values, _Figures, int]:
+        step, frame = at
+        if held is not None:
+            held[step] = frame
+        own = _Figures(series) if large else figures
+        return frame, own, own.add(frame)
+
+    with thread_pool() as workers:
+        frames = enumerate(series.frames())
+        looks = map_ahead(workers, look, frames, FRAMES_AHEAD) if large else map(look, frames)
+        for step, (frame, own, finite) in enumerate(looks):
+            if large:
+                figures.join(own)
+            if finite < frame.size:
+                missing[step] = last_bits = _missing_bits(frame, last_bits)
+            if ranks is not None:
+                ranks.add(frame)
+            progress("scanning", step + 1, steps, "")
     series.check()
+    if held is not None:
+        held.flags.writeable = False
+        series.held = held
     if figures.mean.count == 0:
         raise InputError(
             f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; "

@@ -368,6 +368,7 @@ class Series(ABC):
             unpacked; they are hardly ever data.
         remark: what is to be said of the times, "" for nothing.
         not_stored: what of the values nobody wrote; None where nothing is known of such.
+        held: all frames (t, z, y, x) as `read` gives them; None where they are not in memory.
         defaults: default fill values of the format that were met in the frames read so far, of an
             array that declares no other. Among floats they are missing.
     """
@@ -387,6 +388,7 @@ class Series(ABC):
     unlikely: frozenset[float] = frozenset()
     remark: str = ""
     not_stored: NotStored | None = None
+    held: npt.NDArray[Any] | None = None
     defaults: AbstractSet[float] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
@@ -575,6 +577,7 @@ class ArraySeries(Series):
         self.shape = check_values(self.source, values.shape, values.dtype)
         self.dtype = values.dtype.newbyteorder("=")
         self.values = values
+        self.held = values if values.dtype == self.dtype else None
         self.coords = {
             axis: index_coordinate(axis, n) for axis, n in zip(AXES, self.shape, strict=True)
         } | dict(coords or {})
