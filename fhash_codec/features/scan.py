@@ -22,7 +22,7 @@ from fhash_formats.support.threads import map_ahead, thread_pool
 from fhash_formats.support.values import exact_number
 
 HELD_BYTES = 1 << 28
-"""Bytes of a series in files whose frames stay in memory after the scan, at most."""
+"""Bytes of a series whose frames stay in memory after the scan, at most."""
 
 LARGE = 1 << 16
 """Values of a frame from which on another thread looks at it."""
@@ -281,7 +281,8 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     last_bits: npt.NDArray[np.uint8] | None = None
     steps, size = series.shape[0], prod(series.shape) * series.dtype.itemsize
     # the encoder and the measurement read all frames once more
-    held = np.empty(series.shape, series.dtype) if series.files and size <= HELD_BYTES else None
+    kept = series.held is None and size <= HELD_BYTES
+    held = np.empty(series.shape, series.dtype) if kept else None
     large = prod(series.shape[1:]) >= LARGE
 
     def look(at: tuple[int, Values]) -> tuple[Values, _Figures, int]:
