@@ -516,13 +516,13 @@ def fhash(words: list[str], allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
 
 
 PARTS: dict[str, tuple[Callable[[Run], Iterator[Result]], float]] = {
-    "machine": (machine, 40.0),
-    "oracle": (oracle, 70.0),
-    "speed": (speed, 150.0),
+    "machine": (machine, 60.0),
+    "oracle": (oracle, 100.0),
+    "speed": (speed, 170.0),
     "curve": (curve, 90.0),
     "card": (card, 120.0),
     "points": (points, 40.0),
-    "selftest": (selftest, 90.0),
+    "selftest": (selftest, 150.0),
 }
 """The parts and their limits in seconds."""
 

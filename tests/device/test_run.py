@@ -54,7 +54,7 @@ def test_a_part_that_hangs_is_stopped_and_keeps_what_it_has(tmp_path) -> None:
     lines = SCRIPT.read_text().replace("parents[2]", f"parents[2] and Path({str(ROOT)!r})")
     lines = lines.replace("    yield from measured_points(", HANGS)
     lines = lines.replace("(points, 40.0)", "(points, 3.0)").replace(
-        "(selftest, 90.0)", "(selftest, 0)"
+        "(selftest, 150.0)", "(selftest, 0)"
     )
     script.write_text(lines)
     words = [str(tmp_path), "--device", "cpu", "--quick", "--parts", "points,selftest"]
