@@ -23,6 +23,7 @@ from fhash_bench.rate.peers import AnyVariant, spent
 from fhash_bench.rate.rate import all_variants, bench_of, check, goals_of
 from fhash_codec.cost.plan import machine
 from fhash_codec.progress import Progress, silent
+from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.files import replacing
 from fhash_formats.support.threads import at_most
@@ -279,25 +280,28 @@ class _Run:
         return path, load(path, RateCell.from_dict)
 
     def measure(self, codec: str, goal: tuple[str, float], search: Search) -> RateCell:
-        """Search and time a codec for a quality."""
+        """Search and time a codec for a quality; what cannot be encoded says why."""
+        figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory(prefix="fhash-bench-") as scratch:
-            bench = bench_of(self._series, Path(scratch), [goal], silent)
-            bench.price_tiles = False
-            search(bench)
-            best = next(iter(bench.best[goal].values()), None)
-            if best is None:
-                why = next(iter(bench.refused.values()), "it has no such goal")
-                return self.refused(codec, goal, why)
-            figures: dict[str, Any] = {}
-            if self._speed:
-                bench.time(best)
-                (speed,), (access,) = bench.speeds, bench.access
-                figures = {
-                    "encode_mb_s": speed.encode_core_mb_s,
-                    "decode_mb_s": speed.decode_core_mb_s,
-                    "region_ms": access.core_milliseconds,
-                    "region_bytes": access.bytes_read,
-                }
+            try:
+                bench = bench_of(self._series, Path(scratch), [goal], silent)
+                bench.price_tiles = False
+                search(bench)
+                best = next(iter(bench.best[goal].values()), None)
+                if best is None:
+                    why = next(iter(bench.refused.values()), "it has no such goal")
+                    return self.refused(codec, goal, why)
+                if self._speed:
+                    bench.time(best)
+                    (speed,), (access,) = bench.speeds, bench.access
+                    figures = {
+                        "encode_mb_s": speed.encode_core_mb_s,
+                        "decode_mb_s": speed.decode_core_mb_s,
+                        "region_ms": access.core_milliseconds,
+                        "region_bytes": access.bytes_read,
+                    }
+            except InputError as error:
+                return self.refused(codec, goal, str(error))
         return replace(
             self.refused(codec, goal, ""),
             reached=best.reached,

@@ -401,6 +401,9 @@ def test_a_codec_that_cannot_be_measured_says_why(field: Field, tmp_path: Path) 
     cell = bench_table(sources, tmp_path, coders, names=("SPERR",), **options).cells[1]
     assert cell.why.startswith("SPERR ")
     assert (cell.reached, cell.bytes) == (False, None)
+    flat = {"flat": source(np.ones((2, 3, 4, 5)))}
+    for cell in bench_table(flat, tmp_path, coders, names=("SZ3",), **options).cells:
+        assert "is constant" in cell.why
     with pytest.raises(InputError, match="peer is 'zip'"):
         bench_table(sources, tmp_path, coders, names=("zip",))
 
