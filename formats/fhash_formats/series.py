@@ -544,6 +544,21 @@ class StepsSeries(Series):
         self.series.close()
 
 
+class HeldSeries(StepsSeries):
+    """Another series, whose frames stay in memory once they were read."""
+
+    def __init__(self, series: Series) -> None:
+        super().__init__(series, range(series.shape[0]))
+        self.not_stored, self.remark = series.not_stored, series.remark
+        self.metadata = lambda: series.metadata
+        self._frames: dict[int, npt.NDArray[Any]] = {}
+
+    def read(self, step: int) -> npt.NDArray[Any]:
+        if step not in self._frames:
+            self._frames[step] = super().read(step)
+        return self._frames[step]
+
+
 class ArraySeries(Series):
     """An array in memory, (t, z, y, x) or (z, y, x), as a series; masked floats become NaN.
 

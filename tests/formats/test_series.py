@@ -16,6 +16,7 @@ from fhash_formats.readers.registry import open_mask, open_series
 from fhash_formats.series import (
     ArraySeries,
     Coordinate,
+    HeldSeries,
     SourceMetadata,
     SourceVariable,
     StepsSeries,
@@ -45,6 +46,21 @@ def test_some_steps() -> None:
     np.testing.assert_array_equal(some.coords["t"].values, [2, 0])
     with pytest.raises(InputError, match="empty"):
         StepsSeries(ArraySeries(VALUES), [])
+
+
+def test_held_frames_are_read_once_and_labels_stay(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", VALUES)
+    with open_series(tmp_path / "a.npy") as series:
+        held = HeldSeries(series)
+        first = list(held.frames())
+        assert all(again is frame for again, frame in zip(held.frames(), first, strict=True))
+        np.testing.assert_array_equal(np.stack(first), VALUES)
+        for name in ("source", "name", "dtype", "shape", "files", "not_stored", "remark"):
+            assert getattr(held, name) == getattr(series, name)
+        assert held.metadata is series.metadata
+        (tmp_path / "a.npy").write_bytes(b"")
+        with pytest.raises(InputError, match="changed while it was being read"):
+            held.check()
 
 
 def test_three_axes_are_one_step() -> None:
