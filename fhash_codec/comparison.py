@@ -110,6 +110,9 @@ def bytes_on_disk(paths: Iterable[Path]) -> int | None:
 
 LAYER_BYTES = 1 << 30
 """Bytes of decoded frames that are held at a time, at most; a single larger one is allowed."""
+SMALL_BYTES = 1 << 20
+"""Bytes of decoded frames that are read together though their tiles are kept: a call costs more
+than a small frame."""
 QUICK_SSIM_BUDGET = 1 << 20
 """Vertices whose SSIM is measured after an encoding at effort 1."""
 
@@ -244,10 +247,11 @@ class DecodedFrames:
         self._volume, self._exact, self._origin = volume, exact, origin
         self._steps, self._frames = range(0), np.empty(0)
         layer = min(volume.chunks[0], volume.shape[0])
-        room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
-        parts = -(-room // LAYER_BYTES)
-        is_kept = 2 * room <= volume.container.cache_bytes
-        self._layer, self._together = layer, 1 if is_kept else -(-layer // parts)
+        frame = prod(volume.shape[1:]) * volume.float_dtype.itemsize
+        parts = -(-layer * frame // LAYER_BYTES)
+        is_kept = 2 * layer * frame <= volume.container.cache_bytes
+        few = min(layer, max(1, SMALL_BYTES // frame))
+        self._layer, self._together = layer, few if is_kept else -(-layer // parts)
 
     def read(self, step: int) -> npt.NDArray[Any]:
         """The frame (z, y, x) of a step."""

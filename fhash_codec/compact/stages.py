@@ -10,7 +10,7 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling, sub_tile
+from fhash_codec.compact.attempt import FAST_BYTES, Attempt, PlanTask, Tiling, sub_tile
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
@@ -23,6 +23,7 @@ from fhash_codec.compact.step import (
     find_step,
     octave_gain,
     off_trellis,
+    on_trellis,
     require_reach,
     with_step,
 )
@@ -295,6 +296,10 @@ LOOK_VERTICES = 1 << 18
 """Vertices coded for the first size estimate."""
 TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
+COMPARED_VERTICES = 1 << 20
+"""Vertices of the tiles on which the two coders are compared; one tile may have more."""
+PRICED_VERTICES = 1 << 20
+"""Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
 MAX_SEARCHED_VERTICES = 12 << 20
@@ -348,7 +353,9 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
     """Code a few tiles for a first idea of the size."""
-    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk)
+    coding = Coding(
+        filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=task.tries_fast
+    )
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)
@@ -400,9 +407,10 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    parts = task.blocks.retile(sub_tile(sample.blocks.tile, TRIAL_VERTICES // PARTS))
+    vertices = PRICED_VERTICES if task.tries_fast else TRIAL_VERTICES
+    parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
-    small = _sample(task, parts, usual, TRIAL_VERTICES)
+    small = _sample(task, parts, usual, vertices)
     found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
     return adapted_transform(sample, attempt.settings, found.transform.axes, coding)
 
@@ -448,13 +456,35 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        if not allows_trellis(attempt.settings, task.goal, task.config.effort):
-            return _searched_step(task, attempt)
-        settings, coding, outcome = choose_quantiser(
-            attempt.sample, attempt.settings, attempt.coding, task.goal
-        )
-        attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
+        fast = _has_fast_coder(task, attempt)
+        attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+        if not fast and allows_trellis(attempt.settings, task.goal, task.config.effort):
+            settings, coding, outcome = choose_quantiser(
+                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=task.tries_fast
+            )
+            attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
         return _searched_step(task, attempt)
+
+
+def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
+    """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it."""
+    access, goal, settings = task.config.access, task.goal, attempt.settings
+    if not task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size):
+        return False
+    if task.config.effort == 1:
+        return True
+    part = attempt.sample.narrowed(COMPARED_VERTICES)
+    fast = part.run(settings, goal.bounded(replace(attempt.coding, fast=True)))
+    coding = replace(attempt.coding, fast=False)
+    if allows_trellis(settings, goal, task.config.effort):
+        settings, coding = on_trellis(settings, coding)
+    mixed = part.run(settings, goal.bounded(coding))
+    size = float(mixed.size)
+    if goal.error is None and goal.data_range > 0 and mixed.squares and fast.squares:
+        better = fast.psnr(goal.data_range) - mixed.psnr(goal.data_range)
+        size *= 2 ** (better / EXCHANGE)
+    tell("step", f"the fast coder takes {fast.size / max(size, 1.0):.3f} times the bytes")
+    return fast.size <= FAST_BYTES[access] * size
 
 
 def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -612,7 +642,9 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES or sample.is_single:
+    elif sample.is_single or prod(sample.blocks.tile) > (
+        PRICED_VERTICES if task.tries_fast else LARGE * TRIAL_VERTICES
+    ):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)

@@ -59,14 +59,16 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
 
 
 def choose_quantiser(
-    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, *, fast: bool
 ) -> tuple[TileSettings, Coding, Outcome]:
     """Return settings and coding with the trellis if that makes a sample smaller, and the outcome.
 
     Otherwise those with the plain quantiser are returned. Either have a better step: the trial of
     the plain quantiser tells where the search for the step begins.
+
+    fast: whether the plain quantiser is tried with the fast coder.
     """
-    plain = sample.run(settings, goal.bounded(coding))
+    plain = sample.run(settings, goal.bounded(replace(coding, fast=fast)))
     settings = replace(settings, step=step_after(settings, plain, goal))
     other, other_coding = on_trellis(settings, coding)
     outcome = sample.run(other, goal.bounded(other_coding))

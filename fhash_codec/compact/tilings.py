@@ -336,12 +336,13 @@ class _Prices:
 def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     """Return the tile of the least burden among those tried whose price is allowed."""
     allowed = max(PRICES[access] - MARGIN, 1.0)
+    bits = 8 * min(prices.sizes.values()) / prod(shape)
 
     def work(tile: Shape) -> float:
         return region_vertices(shape, tile)
 
     def burden_of(tile: Shape) -> float:
-        return burden(access, prices.price(tile), work(tile))
+        return burden(access, prices.price(tile), work(tile), bits)
 
     def best() -> Shape:
         return min((tile for tile in prices.sizes if prices.price(tile) <= allowed), key=burden_of)
@@ -351,7 +352,7 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     while len(prices.sizes) < TRIALS:
         least, limit = burden_of(best()), FASTER * work(best())
         likely = [
-            (burden(access, prices.foretold(tile), work(tile)), tile)
+            (burden(access, prices.foretold(tile), work(tile), bits), tile)
             for tile in prices.candidates
             if tile not in prices.sizes and work(tile) < limit and prices.foretold(tile) <= allowed
         ]

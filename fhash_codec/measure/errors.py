@@ -364,8 +364,7 @@ class Errors:
         return self._unscaled(math.sqrt(squares / count) if count else 0.0, count)
 
     def _unscaled(self, value: float, count: int) -> float | None:
-        with np.errstate(over="ignore"):
-            figure = float(np.float64(value) / self._scale)
+        figure = float(value) / float(self._scale)
         return figure if count and math.isfinite(figure) else None
 
 

@@ -317,6 +317,9 @@ of several frames of 128^3 float64 are decompressed once, and memory stays small
 encoder's own.
 """
 
+SMALL_BYTES = 1 << 20
+"""Bytes that are fetched at once where nothing is in chunks: a fetch costs more than few values."""
+
 Fetch = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
 
 
@@ -353,8 +356,8 @@ class StoredValues:
         dtype: type of the physical values, in any byte order.
         fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
         chunks: shape of a stored chunk, None without chunks. As many steps of one chunk as fit
-            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame
-            at a time.
+            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame,
+            or small ones of SMALL_BYTES together.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
         not_stored: what nobody wrote, with the number that stands there as it is stored.
         default_fill: value as it is read that stands for one that nobody wrote, see
@@ -412,6 +415,8 @@ class FileSeries(Series):
         )
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
         together = _steps_of_a_chunk(self._axes, values.shape, values.chunks)
+        if values.chunks is None:
+            together = max(together, SMALL_BYTES // frame_bytes)
         self._together = max(1, min(together, SLAB_BYTES // frame_bytes))
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
