@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from math import prod
 from threading import Event
 from typing import NamedTuple
 
@@ -48,6 +49,8 @@ class Effort:
     """Training of the perceptron, whose updates cost a sixth."""
     least: float = 0.0
     """Share of the file that a head must be expected to save."""
+    most_bits: float = math.inf
+    """Bits of a vertex above which no head is tried: none has saved that share there."""
 
     def budget_of(self, shape: Shape) -> Budget:
         """Return the training of a head of a shape."""
@@ -74,7 +77,8 @@ EFFORTS = {
         candidates=0,
         budget=None,
         perceptron=Budget(updates=2000, samples=400_000, rate=3e-2),
-        least=0.003,
+        least=0.02,
+        most_bits=0.75,
     ),
     **{
         effort: Effort(
@@ -199,6 +203,9 @@ def choose_head(
     aim = None if task.goal.psnr is None else task.goal.psnr + AIM
     if outcome.size < MIN_BYTES:
         skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
+        return settings, outcome, []
+    if 8 * outcome.size > spent.most_bits * prod(task.blocks.shape):
+        skip("head", "at so many bits of a vertex, heads save little")
         return settings, outcome, []
     tell = partial(task.parts.report, "training")
 
