@@ -13,6 +13,7 @@ from typing import Any
 
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample
+from fhash_codec.compact.step import Slope
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
@@ -158,13 +159,12 @@ FAST_BYTES = {"fast": 1.6, "balanced": 1.08, "small": 0.0}
 """Bytes that the fast coder may take, as a multiple of those of the other one."""
 LATE = 1.0
 """Share of the bytes that half the work for a region is worth where it takes longer than that."""
-MIXING_NS, MIXING_BIT_NS = 25.0, 110.0
-"""Nanoseconds to decode a vertex, and more for each bit of it, by the mixing coder.
+DECODING_NS = {False: (25.0, 110.0), True: (10.0, 10.0)}
+"""Nanoseconds to decode a vertex, and more for each bit of it, by whether the coder is the fast one.
 
 These are counts of work rather than times, so that every machine makes the same choice: of one core
-of an EPYC of 2021."""
-FAST_NS, FAST_BIT_NS = 10.0, 10.0
-"""The same of the fast coder."""
+of an EPYC of 2021.
+"""
 TRANSFORM_NS = 8.0
 """The same of all else."""
 REGION = 16
@@ -233,7 +233,7 @@ def region_vertices(shape: Shape, tile: Shape) -> float:
 
 def decoding_ns(bits: float, *, fast: bool) -> float:
     """Return the nanoseconds in which a vertex of so many bits is decoded, by count."""
-    first, more = (FAST_NS, FAST_BIT_NS) if fast else (MIXING_NS, MIXING_BIT_NS)
+    first, more = DECODING_NS[fast]
     return TRANSFORM_NS + first + more * bits
 
 
@@ -323,6 +323,11 @@ def _even_length(length: int, edge: int, *, even: bool = True) -> int:
     return part + part % 2 if even and parts > 1 else part
 
 
+def is_small(shape: Shape) -> bool:
+    """Whether a series is one tile without a trial, since all of it decodes in a moment."""
+    return prod(shape) <= 4 * FAST_ENOUGH
+
+
 def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
     """Return the price of tiles that nothing was tried for: the most that is likely.
 
@@ -395,6 +400,8 @@ class PlanTask:
     gains: GainLog
     parts: Parts = field(default_factory=Parts)
     """Progress of the planning."""
+    slope: Slope = field(default_factory=Slope)
+    """Fall of the PSNR with the step."""
 
     @property
     def density(self) -> int:

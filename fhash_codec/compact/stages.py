@@ -16,8 +16,10 @@ from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
 from fhash_codec.compact.sample import Sample, priced
 from fhash_codec.compact.step import (
-    AIM,
-    CLOSE,
+    EXACT,
+    NEAR,
+    QUICK,
+    Precision,
     allows_trellis,
     choose_quantiser,
     find_step,
@@ -25,6 +27,7 @@ from fhash_codec.compact.step import (
     off_trellis,
     on_trellis,
     require_reach,
+    step_after,
     with_step,
 )
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile
@@ -298,7 +301,7 @@ TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
 COMPARED_VERTICES = 1 << 20
 """Vertices of the tiles on which the two coders are compared; one tile may have more."""
-PRICED_VERTICES = 1 << 20
+PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
@@ -314,11 +317,6 @@ SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
 HEAD_TRIES = 3
 """Trials of the step with a head: the search begins within some hundredths of a dB of its end."""
-NEAR = 0.03
-"""Distance in dB from the promise at which the search for a step ends before a head is tried.
-
-Candidates are compared at equal quality, and the step is searched once more for the best.
-"""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 LOST = 0.5
@@ -412,7 +410,8 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, vertices)
     found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
-    return adapted_transform(sample, attempt.settings, found.transform.axes, coding)
+    trials = priced(sample, attempt.settings, task.config.effort)
+    return adapted_transform(trials, attempt.settings, found.transform.axes, coding)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
@@ -458,6 +457,10 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         fast = _has_fast_coder(task, attempt)
         attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+        if fast and task.tries_fast:
+            slope = task.slope.slope
+            step = step_after(attempt.settings, attempt.outcome, task.goal, slope)
+            attempt = replace(attempt, settings=replace(attempt.settings, step=step))
         if not fast and allows_trellis(attempt.settings, task.goal, task.config.effort):
             settings, coding, outcome = choose_quantiser(
                 attempt.sample, attempt.settings, attempt.coding, task.goal, fast=task.tries_fast
@@ -492,9 +495,17 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
-    close = CLOSE if _without_head(task, attempt) else NEAR
+    precision = _precision(task)
+    if not task.tries_fast and not _without_head(task, attempt):
+        precision = NEAR
     settings, outcome = find_step(
-        sample, attempt.settings, coding, goal, tries=tries, tried=tried, close=close
+        sample,
+        attempt.settings,
+        coding,
+        goal,
+        tries=tries,
+        tried=tried,
+        precision=precision,
     )
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)
@@ -505,7 +516,9 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
         if refitted is settings:
             break
         step_before, before = settings.step, (settings, outcome)
-        settings, outcome = find_step(sample, refitted, coding, goal, tried=tried, close=close)
+        settings, outcome = find_step(
+            sample, refitted, coding, goal, tried=tried, precision=precision
+        )
         if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
             settings, outcome = before
             break
@@ -526,7 +539,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         return attempt
 
     def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
-        return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+        return _head_step(task, attempt, settings)
 
     def look(settings: TileSettings) -> Outcome:
         return attempt.sample.run(settings, goal.bounded(attempt.coding))
@@ -546,12 +559,32 @@ def _at_the_promise(task: PlanTask, attempt: Attempt) -> tuple[TileSettings, Out
     goal = task.goal
     if goal.psnr is None:
         return attempt.settings, attempt.outcome
-    missing = goal.psnr + AIM - attempt.outcome.psnr(goal.data_range)
-    if abs(missing) < CLOSE or math.isinf(missing):
+    precision = _precision(task)
+    missing = goal.psnr + precision.aim - attempt.outcome.psnr(goal.data_range)
+    if abs(missing) < precision.close or math.isinf(missing):
         return attempt.settings, attempt.outcome
     settings = attempt.settings
     settings = replace(settings, step=step_after_gain(settings.step, -missing))
-    return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+    return _head_step(task, attempt, settings)
+
+
+def _head_step(
+    task: PlanTask, attempt: Attempt, settings: TileSettings
+) -> tuple[TileSettings, Outcome]:
+    """Return settings with the step that keeps the promise, and their outcome."""
+    return find_step(
+        attempt.sample,
+        settings,
+        attempt.coding,
+        task.goal,
+        tries=HEAD_TRIES,
+        precision=_precision(task),
+    )
+
+
+def _precision(task: PlanTask) -> Precision:
+    """Return the precision of the last search for the step."""
+    return replace(QUICK, slope=task.slope) if task.tries_fast else EXACT
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:
@@ -643,11 +676,13 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
     elif sample.is_single or prod(sample.blocks.tile) > (
-        PRICED_VERTICES if task.tries_fast else LARGE * TRIAL_VERTICES
+        2 * PRICED_VERTICES if task.tries_fast else LARGE * TRIAL_VERTICES
     ):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)
         settings, _ = choose_transform(trials, attempt.settings, goal.bounded(coding))
-    settings, outcome = find_step(sample, settings, coding, goal, tries=4, close=NEAR)
+    tries, slope = (2, task.slope) if task.tries_fast else (4, None)
+    near = replace(NEAR, slope=slope)
+    settings, outcome = find_step(sample, settings, coding, goal, tries=tries, precision=near)
     return replace(attempt, settings=settings, outcome=outcome)

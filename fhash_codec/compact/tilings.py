@@ -17,6 +17,7 @@ from fhash_codec.compact.attempt import (
     Tiling,
     burden,
     cheap_tiling,
+    is_small,
     region_vertices,
     tiles_to_try,
 )
@@ -208,7 +209,9 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
 
     size: bytes of the series, roughly.
     """
-    config = task.config
+    config, shape = task.config, task.blocks.shape
+    if task.tries_fast and config.access != "fast" and is_small(shape):
+        return Tiling(tile=shape, price=1.0)
     if config.effort > 1 and "tiles" not in config.without:
         return None
     return cheap_tiling(task.blocks.shape, size, config.access)

@@ -49,7 +49,7 @@ def half_octaves(number: np.float32) -> int:
 
 
 class BandNumbers:
-    """What is known of a band: magnitudes within 255 and signs, with zeros around."""
+    """Known numbers of a band: magnitudes within 255 and signs, with zeros around."""
 
     def __init__(self, band: Band) -> None:
         self.band, self.shift, self.any = band, 0, False
@@ -144,7 +144,7 @@ class FastDecoder:
     def around(
         self, band: BandNumbers, t: int, z: int, y: int
     ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[Any], int]:
-        """Which blocks lie near filled ones; weighted sums of magnitudes; sum of the weights."""
+        """Blocks that lie near filled ones; weighted sums of magnitudes; sum of the weights."""
         near, weight = np.zeros(band.blocks, bool), 0
         sums = np.zeros(band.blocks * BLOCK, int)
         for dt, dz, dy, dx, share in AROUND:

@@ -3,11 +3,11 @@
 // Integers are coded band by band, row by row, in blocks of 16 along x: first the eight even places
 // of a block, then the odd ones, which lie between them. The context of a magnitude is the weighted
 // mean of the magnitudes around it, in half octaves; a sign is predicted by the signs around it, as
-// far as they have agreed before. Each context has one of the distributions of the prior, for which
-// eight asymmetric numeral systems (rANS, Duda 2013) are written one word at a time. What cannot be
-// foretold, low bits of large magnitudes, lies beside that as it is; flags of empty bands, rows and
-// blocks have adaptive estimates. Floating point is single and each result is rounded alone, so that
-// every machine has the same levels. tests/reference/fast.py explains it.
+// far as they have agreed before. Each context has one of the distributions of the prior, by which
+// eight lanes are coded with asymmetric numeral systems (rANS, Duda 2013). What cannot be foretold,
+// low bits of large magnitudes, lies beside that as it is; flags of empty bands, rows and blocks
+// have adaptive estimates. Floating point is single and each result is rounded alone, so that every
+// machine has the same levels. tests/reference/fast.py explains it.
 //
 // With PRICE nothing is written: the bytes are those that it would take, and by these transforms
 // are compared.
@@ -130,7 +130,8 @@ struct BitsIn {
     uint64_t at = 0, end = 0;    // in bits
     bool damaged = false;
 
-    BitsIn(const uint8_t* data, int64_t size) : bytes((size_t)size + 16, 0), end(8 * (uint64_t)size) {
+    BitsIn(const uint8_t* data, int64_t size)
+        : bytes((size_t)size + 16, 0), end(8 * (uint64_t)size) {
         if (size) std::memcpy(bytes.data(), data, (size_t)size);
     }
     FHASH_INLINE uint64_t peek() {  // 57 bits at least
@@ -166,7 +167,8 @@ template <Mode MODE>
 using FlagCoder = typename std::conditional<MODE == DECODE, Decoder, Encoder>::type;
 
 template <Mode MODE> struct Coder {
-    static const bool CHOOSES = MODE == PRICE || MODE == CHOOSE, WRITES = MODE == CHOOSE || MODE == ENCODE;
+    static const bool CHOOSES = MODE == PRICE || MODE == CHOOSE;
+    static const bool WRITES = MODE == CHOOSE || MODE == ENCODE;
     Task& task;
     FlagCoder<MODE> range;
     Simple flags[FLAGS];
@@ -181,8 +183,8 @@ template <Mode MODE> struct Coder {
     double squares = 0;
     BitsOut out;
     std::vector<Step> steps;
-    float lower[CONTEXTS + 1][TOKENS] = {};  // added to a magnitude: below that, one less is cheaper
-    float zero_of_two[CONTEXTS + 1] = {};  // below it a 2 is worth less than its bits
+    float lower[CONTEXTS + 1][TOKENS] = {};  // of a magnitude: below it, one less is cheaper
+    float zero_of_two[CONTEXTS + 1] = {};    // below it a 2 is worth less than its bits
 
     // Decoding.
     BitsIn in;
@@ -211,7 +213,8 @@ template <Mode MODE> struct Coder {
         float scale[2];                 // by parity: 1 / sum of weights
     };
 
-    Coder(Task& of, FlagCoder<MODE> flag_coder, BitsIn bits) : task(of), range(flag_coder), in(bits) {
+    Coder(Task& of, FlagCoder<MODE> flag_coder, BitsIn bits)
+        : task(of), range(flag_coder), in(bits) {
         for (Simple& flag : flags) flag = {32768, 0};
     }
 
@@ -220,7 +223,8 @@ template <Mode MODE> struct Coder {
             // As an estimate that knows all that was seen so far.
             Simple& seen = flags[number];
             raw_flags += tables.cost[bit ? seen.p : 65536 - seen.p];
-            seen.p = (uint16_t)min(max(seen.p + ((((bit ? 65535 : 0) - (int)seen.p) * tables.rate[seen.count]) >> 16), 32), 65504);
+            const int change = (((bit ? 65535 : 0) - (int)seen.p) * tables.rate[seen.count]) >> 16;
+            seen.p = (uint16_t)min(max(seen.p + change, 32), 65504);
             if (seen.count < SIMPLE_LIMIT) seen.count++;
             return bit;
         } else return code_simple(range, flags[number], bit);
@@ -242,7 +246,8 @@ template <Mode MODE> struct Coder {
                 lower[context][token] = (float)(task.weight / 2) * max(more, 0.0F) - 0.5F;
             }
             const bool raw_too = low_bits(level) > 0;
-            zero_of_two[context] = raw_too ? 0.0F : 1 + (float)(task.weight / 4) * (bits[2] - bits[0]);
+            const float more = bits[2] - bits[0];
+            zero_of_two[context] = raw_too ? 0.0F : 1 + (float)(task.weight / 4) * more;
         }
     }
 
@@ -312,7 +317,8 @@ template <Mode MODE> struct Coder {
         });
         band.any = count > 0;
         if (!band.any) squares += error;
-        while (sum > (double)MANY * count * (1 << band.shift) && band.shift < MAX_SHIFT) band.shift++;
+        const double most = (double)MANY * count;
+        while (sum > most * (1 << band.shift) && band.shift < MAX_SHIFT) band.shift++;
     }
 
     FHASH_INLINE void code_band(Band& band) {
@@ -476,7 +482,8 @@ template <Mode MODE> struct Coder {
     };
 
     // Whether the block has an integer that is not 0. before: whether the block before it may.
-    FHASH_INLINE int code_block(Band& band, const Row& row, int group, int number, int& before, float far) {
+    FHASH_INLINE int code_block(Band& band, const Row& row, int group, int number, int& before,
+                                float far) {
         const int first = BLOCK * number, room = min(band.size[3] - first, BLOCK);
         uint16_t sums[BLOCK] = {};
         int flags_of = 0;
@@ -484,7 +491,8 @@ template <Mode MODE> struct Coder {
             sum_block(first, sums);
             uint32_t total = 0;
             for (int i = 0; i < BLOCK; i++) total += sums[i];
-            const int octaves = half_octaves((float)total * row.scale[0]) - 2 * (127 - LOWEST_FLAG) + 1;
+            const float mean = (float)total * row.scale[0];  // of 16 vertices
+            const int octaves = half_octaves(mean) - 2 * (127 - LOWEST_FLAG) + 1;
             if (total) flags_of = min(max(octaves, 1), FLAG_CLASSES);
         }
         if (flags_of < FLAG_CLASSES) {
@@ -503,7 +511,8 @@ template <Mode MODE> struct Coder {
         for (int i = 0; i < LANES; i++) level[i] = level_of((float)sums[2 * i] * row.scale[0]);
         code_half<3>(band, row, first, room, 0, group, level, halves[0]);
         int seen[LANES + 1];
-        for (int i = 0; i < LANES; i++) seen[i] = min(halves[0].magnitudes[i] >> band.shift, LARGEST);
+        for (int i = 0; i < LANES; i++)
+            seen[i] = min(halves[0].magnitudes[i] >> band.shift, LARGEST);
         seen[LANES] = 0;
         for (int i = 0; i < LANES; i++) {
             const int sum = sums[2 * i + 1] + SIDE * (seen[i] + seen[i + 1]);
@@ -575,7 +584,8 @@ template <Mode MODE> struct Coder {
 
     // Code the places of one parity in a block. NEAR: signs around that are looked at.
     template <int NEAR>
-    FHASH_INLINE void code_half(Band& band, const Row& row, int first, int room, int parity, int group, const int* level, Half& half) {
+    FHASH_INLINE void code_half(Band& band, const Row& row, int first, int room, int parity,
+                                int group, const int* level, Half& half) {
         int contexts[LANES], tokens[LANES], low[LANES], lows = 0;
         for (int i = 0; i < LANES; i++) {
             const bool inside = 2 * i + parity < room;
@@ -594,7 +604,8 @@ template <Mode MODE> struct Coder {
             }
             if (large)
                 for (int i = 0; i < LANES; i++)
-                    if (tokens[i] >= DIRECT || low[i]) magnitudes[i] = read_magnitude(tokens[i], low[i]);
+                    if (tokens[i] >= DIRECT || low[i])
+                        magnitudes[i] = read_magnitude(tokens[i], low[i]);
         } else {
             int large = lows;
             for (int i = 0; i < LANES; i++) {
@@ -618,7 +629,8 @@ template <Mode MODE> struct Coder {
             code_lanes(contexts, tokens);
             if (large)
                 for (int i = 0; i < LANES; i++)
-                    if (tokens[i] >= DIRECT || low[i]) write_magnitude(magnitudes[i], tokens[i], low[i]);
+                    if (tokens[i] >= DIRECT || low[i])
+                        write_magnitude(magnitudes[i], tokens[i], low[i]);
         }
         int some = 0;
         for (int i = 0; i < LANES; i++) some |= magnitudes[i];
@@ -626,11 +638,13 @@ template <Mode MODE> struct Coder {
         if (some) code_signs<NEAR>(row, parity, negative, agreed[band.kind][parity], half);
         if constexpr (MODE == DECODE)
             for (int i = 0; i < LANES; i++)
-                if (2 * i + parity < room) row.q[first + 2 * i + parity] = magnitudes[i] * half.signs[i];
+                if (2 * i + parity < room)
+                    row.q[first + 2 * i + parity] = magnitudes[i] * half.signs[i];
     }
 
     template <int NEAR>
-    FHASH_INLINE void code_signs(const Row& row, int parity, const int* negative, uint32_t (*seen)[2], Half& half) {
+    FHASH_INLINE void code_signs(const Row& row, int parity, const int* negative,
+                                 uint32_t (*seen)[2], Half& half) {
         int contexts[LANES], differs[LANES], foretold[LANES], sums[LANES] = {};
         const int* const magnitudes = half.magnitudes;
         for (int n = 0; n < NEAR; n++)
@@ -673,7 +687,9 @@ template <Mode MODE> struct Coder {
                 out.put(1ull << (length - LAST_BITS), length - LAST_BITS + 1);
                 out.put(rest & ((1u << length) - 1), length);
             }
-        } else if (WRITES && token >= DIRECT) out.put((uint64_t)(high - FIRST[token]), token - DIRECT + 1);
+        } else if (WRITES && token >= DIRECT) {
+            out.put((uint64_t)(high - FIRST[token]), token - DIRECT + 1);
+        }
         if (WRITES) out.put((uint64_t)magnitude & ((1ull << low) - 1), low);
         raw += bits;
     }
@@ -716,7 +732,8 @@ double choose_distributions(const uint32_t (*counts)[TOKENS], const Prior& prior
             const int choice = pass < 0 ? prior.defaults[context] : pass;
             double sum = pass < 0 ? 0 : CHOICE_BITS;
             const float* const of = &bits[(size_t)(first + choice) * TOKENS];
-            for (int token = 0; token < TOKENS; token++) sum += counts[context][token] * (double)of[token];
+            for (int token = 0; token < TOKENS; token++)
+                sum += counts[context][token] * (double)of[token];
             if (pass >= 0 && sum >= least) continue;
             least = sum;
             chosen[context] = (uint8_t)choice;
@@ -727,13 +744,15 @@ double choose_distributions(const uint32_t (*counts)[TOKENS], const Prior& prior
 }
 
 // The words of the lanes: the steps are coded backwards, so that they are read forwards.
-std::vector<uint8_t> words_of(const std::vector<Step>& steps, const Prior& prior, const uint8_t* chosen) {
+std::vector<uint8_t> words_of(const std::vector<Step>& steps, const Prior& prior,
+                              const uint8_t* chosen) {
     struct Symbol {
         uint32_t slots, first;
     };
     std::vector<Symbol> symbols((size_t)(CONTEXTS + 1) * TOKENS);
     for (int context = 0; context <= NOTHING; context++) {
-        const int d = context == NOTHING ? CERTAIN : chosen[context] + (context < OF_SIGNS ? 0 : CHOICES);
+        const int first_choice = context < OF_SIGNS ? 0 : CHOICES;
+        const int d = context == NOTHING ? CERTAIN : chosen[context] + first_choice;
         uint32_t first = 0;
         for (int token = 0; token < TOKENS; token++) {
             symbols[(size_t)context * TOKENS + token] = {prior.slots[d][token], first};
@@ -787,9 +806,11 @@ bool take_section(const uint8_t*& data, int64_t& size, const uint8_t*& section, 
     return true;
 }
 
-template <Mode MODE> FHASH_INLINE int64_t encode_into(Task& task, std::vector<uint8_t>& bytes, double* results) {
+template <Mode MODE>
+FHASH_INLINE int64_t encode_into(Task& task, std::vector<uint8_t>& bytes, double* results) {
     std::vector<uint8_t> flag_bytes;
-    const auto coder = std::make_unique<Coder<MODE>>(task, Encoder{&flag_bytes}, BitsIn(nullptr, 0));
+    const BitsIn none(nullptr, 0);
+    const auto coder = std::make_unique<Coder<MODE>>(task, Encoder{&flag_bytes}, none);
     if (Coder<MODE>::CHOOSES) coder->weigh();
     coder->run();
     uint8_t chosen[CONTEXTS];
@@ -873,7 +894,8 @@ FHASH_EXPORT int64_t fhash_fast_encode(int32_t* q, const float* values, double s
                                        uint8_t* data, int64_t capacity, double* results) {
     return guarded([&]() -> int64_t {
         const Prior prior = {reinterpret_cast<const uint16_t(*)[TOKENS]>(slots), defaults, nullptr};
-        Task task = {q, values, (float)scale, weight, shape, prior, std::vector<Band>((size_t)count)};
+        std::vector<Band> bands((size_t)count);
+        Task task = {q, values, (float)scale, weight, shape, prior, bands};
         if (!read_bands(table, shape, task.bands)) return -1;
         std::vector<uint8_t> bytes;
         const int64_t code = !q ? price(task, bytes, results)

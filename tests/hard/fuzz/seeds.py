@@ -61,7 +61,7 @@ NAMES = (
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
 CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
 PLAIN, TRELLIS, FAST = range(3)
-"""How integers are coded, as inputs of the coder say it."""
+"""Ways to code integers, as inputs of the coder name them."""
 WITH_SEEDS = (CODER, PREDICTOR)
 """Targets that have seeds of their own only; those of all others are random bytes, too."""
 
