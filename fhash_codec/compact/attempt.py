@@ -12,7 +12,7 @@ from math import prod
 from typing import Any
 
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample
+from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.step import Slope
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
@@ -160,7 +160,7 @@ FAST_BYTES = {"fast": 1.6, "balanced": 1.08, "small": 0.0}
 LATE = 1.0
 """Share of the bytes that half the work for a region is worth where it takes longer than that."""
 DECODING_NS = {False: (25.0, 110.0), True: (10.0, 10.0)}
-"""Nanoseconds to decode a vertex, and more for each bit of it, by whether the coder is the fast one.
+"""Nanoseconds to decode a vertex, and more for each of its bits, by whether the coder is fast.
 
 These are counts of work rather than times, so that every machine makes the same choice: of one core
 of an EPYC of 2021.
@@ -409,11 +409,6 @@ class PlanTask:
         effort = self.config.effort
         return 8 if effort >= 4 else 4 if effort > 1 else 1
 
-    @property
-    def tries_fast(self) -> bool:
-        """Whether trials are coded by the fast coder."""
-        return self.config.effort <= MAX_PRICED_EFFORT
-
     def is_slow(self, tile: Shape, size: float) -> bool:
         """Whether reading would take longer than is wished for with the mixing coder.
 
@@ -451,3 +446,9 @@ class Attempt:
     """Training of the head."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
+    quick: bool = False
+    """Whether trials are few, and coded by the fast coder.
+
+    Not where many values are alike: of the sharp shells in a plateau the two coders make so
+    different numbers of bytes, up to 1.7, that one does not tell what the other would choose.
+    """

@@ -14,7 +14,7 @@ from fhash_codec.compact.attempt import FAST_BYTES, Attempt, PlanTask, Tiling, s
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import Sample, priced
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced
 from fhash_codec.compact.step import (
     EXACT,
     NEAR,
@@ -301,7 +301,7 @@ TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
 COMPARED_VERTICES = 1 << 20
 """Vertices of the tiles on which the two coders are compared; one tile may have more."""
-PRICED_VERTICES = 1 << 19
+PRICED_VERTICES = 1 << 20
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
@@ -351,15 +351,15 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
     """Code a few tiles for a first idea of the size."""
-    coding = Coding(
-        filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=task.tries_fast
-    )
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
+    quick = task.config.effort <= MAX_PRICED_EFFORT
+    quick = quick and plateau_center(sample, task.value_range) is None
+    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)
     require_reach(task.goal, settings, outcome)
     task.gains.note("start", outcome)
-    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding, quick=quick)
 
 
 def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -405,7 +405,7 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    vertices = PRICED_VERTICES if task.tries_fast else TRIAL_VERTICES
+    vertices = PRICED_VERTICES if attempt.quick else TRIAL_VERTICES
     parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, vertices)
@@ -455,15 +455,15 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        fast = _has_fast_coder(task, attempt)
+        fast, tried = _has_fast_coder(task, attempt), attempt.coding.fast
         attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
-        if fast and task.tries_fast:
+        if fast and attempt.quick:
             slope = task.slope.slope
             step = step_after(attempt.settings, attempt.outcome, task.goal, slope)
             attempt = replace(attempt, settings=replace(attempt.settings, step=step))
         if not fast and allows_trellis(attempt.settings, task.goal, task.config.effort):
             settings, coding, outcome = choose_quantiser(
-                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=task.tries_fast
+                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
             )
             attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
         return _searched_step(task, attempt)
@@ -495,8 +495,8 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
-    precision = _precision(task)
-    if not task.tries_fast and not _without_head(task, attempt):
+    precision = _precision(task, attempt)
+    if not attempt.quick and not _without_head(task, attempt):
         precision = NEAR
     settings, outcome = find_step(
         sample,
@@ -559,7 +559,7 @@ def _at_the_promise(task: PlanTask, attempt: Attempt) -> tuple[TileSettings, Out
     goal = task.goal
     if goal.psnr is None:
         return attempt.settings, attempt.outcome
-    precision = _precision(task)
+    precision = _precision(task, attempt)
     missing = goal.psnr + precision.aim - attempt.outcome.psnr(goal.data_range)
     if abs(missing) < precision.close or math.isinf(missing):
         return attempt.settings, attempt.outcome
@@ -578,13 +578,13 @@ def _head_step(
         attempt.coding,
         task.goal,
         tries=HEAD_TRIES,
-        precision=_precision(task),
+        precision=_precision(task, attempt),
     )
 
 
-def _precision(task: PlanTask) -> Precision:
+def _precision(task: PlanTask, attempt: Attempt) -> Precision:
     """Return the precision of the last search for the step."""
-    return replace(QUICK, slope=task.slope) if task.tries_fast else EXACT
+    return replace(QUICK, slope=task.slope) if attempt.quick else EXACT
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:
@@ -676,13 +676,13 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
     elif sample.is_single or prod(sample.blocks.tile) > (
-        2 * PRICED_VERTICES if task.tries_fast else LARGE * TRIAL_VERTICES
+        2 * PRICED_VERTICES if attempt.quick else LARGE * TRIAL_VERTICES
     ):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)
         settings, _ = choose_transform(trials, attempt.settings, goal.bounded(coding))
-    tries, slope = (2, task.slope) if task.tries_fast else (4, None)
+    tries, slope = (2, task.slope) if attempt.quick else (4, None)
     near = replace(NEAR, slope=slope)
     settings, outcome = find_step(sample, settings, coding, goal, tries=tries, precision=near)
     return replace(attempt, settings=settings, outcome=outcome)

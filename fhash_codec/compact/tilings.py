@@ -22,7 +22,7 @@ from fhash_codec.compact.attempt import (
     tiles_to_try,
 )
 from fhash_codec.compact.goal import EXCHANGE, exchange, step_after_gain
-from fhash_codec.compact.sample import Sample, priced, strata
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced, strata
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
@@ -210,7 +210,8 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
     size: bytes of the series, roughly.
     """
     config, shape = task.config, task.blocks.shape
-    if task.tries_fast and config.access != "fast" and is_small(shape):
+    few = config.effort <= MAX_PRICED_EFFORT and config.access != "fast"
+    if few and is_small(shape):
         return Tiling(tile=shape, price=1.0)
     if config.effort > 1 and "tiles" not in config.without:
         return None
