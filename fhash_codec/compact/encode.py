@@ -129,7 +129,8 @@ def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str,
 
     Keys: `price`, bytes as a multiple of those of the best tiling; `best`, the tile of that one;
     `tried`, the number of tilings that were coded, 0 where the price is foretold; `region_ms`, see
-    `measure_region`. Tiles that were asked for have the last alone.
+    `measure_region`; `coder`, "fast" where the tiles are of the fast coder. Tiles that were asked
+    for have these two alone.
 
     timings: whether times may be told.
     quick: whether there is no time to measure one.
@@ -142,6 +143,8 @@ def tiling_header(table: CodedTable, *, timings: bool, quick: bool) -> dict[str,
             "best": list(tiling.best or table.plan.blocks.shape),
             "tried": len(tiling.trials),
         }
+    if table.plan.coding.fast:
+        record["coder"] = "fast"
     if timings and not quick:
         record["region_ms"] = round(1000 * measure_region(table), 2)
     return record or None

@@ -456,6 +456,8 @@ def tiling_text(info: dict[str, Any]) -> str:
         text = f", {more:.0%} above {against}" if more > 0 else ", the fewest bytes of all tried"
         if not told.get("tried"):
             text = f", at most about {more:.0%} above {against}" if more > 0 else ""
+    if told.get("coder"):
+        text += f"; by the {told['coder']} coder"
     if told.get("region_ms") is not None:
         text += f"; regions {number(told['region_ms'], 'ms', digits=2)}"
     return text

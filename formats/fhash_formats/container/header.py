@@ -638,6 +638,8 @@ def _check_tiling(tiling: Record) -> None:
         tiling.integers("best", 4, 1, MAX_LENGTH)
     if tiling.has("tried"):
         tiling.integer("tried", 0, MAX_LENGTH)
+    if tiling.has("coder"):
+        tiling.choice("coder", ("fast",))
 
 
 def _check_levels(model: Record, steps: int, box: Sequence[int]) -> None:
