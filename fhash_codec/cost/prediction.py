@@ -31,6 +31,7 @@ from fhash_codec.compact.stages import (
     LEAST,
     MAX_SEARCHED_VERTICES,
     MIN_HEAD_EFFORT,
+    PRICED_VERTICES,
     SAMPLE_VERTICES,
     TRIAL_VERTICES,
 )
@@ -63,6 +64,8 @@ from fhash_formats.transform.tile_format import Shape
 
 TRIES = 2.5
 """Trials of a search for the step of a PSNR."""
+QUICK_TRIES = 2
+"""Such trials at most, where few are made."""
 HEAD_TRIES = 1.5
 """Trials of that search with the head that is kept, after the one by which heads are compared."""
 NEAR_TRIES = 1.5
@@ -198,19 +201,19 @@ def _choices(work: _Work) -> dict[str, float]:
     """Seconds of the choices by trial: sample, transform, tiles, filling, step."""
     look, rates, config = work.look, work.rates, work.config
     tile, seconds = look.tile, {"sample": look.costing}
-    tried = work.tiles(tile, TRIAL_VERTICES)
+    quick, tried = look.attempt.quick, work.tiles(tile, TRIAL_VERTICES)
     in_memory = look.task.blocks.in_memory
     if config.effort > 1:
         trials, bases = count_trials(tile, in_memory=in_memory)
-        search = work.tries(TRIES) * work.wall(rates.trial, tile, tried)
+        search = work.tries(QUICK_TRIES if quick else TRIES) * work.wall(rates.trial, tile, tried)
         if "transform" in config.without:
             trials = bases = 0
         coded = trials if rates.price is None else min(trials, CODED)
         coding = TRIAL_SHARE * work.wall(rates.trial, tile, coded * tried)
         pricing = work.wall(rates.price or 0.0, tile, trials * tried)
-        if prod(tile) > LARGE * TRIAL_VERTICES:
+        if prod(tile) > (2 * PRICED_VERTICES if quick else LARGE * TRIAL_VERTICES):
             # A part stands for the tile in all trials but two.
-            part = TRIAL_VERTICES / usable_threads()
+            part = (PRICED_VERTICES if quick else TRIAL_VERTICES) / usable_threads()
             coding = TRIAL_SHARE * rates.trial * (coded * part + 2 * prod(tile))
             pricing = (rates.price or 0.0) * trials * part
         coding += pricing
@@ -227,8 +230,8 @@ def _choices(work: _Work) -> dict[str, float]:
         if config.effort > 1 and "filling" not in config.without:
             seconds["filling"] = 4 * fill + 4 * work.tries(2.5) * once
         seconds["sample"] += 2 * fill
-    usual = NEAR_TRIES if searched == tried and config.effort > 1 else TRIES
-    refits = NEAR_REFIT_TRIES if config.effort >= MIN_HEAD_EFFORT else REFIT_TRIES
+    usual = NEAR_TRIES if quick or (searched == tried and config.effort > 1) else TRIES
+    refits = NEAR_REFIT_TRIES if quick or config.effort >= MIN_HEAD_EFFORT else REFIT_TRIES
     tries = work.tries(usual + (refits if rates.has_bases else 0))
     if allows_trellis(look.attempt.settings, look.task.goal, config.effort):
         quantisers = QUANTISER_TRIES if look.task.goal.error is None else QUANTISER_TRIES_OF_BOUND
@@ -426,6 +429,7 @@ class Predictor:
             self._rates[key] = probe_rates(look, key)
         rates, head = self._rates[key], None
         if self._may_have_head(look, config):
+            key = replace(key, effort=config.effort)  # each has a trial of its own
             if key not in self._heads:
                 self._heads[key] = probe_head(look, rates, key)
             head = self._heads[key]
