@@ -44,7 +44,8 @@ LONG_ROOMS = (
     "benchmarks/tests/rate/",
     "benchmarks/tests/test_ablate.py",
     "benchmarks/tests/test_train.py",
-    "tests/codec/cost/",
+    "tests/codec/cost/test_cost.py",
+    "tests/codec/cost/test_report.py",
     "tests/codec/paper/engines/fused/",
 )
 """Rooms of measuring tools, and of kernels that are emulated, which the long set alone runs. Not
