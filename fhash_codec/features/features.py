@@ -434,6 +434,12 @@ class Extent:
         """
         return self._unpacked(self.packed[key])
 
+    def masks(self, keys: range) -> npt.NDArray[np.bool_]:
+        """Masks (keys, z, y, x) of `mask` of neighbouring key frames."""
+        rows = np.stack(self.packed[keys.start : keys.stop])
+        bits = np.unpackbits(rows, axis=1, count=prod(self.domain)).view(np.bool_)
+        return bits.reshape(-1, *self.domain)[:, *self.box.slices()]
+
     def mask_of(self, feature: int, key: int) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of the box that are in the coreset for one feature.
 
@@ -497,8 +503,9 @@ def find_extent(
     z, y, x = series.shape[1:]
     key_frames, features, dilation = choice
     everything = any(isinstance(feature, Everything) for feature in features)
-    if everything and not scan.missing and not apart:
-        return _everywhere(scan, key_frames, (z, y, x), progress)
+    if everything and not apart and (not scan.missing or len(key_frames) == series.shape[0]):
+        progress("selecting", 1, 1, "")
+        return _everywhere(scan, key_frames, (z, y, x))
     packed: list[npt.NDArray[np.uint8]] = []
     boxes, outside, samples = [], Mean(), 0
     packed_apart: tuple[list[npt.NDArray[np.uint8]], ...] = tuple(
@@ -564,17 +571,25 @@ def packed_masks(
     return result
 
 
-def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: Progress) -> Extent:
-    """The extent of a coreset that holds every vertex; no frame is read for it."""
-    all_ones = np.packbits(np.ones(domain, dtype=bool))
-    for done in range(len(key_frames)):
-        progress("selecting", done + 1, len(key_frames), "")
+def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes) -> Extent:
+    """The extent of a coreset of all finite vertices; no frame is read for it.
+
+    key_frames: all steps where values are missing.
+    """
+    every = np.packbits(np.ones(domain, dtype=bool))
+    packed = [every] * len(key_frames)
+    some = every if len(scan.missing) < len(key_frames) else np.zeros_like(every)
+    for step, missing in scan.missing.items():
+        packed[step] = every & ~missing
+        some = some | packed[step]
+    box = bounding_box(np.unpackbits(some, count=prod(domain)).view(np.bool_).reshape(domain))
+    assert box is not None, "a scan has a finite value"
     return Extent(
-        box=Box.of_shape(domain),
+        box=box,
         key_frames=tuple(key_frames),
-        packed=[all_ones] * len(key_frames),
+        packed=packed,
         domain=domain,
-        samples=len(key_frames) * prod(domain),
+        samples=scan.finite_count if scan.missing else len(packed) * prod(domain),
         background=scan.mean,
     )
 

@@ -283,7 +283,7 @@ class Selection:
         """Some steps at a time, and their frames (t, z, y, x)."""
         import numpy as np
 
-        from fhash_codec.boxes import step_blocks
+        from fhash_formats.series import step_blocks
 
         first = int(self.steps[0])
         neighbours = range(first, first + len(self.steps))

@@ -461,20 +461,37 @@ class FileSeries(Series):
         return self
 
     def read(self, step: int) -> npt.NDArray[Any]:
-        self.require_step(step)
-        start = step - step % self._together
+        frame: npt.NDArray[Any] = self.read_steps(range(step, step + 1))[0]
+        return frame
+
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        self.require_step(steps.start)
+        self.require_step(steps.stop - 1)
         if self._together == 1:
-            return np.ascontiguousarray(self._block(step, step + 1)[0], dtype=self.dtype)
+            return np.ascontiguousarray(self._block(steps.start, steps.stop), dtype=self.dtype)
+        result = np.empty((len(steps), *self.shape[1:]), self.dtype)
+        place = steps.start
+        while place < steps.stop:
+            inside = place % self._together
+            whole = (steps.stop - place) // self._together * self._together
+            if inside or not whole:
+                values = self._slab_from(place - inside)[inside:][: steps.stop - place]
+            else:  # whole chunks, of which nothing is read again
+                values = self._block(place, place + whole)
+            result[place - steps.start :][: len(values)] = values
+            place += len(values)
+        return result
+
+    def _slab_from(self, start: int) -> npt.NDArray[Any]:
+        """The steps of a chunk from `start` on, which are kept."""
         slab = self._slab
         if slab is None or slab[0] != start:
             self._slab = None  # before the fetch, so that two slabs are never held
-            slab = self._slab = (
-                start,
-                self._block(start, min(start + self._together, self.shape[0])),
-            )
+            stop = min(start + self._together, self.shape[0])
+            slab = self._slab = (start, self._block(start, stop))
         else:
             self._check_files()
-        return np.array(slab[1][step - start], dtype=self.dtype, order="C")
+        return slab[1]
 
     def check(self) -> None:
         for stamp in self.stamps:
