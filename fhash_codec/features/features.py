@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box, Sizes, bounding_box, fuse
-from fhash_codec.features.scan import Scan, finite_mask, finite_values
+from fhash_codec.features.scan import Scan, finite_masks, finite_values
 from fhash_codec.measure.value_range import Mean, Ranks, ValueRange, pieces
 from fhash_codec.progress import Progress
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.series import Series
+from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.values import exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
@@ -54,9 +54,21 @@ class Feature(ABC):
     def select(self, frame: Frame, step: int) -> FrameMask:
         """Mask (z, y, x) of the vertices of the feature in a frame of data values."""
 
+    def select_steps(self, frames: Frame, steps: range) -> FrameMask:
+        """Masks (t, z, y, x) of `select` for neighbouring steps."""
+        pairs = zip(frames, steps, strict=True)
+        return np.stack([self.select(frame, step) for frame, step in pairs])
+
+
+class InSpace(Feature):
+    """A feature of the values of a frame alone: `select` takes those of several steps as well."""
+
+    def select_steps(self, frames: Frame, steps: range) -> FrameMask:
+        return self.select(frames, steps.start)
+
 
 @dataclass(frozen=True)
-class Everything(Feature):
+class Everything(InSpace):
     """Every finite vertex."""
 
     def select(self, frame: Frame, step: int) -> FrameMask:
@@ -67,7 +79,7 @@ class Everything(Feature):
 
 
 @dataclass(frozen=True)
-class Interval(Feature):
+class Interval(InSpace):
     """Vertices with low <= value <= high; both ends may be infinite."""
 
     low: float
@@ -88,7 +100,7 @@ class Interval(Feature):
 
 
 @dataclass(frozen=True)
-class Isosurface(Feature):
+class Isosurface(InSpace):
     """Vertices beside an isosurface.
 
     They are both ends of every grid edge (along z, y or x) whose ends lie strictly on either side
@@ -103,7 +115,7 @@ class Isosurface(Feature):
         selected &= finite
         above: FrameMask = (frame > value) & finite
         below: FrameMask = (frame < value) & finite
-        for axis in range(3):
+        for axis in (-3, -2, -1):
             high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
             crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
             ends[:-1] |= crossed
@@ -115,7 +127,7 @@ class Isosurface(Feature):
 
 
 @dataclass(frozen=True)
-class Segmentation(Feature):
+class Segmentation(InSpace):
     """The foreground: vertices strictly above a threshold.
 
     The threshold None stands for Otsu's threshold, which `resolve_features` fills in.
@@ -331,12 +343,12 @@ def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
 
 
 def dilate(mask: FrameMask, vertices: int) -> FrameMask:
-    """A mask (z, y, x) grown by some vertices in the 26-neighbourhood (paper, Feature Dilation).
+    """A mask (..., z, y, x) grown by vertices in the 26-neighbourhood (paper, Feature Dilation).
 
     The growth does not wrap around the ends of an axis. It takes one axis after another. Along an
     axis the shifts double: a mask that has grown by r may be shifted by r + 1 without a gap.
     """
-    for axis in range(3):
+    for axis in (-3, -2, -1):
         reach = 0
         while reach < vertices:
             shift = min(reach + 1, vertices - reach)
@@ -512,23 +524,24 @@ def find_extent(
         [] for _ in (features if apart else ())
     )
     without_vertices = set(features)
-    for done, step in enumerate(key_frames):
-        frame = series.read(step)
-        masks = [feature.select(frame, step) for feature in features]
+    for steps in _neighbours(key_frames, series):
+        frames = series.read_steps(steps)
+        masks = [feature.select_steps(frames, steps) for feature in features]
         without_vertices -= {
             feature for feature, mask in zip(features, masks, strict=True) if mask.any()
         }
-        finite = scan.finite(step, (z, y, x))
+        finite = finite_masks(scan.missing, steps, (z, y, x))
         mask = _dilated(np.logical_or.reduce(masks), finite, dilation)
-        packed.append(np.packbits(mask))
+        packed += _packed(mask)
         for one, packed_one in zip(masks, packed_apart, strict=False):
-            packed_one.append(np.packbits(_dilated(one, finite, dilation)))
-        boxes.append(bounding_box(mask))
+            packed_one += _packed(_dilated(one, finite, dilation))
+        ever: FrameMask = np.any(mask, axis=0)
+        boxes.append(bounding_box(ever))
         samples += int(np.count_nonzero(mask))
-        _add_outside(outside, frame, mask, finite)
+        _add_outside(outside, frames, mask, finite)
         if ranks is not None:
-            ranks.add(frame[mask])
-        progress("selecting", done + 1, len(key_frames), "")
+            ranks.add(frames[mask])
+        progress("selecting", len(packed), len(key_frames), "")
     box = fuse(boxes)
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high
@@ -562,13 +575,24 @@ def packed_masks(
 
     missing: masks of the missing values of these steps, see `Scan`.
     """
-    result = {}
-    for step in steps:
-        frame = series.read(step)
-        mask = np.logical_or.reduce([feature.select(frame, step) for feature in features])
-        finite = finite_mask(missing, step, series.shape[1:])
-        result[step] = np.packbits(_dilated(mask, finite, dilation))
+    result: dict[int, npt.NDArray[np.uint8]] = {}
+    for block, frames in series.blocks(steps):
+        mask = np.logical_or.reduce([feature.select_steps(frames, block) for feature in features])
+        finite = finite_masks(missing, block, series.shape[1:])
+        result |= zip(block, _packed(_dilated(mask, finite, dilation)), strict=True)
     return result
+
+
+def _neighbours(key_frames: Sequence[int], series: Series) -> Iterator[range]:
+    """The key frames in blocks of neighbours where all steps are, else one by one."""
+    if len(key_frames) < series.shape[0]:
+        return (range(step, step + 1) for step in key_frames)
+    return (block for _, block in step_blocks(range(series.shape[0]), series.shape[1:]))
+
+
+def _packed(masks: FrameMask) -> list[npt.NDArray[np.uint8]]:
+    """The bits of each step of masks (t, z, y, x)."""
+    return list(np.packbits(masks.reshape(len(masks), -1), axis=1))
 
 
 def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes) -> Extent:
@@ -597,9 +621,9 @@ def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes) -> Extent:
 def _dilated(
     mask: npt.NDArray[np.bool_], finite: npt.NDArray[np.bool_] | None, dilation: int
 ) -> npt.NDArray[np.bool_]:
-    """Mask (z, y, x) of the finite vertices of the dilated mask.
+    """Masks (t, z, y, x) of the finite vertices of the dilated masks.
 
-    finite: mask of all finite vertices; None if every vertex is finite.
+    finite: masks of all finite vertices; None if every vertex is finite.
     """
     mask = dilate(mask, dilation)
     if finite is not None:
@@ -609,14 +633,12 @@ def _dilated(
 
 def _add_outside(
     mean: Mean,
-    frame: npt.NDArray[Any],
+    frames: npt.NDArray[Any],
     mask: npt.NDArray[np.bool_],
     finite: npt.NDArray[np.bool_] | None,
 ) -> None:
-    """Add the finite values outside the coreset to a mean.
-
-    Planes are added one by one, so that their float64 copies stay small.
-    """
-    for z, plane in enumerate(frame):
-        outside = ~mask[z] if finite is None else finite[z] & ~mask[z]
-        mean.add(plane[outside])
+    """Add the finite values outside the coreset to a mean."""
+    outside = ~mask if finite is None else finite & ~mask
+    # Planes of a single frame one by one, so that the float64 copies of a large one stay small.
+    for place in np.ndindex(outside.shape[:2]) if len(frames) == 1 else [()]:
+        mean.add(frames[place][outside[place]])

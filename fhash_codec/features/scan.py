@@ -240,22 +240,20 @@ class Scan:
     finite_count: int
     missing: Mapping[int, npt.NDArray[np.uint8]]
 
-    def finite(self, step: int, shape: tuple[int, int, int]) -> npt.NDArray[np.bool_] | None:
-        """Mask (z, y, x) of the finite vertices of a step; None if all are finite.
 
-        shape: of a frame.
-        """
-        return finite_mask(self.missing, step, shape)
-
-
-def finite_mask(
-    missing: Mapping[int, npt.NDArray[np.uint8]], step: int, shape: tuple[int, int, int]
+def finite_masks(
+    missing: Mapping[int, npt.NDArray[np.uint8]], steps: range, shape: tuple[int, int, int]
 ) -> npt.NDArray[np.bool_] | None:
-    """The mask of `Scan.finite`, from `Scan.missing`."""
-    if step not in missing:
+    """Masks (t, z, y, x) of the finite vertices of some steps; None if all are finite.
+
+    missing: see `Scan`. shape: of a frame.
+    """
+    if not any(step in missing for step in steps):
         return None
-    bits = np.unpackbits(missing[step], count=prod(shape)).view(np.bool_)
-    return ~bits.reshape(shape)
+    none = np.zeros(-(-prod(shape) // 8), np.uint8)
+    rows = np.stack([missing.get(step, none) for step in steps])
+    bits = np.unpackbits(rows, axis=1, count=prod(shape)).view(np.bool_)
+    return ~bits.reshape(-1, *shape)
 
 
 def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan:
