@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
 # tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
 SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test types units hard every wheels clean
+.PHONY: demo test types units hard every device wheels clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png. Installs the plain package.
 demo: .venv/.plain
@@ -38,6 +38,11 @@ hard: .venv/.stamp
 # Every case of every other test, of which `make test` runs up to two of each.
 every: .venv/.stamp
 	FHASH_HARD=1 $(BIN)/python -m pytest $(SPREAD) --ignore tests/fresh --ignore tests/golden --ignore tests/hard
+
+# Figures of a GPU in build/device, by the python3 that has its torch, without network (docs/gpu.md): 7 minutes.
+device:
+	$(PYTHON) setup.py -q build_ext --inplace
+	$(PYTHON) tests/device/run.py build/device
 
 # A source archive and a wheel for every Python 3 of each platform in dist/, by the compiler of ziglang, and that of the
 # benchmarks: ten minutes on 2 processors.

@@ -14,7 +14,6 @@ is trained, or drawn on a GPU.
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from fhash_formats.errors import (
@@ -49,8 +48,6 @@ if TYPE_CHECKING:
     from fhash_codec.views.store import zarr_store
     from fhash_codec.views.unpack import unpack
     from fhash_codec.volume import Volume
-
-__version__ = version("fhash")
 
 _MODULES = {
     "Dataset": "dataset",
@@ -109,6 +106,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("fhash")
     if name not in _MODULES:
         raise AttributeError(f"module 'fhash_codec' has no attribute '{name}'")
     value = getattr(importlib.import_module(f"fhash_codec.{_MODULES[name]}"), name)

@@ -203,7 +203,7 @@ def measure(
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
     source = volume.value_type.source
     origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
-    read = partial(_differences, series, origin) if far else series.read_steps
+    read = partial(_differences, series, origin) if far else series.block
     bulk = _bulk(series, volume)
     about_bulk = None if bulk is None else bulk.moved(-origin)
     quality = measure_quality(
@@ -224,7 +224,7 @@ def measure(
 
 def _differences(series: Series, origin: int, steps: range) -> npt.NDArray[Any]:
     """The frames of neighbouring steps less an integer."""
-    return about_origin(series.read_steps(steps), origin)
+    return about_origin(series.block(steps), origin)
 
 
 class DecodedFrames:
@@ -290,7 +290,7 @@ def _bulk(series: Series, volume: Volume) -> ValueRange | None:
         return None if known["bulk"] is None else ValueRange(*known["bulk"]["range"])
 
     origin = volume.value_range.origin(volume.value_type.source)
-    read = partial(_differences, series, origin) if origin else series.read_steps
+    read = partial(_differences, series, origin) if origin else series.block
 
     def counted_values() -> Iterator[npt.NDArray[Any]]:
         for _, block in step_blocks(range(series.shape[0]), series.shape[1:]):

@@ -70,10 +70,10 @@ def threads_for(vertices: int) -> Iterator[int]:
 # torch looks at this variable once, at the first product of the process.
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
-CUDA_PAYS = 1 << 27
-"""Samples of all epochs from which on `auto` trains on CUDA.
+CUDA_PAYS = 4.0
+"""Seconds of training on the CPU from which on `auto` trains on CUDA, which takes some to start.
 
-An unmeasured guess: some 2 s to start CUDA against 3e7 to 1e8 samples a second on a CPU.
+A guess until `make device` has measured the start.
 """
 
 
@@ -115,12 +115,12 @@ def first_line(error: Exception) -> str:
     return str(error).strip().split("\n")[0]
 
 
-def training_device(name: str, samples: int, needed_bytes: int) -> torch.device:
-    """Return the torch device for a training; auto is CUDA where that pays and fits.
+def training_device(name: str, cpu_seconds: float, needed_bytes: int) -> tuple[torch.device, str]:
+    """Return the torch device for a training, and why; auto is CUDA where that pays and fits.
 
     Args:
         name: cpu, cuda or auto.
-        samples: samples that the training takes, those of all epochs.
+        cpu_seconds: seconds that the training takes on the CPU.
         needed_bytes: memory that it needs on a device of its own.
 
     Raises:
@@ -130,18 +130,24 @@ def training_device(name: str, samples: int, needed_bytes: int) -> torch.device:
     device = choose_device(name)
     import torch
 
-    if device.type == "cpu" or (name == "auto" and samples < CUDA_PAYS):
-        return torch.device("cpu")
+    if name != "auto":
+        why = "as --device says"
+    elif device.type == "cpu":
+        why = "as torch finds no CUDA device"
+    else:
+        why = f"as the CPU takes about {cpu_seconds:.1f} s, and CUDA pays from {CUDA_PAYS:g} s on"
+    if device.type == "cpu" or (name == "auto" and cpu_seconds < CUDA_PAYS):
+        return torch.device("cpu"), f"on the CPU, {why}"
     free, _ = torch.cuda.mem_get_info(device)
     if needed_bytes <= free:
-        return device
+        return device, f"on CUDA, {why}"
     lack = (
         f"training needs about {needed_bytes / 2**30:.1f} GiB on the CUDA device,"
         f" of which {free / 2**30:.1f} GiB are free"
     )
     if name == "auto":
         warnings.warn(f"{lack}; it takes the CPU", FhashWarning, stacklevel=2)
-        return torch.device("cpu")
+        return torch.device("cpu"), f"on the CPU, as {lack}"
     raise InputError(f"{lack}; use --device cpu, or a feature or key frames that select less")
 
 

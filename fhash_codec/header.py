@@ -8,10 +8,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
-from importlib.metadata import version
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,6 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.occupancy import write_bits
-from fhash_codec.features.scan import Scan
 from fhash_codec.measure.metrics import even_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import (
@@ -44,6 +42,9 @@ from fhash_formats.container.header import (
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series, SourceMetadata, with_history
 from fhash_formats.support.values import is_within, json_attributes
+
+if TYPE_CHECKING:
+    from fhash_codec.features.scan import Scan
 
 DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
 .pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
@@ -333,6 +334,8 @@ def describe_source(
     gaps: whether vertices are outside the coreset. Integers that floats have not all of then get a
     fill value, where the source has none: a reader cannot give them as floats with NaN.
     """
+    from importlib.metadata import version
+
     variable = describe_variable(series)
     dtype = series.source_dtype or series.dtype
     if gaps and "fill" not in variable and value_range.is_far(dtype):

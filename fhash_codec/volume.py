@@ -24,7 +24,6 @@ from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import describe_file, read_missing
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
@@ -580,6 +579,8 @@ class FeatureVolume(Volume):
 
     def _occupied(self, key: float, region: Box) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the features' coreset at a key index; region in vertices of the box."""
+        from fhash_codec.paper.model import PaperModel
+
         assert isinstance(self._model, PaperModel), "only_features refuses other profiles"
         first, last = int(np.floor(key)), int(np.ceil(key))
         return self._model.occupied_by(self.numbers, first, last, region)
@@ -615,7 +616,7 @@ def only_features(volume: Volume, features: Sequence[str]) -> Volume:
 
 def holds_features_apart(volume: Volume) -> bool:
     """Whether a file keeps the occupancy of each of its features."""
-    return isinstance(volume._model, PaperModel)
+    return volume.profile == "paper"
 
 
 def _numbers(volume: Volume, features: Sequence[str]) -> tuple[int, ...]:

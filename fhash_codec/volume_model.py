@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from math import floor, prod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +15,14 @@ from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
-from fhash_codec.paper.model import PaperModel
 from fhash_formats.container import Container
 from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.arrays import Mask
+
+if TYPE_CHECKING:
+    from fhash_codec.paper.model import PaperModel
 
 Positions = npt.NDArray[np.float64]
 """Positions (n,) of points along one axis."""
@@ -28,7 +30,7 @@ Decoded = tuple[npt.NDArray[Any], Mask]
 """Values of a part of the box, and the mask of those in the coreset."""
 
 
-VolumeModel = CompactModel | PaperModel
+VolumeModel: TypeAlias = "CompactModel | PaperModel"
 """Values of a series, in data units, inside the feature bounding box.
 
 Regions and positions count vertices of that box. Times are key indices: 0 to key frames - 1,
@@ -48,6 +50,8 @@ def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
     if container.header["model"]["profile"] == "compact":
         return CompactModel(container)
+    from fhash_codec.paper.model import PaperModel
+
     return PaperModel(container)
 
 
@@ -55,6 +59,7 @@ class Card:
     """The parts of the model of a volume. Tables and occupancy are decoded as they are read."""
 
     container: Container
+    profile: str
     shape: tuple[int, int, int, int]
     box: Box
     _model: VolumeModel
@@ -168,7 +173,7 @@ class Card:
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
         arrays = self.container.arrays
         names = [str(name) for name in self.container.header["features"]]
-        apart = names if isinstance(self._model, PaperModel) and len(names) > 1 else []
+        apart = names if self.profile == "paper" and len(names) > 1 else []
         for name in (MASK_ARRAY, BITS_ARRAY):
             if name in arrays:
                 return {"shape": shape, **self._stored(name, ""), "apart": apart}

@@ -25,8 +25,9 @@ from fhash_codec.compact import head
 
 budget = head.Budget(updates=80, samples=8192)
 trial = replace(head.EFFORTS[5].trial, budget=budget)
-head.MIN_BYTES, least = 0, -1e6  # a head is trained, whether it pays or not
-head.EFFORTS[5] = replace(head.EFFORTS[5], trial=trial, perceptron=budget, least=least)
+# A head is trained, whether it pays or not.
+any_size = {"least": -1e6, "least_bytes": 0, "most_bits": 1e6}
+head.EFFORTS[5] = replace(head.EFFORTS[5], trial=trial, perceptron=budget, **any_size)
 for line in sys.stdin:
     result = CliRunner().invoke(program, json.loads(line))
     print(json.dumps([result.exit_code, result.stdout, result.stderr]))

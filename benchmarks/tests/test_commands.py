@@ -153,20 +153,23 @@ def test_an_unknown_kind_is_refused(refused: Refused) -> None:
     assert "kind is 'foo'; allowed: " in refused(2, "bench", "labels", "--kind", "foo")
 
 
-def test_bench_table_prints_markdown_and_goes_on(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+def test_bench_table_prints_a_table_and_goes_on(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     words = ["bench", "table", data, "--target", "40", "--bound", "0.05", "--peer", "SZ3"]
-    words += ["--effort", "1", "-o", tmp_path / "cells", "-q"]
+    words += ["--effort", "1", "--access", "fast", "-o", tmp_path / "cells", "-q"]
     first = fhash(*words)
     assert (first.exit_code, first.stderr) == (0, "")
-    header, line, *rows = first.stdout.splitlines()
-    assert header.startswith("| series | quality | fhash, bytes | one tile | tiles cost |")
-    assert set(line) == set("| -")
-    assert [row.split(" | ")[1] for row in rows] == ["40 dB", "5 %"]
-    assert len(list((tmp_path / "cells").glob("*.json"))) == 4
+    header, *rows = first.stdout.split("\n\n")[0].splitlines()
+    assert header.split()[:4] == ["series", "quality", "codec", "bytes"]
+    assert [word in row for row, word in zip(rows, ["40 dB", "40 dB", "5 %", "5 %"], strict=True)]
+    assert [("fhash 1 fast" in row, "SZ3" in row) for row in rows] == 2 * [
+        (True, False),
+        (False, True),
+    ]
+    assert "start-up of fhash" in first.stdout
+    assert len(list((tmp_path / "cells").iterdir())) == 5
     again = json.loads(fhash(*words, "--json").stdout)
     assert again["measured"] == 0
-    assert again["table"] == first.stdout.rstrip("\n")
-    assert {cell["codec"] for cell in again["cells"]} == {"fhash compact", "SZ3"}
+    assert [cell["codec"] for cell in again["cells"]] == 2 * ["fhash 1 fast", "SZ3"]
 
 
 def test_bench_table_needs_data(refused: Refused, data: Path) -> None:
@@ -180,9 +183,9 @@ def test_bench_table_needs_data(refused: Refused, data: Path) -> None:
 
 def test_filters_are_all_unless_some_are_named() -> None:
     program = Peer(name="vvc", path="/usr/bin/ffmpeg")
-    assert filters_of([]) == filters_of([program]) == list(PEERS)
-    assert filters_of([Peer(name="SZ3"), program, Peer(name="SZ3")]) == ["SZ3"]
-    assert filters_of([Peer(name="none"), program]) == []
+    assert filters_of([], PEERS) == filters_of([program], PEERS) == list(PEERS)
+    assert filters_of([Peer(name="SZ3"), program, Peer(name="SZ3")], PEERS) == ["SZ3"]
+    assert filters_of([Peer(name="none"), program], PEERS) == []
     assert programs_of([Peer(name="SZ3"), program]) == {"vvc": "/usr/bin/ffmpeg"}
 
 

@@ -38,7 +38,7 @@ def test_bench_rate() -> None:
     tiles = TilePrice(goal="psnr", asked=40.0, bytes=9, one_tile_bytes=8, price=1.125, steps=1)
     access = Access(
         codec="SZ3", setting="", region=(1, 2, 3), bytes=9, psnr=None, milliseconds=0.5,
-        bytes_read=9,
+        core_milliseconds=0.5, bytes_read=9,
     )  # fmt: skip
     result = RateBench(
         series="a", shape=(1, 2, 3, 4), dtype="float32", raw_bytes=96, value_range=(0.0, 1.0),

@@ -28,7 +28,6 @@ from fhash_formats.errors import (
     RegionError,
     UnsupportedFileError,
 )
-from fhash_formats.support.values import plain_json, plain_text
 
 QUIET_SECONDS = 1.0
 """Seconds of a command that show no progress, so that short commands stay silent."""
@@ -253,6 +252,8 @@ def emit(
 
     Raises OutputError where stdout is closed.
     """
+    from fhash_formats.support.values import plain_text
+
     if sys.stdout is None:
         raise OutputError(
             "the result cannot be printed, stdout is closed; files named as outputs are written"
@@ -267,6 +268,8 @@ def emit(
 
 def print_json(values: Mapping[str, Any]) -> None:
     """Print the one JSON object of a command on stdout."""
+    from fhash_formats.support.values import plain_json
+
     click.echo(json.dumps(plain_json(values), allow_nan=False))
     printed.set(True)
 

@@ -33,14 +33,14 @@ from fhash_formats.container.array import transform_codecs
 from fhash_formats.container.growing import GrowingArray, GrowingContainer
 from fhash_formats.container.header import COMPACT, NOT_STORED, PLAIN_FEATURE, STEPS, TABLE
 from fhash_formats.container.zip_file import damage_named
-from fhash_formats.errors import InputError
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import AXES, AXIS_NAMES, MAX_SPANS, Coordinate, NotStored
 from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import exact_number, is_within
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import TRELLIS_WEIGHT, WEIGHT, CodedTile
-from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.tile_format import TileSettings, parse_stream
 
 ROUNDED_ONCE = 1 - 1e-12
 """Factor of a figure that was rounded up to some decimals, so that it is not once more.
@@ -422,7 +422,7 @@ def continued(path: Path, steps: int | None = None) -> Iterator[GrowingFile]:
         value_range = ValueRange(*header["value_range"])
         growing = GrowingFile(
             path,
-            _coder(container.arrays[TABLE], settings, header, value_range),
+            _coder(path, container.arrays[TABLE], settings, header, value_range),
             _lasting(header) | {"history": container.header["history"]},
             {axis: container.coordinate(stored) for axis, stored in AXIS_NAMES.items()},
             _figures(path, header, value_range, kept),
@@ -488,13 +488,22 @@ def _steps_to_keep(container: Container, steps: int | None) -> int:
 
 
 def _coder(
-    table: StoredArray, settings: TileSettings, header: Mapping[str, Any], value_range: ValueRange
+    path: Path,
+    table: StoredArray,
+    settings: TileSettings,
+    header: Mapping[str, Any],
+    value_range: ValueRange,
 ) -> LayerCoder:
     """The coder of further layers: options of the encoder as the file's effort asks for."""
     effort = header["config"].get("effort")
     config = EncodeConfig(max_error=bound_of_file(header))
     goal = goal_of(config, value_range, 1, 0, integers=table.dtype.kind in "iu")
+    try:
+        fast = parse_stream(table.coded((0,) * len(table.grid))).fast
+    except DamagedFileError as error:
+        raise DamagedFileError(f"{path}: {error}") from error
     coding = Coding(
+        fast=fast,
         weight=TRELLIS_WEIGHT if settings.trellis else WEIGHT,
         filled=True,
         density=0,

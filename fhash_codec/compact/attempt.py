@@ -13,6 +13,7 @@ from typing import Any
 
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.step import Slope
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature
@@ -150,6 +151,23 @@ MARGIN_FORETOLD = 0.035
 """Part of an allowed price that no foretold one may take, which is too high rather than too low."""
 WORTH = {"fast": 1.0, "balanced": 0.01, "small": 0.0}
 """Share of the bytes that half the work for a region is worth, by the wish for access."""
+REGION_MS = {"fast": 3.0, "balanced": 30.0, "small": math.inf}
+"""Milliseconds that the decoding of a region may take, in the mean, by the wish for access."""
+NS_PER_BYTE = {"fast": 0.0, "balanced": 10.0, "small": math.inf}
+"""Nanoseconds that the decoding of a whole series may take for each byte of its values, with the
+mixing coder: those of 100 MB/s. Who wishes for fast access never has that coder."""
+FAST_BYTES = {"fast": 1.6, "balanced": 1.08, "small": 0.0}
+"""Bytes that the fast coder may take, as a multiple of those of the other one."""
+LATE = 1.0
+"""Share of the bytes that half the work for a region is worth where it takes longer than that."""
+DECODING_NS = {False: (25.0, 110.0), True: (10.0, 10.0)}
+"""Nanoseconds to decode a vertex, and more for each of its bits, by whether the coder is fast.
+
+These are counts of work rather than times, so that every machine makes the same choice: of one core
+of an EPYC of 2021.
+"""
+TRANSFORM_NS = 8.0
+"""The same of all else."""
 REGION = 16
 """Vertices of a region along each axis in space; it is of one step."""
 FAST_ENOUGH = 1 << 16
@@ -214,14 +232,22 @@ def region_vertices(shape: Shape, tile: Shape) -> float:
     return mean
 
 
-def burden(access: str, price: float, work: float) -> float:
+def decoding_ns(bits: float, *, fast: bool) -> float:
+    """Return the nanoseconds in which a vertex of so many bits is decoded, by count."""
+    first, more = DECODING_NS[fast]
+    return TRANSFORM_NS + first + more * bits
+
+
+def burden(access: str, price: float, work: float, bits: float) -> float:
     """Return what tiles cost in bytes and in work for a region together, as a logarithm.
 
     access: the wish, a name of `WORTH`.
     price: bytes as a multiple of those of the best tiling.
     work: vertices that are decoded for a region.
+    bits: of a vertex.
     """
-    return math.log(price) + WORTH[access] * math.log2(work)
+    late = work * decoding_ns(bits, fast=True) * 1e-6 / REGION_MS[access]
+    return math.log(price) + WORTH[access] * math.log2(work) + LATE * math.log2(max(late, 1.0))
 
 
 def tiles_to_try(shape: Shape, max_vertices: int, *, slabs: bool = False) -> list[Shape]:
@@ -298,6 +324,11 @@ def _even_length(length: int, edge: int, *, even: bool = True) -> int:
     return part + part % 2 if even and parts > 1 else part
 
 
+def is_small(shape: Shape) -> bool:
+    """Whether a series is one tile without a trial, since all of it decodes in a moment."""
+    return prod(shape) <= 4 * FAST_ENOUGH
+
+
 def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
     """Return the price of tiles that nothing was tried for: the most that is likely.
 
@@ -370,12 +401,25 @@ class PlanTask:
     gains: GainLog
     parts: Parts = field(default_factory=Parts)
     """Progress of the planning."""
+    slope: Slope = field(default_factory=Slope)
+    """Fall of the PSNR with the step."""
 
     @property
     def density(self) -> int:
         """Thoroughness of filling the vertices that do not count, see `fill`."""
         effort = self.config.effort
         return 8 if effort >= 4 else 4 if effort > 1 else 1
+
+    def is_slow(self, tile: Shape, size: float) -> bool:
+        """Whether reading would take longer than is wished for with the mixing coder.
+
+        tile: of the series. size: its bytes.
+        """
+        access, shape = self.config.access, self.blocks.shape
+        ns = decoding_ns(8 * size / prod(shape), fast=False)
+        in_region = 1e-6 * ns * region_vertices(shape, tile)
+        slow = ns > NS_PER_BYTE[access] * self.blocks.dtype.itemsize
+        return slow or in_region > REGION_MS[access]
 
 
 HeadHistory = list[dict[str, float | None]]
@@ -403,3 +447,9 @@ class Attempt:
     """Training of the head."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
+    quick: bool = False
+    """Whether trials are few, and coded by the fast coder.
+
+    Not where many values are alike: of the sharp shells in a plateau the two coders make so
+    different numbers of bytes, up to 1.7, that one does not tell what the other would choose.
+    """

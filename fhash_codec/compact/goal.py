@@ -41,20 +41,21 @@ MIN_LOSS = 0.02
 class PsnrSearch:
     """Search for the quantiser step at which a PSNR is reached, by secants of the log step."""
 
-    def __init__(self, min_step: float, max_step: float) -> None:
-        """Begin a search between two steps."""
+    def __init__(self, min_step: float, max_step: float, slope: float = SLOPE) -> None:
+        """Begin a search between two steps. slope: dB per factor of e that is assumed at first."""
         self._ends = min_step, max_step
+        self.slope = slope
         self._before: tuple[float, float] | None = None
 
     def after(self, step: float, psnr: float, target: float) -> float:
         """Take up a trial, the PSNR in dB of a step; return the step that should reach `target`."""
-        log_step, slope = math.log(step), SLOPE
+        log_step = math.log(step)
         if self._before is not None and abs(self._before[0] - log_step) > MIN_APART:
             fall = -(psnr - self._before[1]) / (log_step - self._before[0])
-            slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
+            self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
         self._before = log_step, psnr
         low, high = map(math.log, self._ends)  # 0 where nothing but a first trial is made
-        return math.exp(min(max(log_step + (psnr - target) / slope, low), high))
+        return math.exp(min(max(log_step + (psnr - target) / self.slope, low), high))
 
 
 def step_after_gain(step: float, gain: float) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from math import prod
 from threading import Event
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
 from fhash_codec.compact.goal import step_after_gain
 from fhash_codec.compact.head_training import Budget, Pair, Shape, TrainedHead, train_head
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.step import AIM, octave_gain
+from fhash_codec.compact.step import EXACT, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.transform.tile_format import TileSettings
@@ -48,6 +49,14 @@ class Effort:
     """Training of the perceptron, whose updates cost a sixth."""
     least: float = 0.0
     """Share of the file that a head must be expected to save."""
+    least_bytes: int = 900
+    """Bytes of tiles below which no head is tried: it takes some hundreds itself."""
+    most_bits: float = math.inf
+    """Bits of a vertex above which no head is tried: none has saved that share there."""
+
+    def tries(self, size: int | float, vertices: int) -> bool:
+        """Whether a head is tried for a series of so many vertices, coded in `size` bytes."""
+        return size >= self.least_bytes and 8 * size <= self.most_bits * vertices
 
     def budget_of(self, shape: Shape) -> Budget:
         """Return the training of a head of a shape."""
@@ -74,7 +83,9 @@ EFFORTS = {
         candidates=0,
         budget=None,
         perceptron=Budget(updates=2000, samples=400_000, rate=3e-2),
-        least=0.003,
+        least=0.02,
+        least_bytes=12_000,
+        most_bits=0.75,
     ),
     **{
         effort: Effort(
@@ -163,11 +174,6 @@ POINTLESS = 0.005
 """Share of the bytes that a head must cost before the step is searched: then it is left out."""
 CLOSE = 0.004
 """Distance in dB from the PSNR that is searched for at which no further step is tried."""
-MIN_BYTES = 900
-"""Bytes of coded tiles below which a head cannot save what it takes.
-
-The smallest head takes some 250 bytes with its history, and few save 30 % of the tiles.
-"""
 
 
 class _Candidate(NamedTuple):
@@ -196,9 +202,9 @@ def choose_head(
     sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
     data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
     # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
-    aim = None if task.goal.psnr is None else task.goal.psnr + AIM
-    if outcome.size < MIN_BYTES:
-        skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
+    aim = None if task.goal.psnr is None else task.goal.psnr + EXACT.aim
+    if not spent.tries(outcome.size, prod(task.blocks.shape)):
+        skip("head", f"tiles of {outcome.size} bytes: heads save little of so few, or of so many")
         return settings, outcome, []
     tell = partial(task.parts.report, "training")
 

@@ -511,7 +511,8 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
         tiling = cheap_tiling(task.blocks.shape, size, task.config.access)
         tiled = task.blocks.retile(tiling.tile)
     settings = replace(settings, transform=usual_transform(tiled.tile))
-    coding = Coding(filled=True, density=0, bulk=goal.bulk)
+    slow = task.is_slow(tiled.tile, _estimated_bytes(task, tiled, settings))
+    coding = Coding(filled=True, density=0, bulk=goal.bulk, fast=slow)
     step = estimated_step(
         tiled,
         settings,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec import native
 from fhash_codec.compact.tiles import (
     Blocks,
     Coding,
@@ -32,9 +30,9 @@ from fhash_codec.compact.tiles import (
 )
 from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead
-from fhash_formats.transform.coder import array_arguments, checked
+from fhash_formats.transform.coder import foretell
 from fhash_formats.transform.decoding import transform_for
-from fhash_formats.transform.encoding import filled, plain_step
+from fhash_formats.transform.encoding import WEIGHT, filled, plain_step
 from fhash_formats.transform.lifting import band_table
 from fhash_formats.transform.tile_format import TileSettings
 from fhash_formats.transform.values import all_finite
@@ -170,9 +168,11 @@ class Sample:
         indices = list(blocks.indices())
         count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
         chosen = _choose_tiles(len(indices), count, costs)
+        places = [indices[number] for number, _ in chosen]
+        read = (pool.map if blocks.in_memory else map)(blocks.read, places)
         tiles = [
-            (index, blocks.read(index), weight * blocks.weight(index))
-            for index, weight in ((indices[number], weight) for number, weight in chosen)
+            (index, tile, weight * blocks.weight(index))
+            for index, tile, (_, weight) in zip(places, read, chosen, strict=True)
         ]
         # At least one tile, even if no vertex counts.
         tiles = [entry for entry in tiles if not entry[1].is_empty] or tiles[:1]
@@ -212,6 +212,19 @@ class Sample:
             return self
         other = Sample(self.blocks, max_vertices, self._pool, self._costs, self.tick)
         return other if self._filling is None else other.filled(*self._filling)
+
+    def narrowed(self, max_vertices: int) -> Sample:
+        """Return a sample of those of its tiles in the middle, of at most so many vertices.
+
+        At least one is left. Only their bytes beside each other mean anything.
+        """
+        count = max(1, max_vertices // prod(self.blocks.tile))
+        first = max(0, (len(self.tiles) - count) // 2)
+        other = copy(self)
+        other.tiles = self.tiles[first : first + count]
+        other.weights = self.weights[first : first + count]
+        other._known = Known()
+        return other
 
     def filled(self, settings: TileSettings, density: int) -> Sample:
         """Return the same tiles, filled for these settings (see `fill`) from the source."""
@@ -304,8 +317,8 @@ distribution of numbers that are not rounded."""
 class PricedSample(Sample):
     """A sample whose tiles are priced, and not coded.
 
-    Sizes and errors are those that fhash_codec/native/price.cpp foretells, for all vertices of a
-    tile. Only transforms are compared by them.
+    Sizes and errors are those that the fast coder foretells, for all vertices of a tile. Only
+    transforms are compared by them.
 
     Attributes:
         sample: the same sample, which codes its tiles.
@@ -340,16 +353,9 @@ def _price(tile: Tile, settings: TileSettings, coding: Coding) -> Outcome:
         np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     coefficients = transform_for(settings, values.shape).forward(values)
     step = plain_step(settings)
-    results = (ctypes.c_double * 2)()
-    code = native.library().fhash_price(
-        ctypes.c_void_p(coefficients.ctypes.data),
-        (ctypes.c_int64 * 4)(*values.shape),
-        *array_arguments(band_table(settings.transform, values.shape)),
-        1 / step,
-        results,
-    )
-    checked(code)
-    size, squares = results[0], results[1] * step * step
+    table = band_table(settings.transform, values.shape)
+    size, squares = foretell(coefficients, table, 1 / step, WEIGHT)
+    squares *= step * step
     if coding.error:
         size += _residual_bytes(math.sqrt(squares / values.size), settings.quantum) * values.size
     return Outcome(size=round(size), squares=squares, count=values.size, max_error=0.0)

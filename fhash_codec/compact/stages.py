@@ -10,20 +10,24 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.attempt import Attempt, PlanTask, Tiling, sub_tile
+from fhash_codec.compact.attempt import FAST_BYTES, Attempt, PlanTask, Tiling, sub_tile
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import Sample, priced
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced
 from fhash_codec.compact.step import (
-    AIM,
-    CLOSE,
+    EXACT,
+    NEAR,
+    QUICK,
+    Precision,
     allows_trellis,
     choose_quantiser,
     find_step,
     octave_gain,
     off_trellis,
+    on_trellis,
     require_reach,
+    step_after,
     with_step,
 )
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile
@@ -295,6 +299,10 @@ LOOK_VERTICES = 1 << 18
 """Vertices coded for the first size estimate."""
 TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
+COMPARED_VERTICES = 1 << 20
+"""Vertices of the tiles on which the two coders are compared; one tile may have more."""
+PRICED_VERTICES = 1 << 20
+"""Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
 MAX_SEARCHED_VERTICES = 12 << 20
@@ -309,11 +317,6 @@ SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
 HEAD_TRIES = 3
 """Trials of the step with a head: the search begins within some hundredths of a dB of its end."""
-NEAR = 0.03
-"""Distance in dB from the promise at which the search for a step ends before a head is tried.
-
-Candidates are compared at equal quality, and the step is searched once more for the best.
-"""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 LOST = 0.5
@@ -348,13 +351,15 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
     """Code a few tiles for a first idea of the size."""
-    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk)
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
+    quick = task.config.effort <= MAX_PRICED_EFFORT
+    quick = quick and plateau_center(sample, task.value_range) is None
+    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)
     require_reach(task.goal, settings, outcome)
     task.gains.note("start", outcome)
-    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding, quick=quick)
 
 
 def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -400,11 +405,13 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    parts = task.blocks.retile(sub_tile(sample.blocks.tile, TRIAL_VERTICES // PARTS))
+    vertices = PRICED_VERTICES if attempt.quick else TRIAL_VERTICES
+    parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
-    small = _sample(task, parts, usual, TRIAL_VERTICES)
+    small = _sample(task, parts, usual, vertices)
     found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
-    return adapted_transform(sample, attempt.settings, found.transform.axes, coding)
+    trials = priced(sample, attempt.settings, task.config.effort)
+    return adapted_transform(trials, attempt.settings, found.transform.axes, coding)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
@@ -448,13 +455,39 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        if not allows_trellis(attempt.settings, task.goal, task.config.effort):
-            return _searched_step(task, attempt)
-        settings, coding, outcome = choose_quantiser(
-            attempt.sample, attempt.settings, attempt.coding, task.goal
-        )
-        attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
+        fast, tried = _has_fast_coder(task, attempt), attempt.coding.fast
+        attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+        if fast and attempt.quick:
+            slope = task.slope.slope
+            step = step_after(attempt.settings, attempt.outcome, task.goal, slope)
+            attempt = replace(attempt, settings=replace(attempt.settings, step=step))
+        if not fast and allows_trellis(attempt.settings, task.goal, task.config.effort):
+            settings, coding, outcome = choose_quantiser(
+                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
+            )
+            attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
         return _searched_step(task, attempt)
+
+
+def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
+    """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it."""
+    access, goal, settings = task.config.access, task.goal, attempt.settings
+    if not task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size):
+        return False
+    if task.config.effort == 1:
+        return True
+    part = attempt.sample.narrowed(COMPARED_VERTICES)
+    fast = part.run(settings, goal.bounded(replace(attempt.coding, fast=True)))
+    coding = replace(attempt.coding, fast=False)
+    if allows_trellis(settings, goal, task.config.effort):
+        settings, coding = on_trellis(settings, coding)
+    mixed = part.run(settings, goal.bounded(coding))
+    size = float(mixed.size)
+    if goal.error is None and goal.data_range > 0 and mixed.squares and fast.squares:
+        better = fast.psnr(goal.data_range) - mixed.psnr(goal.data_range)
+        size *= 2 ** (better / EXCHANGE)
+    tell("step", f"the fast coder takes {fast.size / max(size, 1.0):.3f} times the bytes")
+    return fast.size <= FAST_BYTES[access] * size
 
 
 def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -462,9 +495,17 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
-    close = CLOSE if _without_head(task, attempt) else NEAR
+    precision = _precision(task, attempt)
+    if not attempt.quick and not _without_head(task, attempt):
+        precision = NEAR
     settings, outcome = find_step(
-        sample, attempt.settings, coding, goal, tries=tries, tried=tried, close=close
+        sample,
+        attempt.settings,
+        coding,
+        goal,
+        tries=tries,
+        tried=tried,
+        precision=precision,
     )
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)
@@ -475,7 +516,9 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
         if refitted is settings:
             break
         step_before, before = settings.step, (settings, outcome)
-        settings, outcome = find_step(sample, refitted, coding, goal, tried=tried, close=close)
+        settings, outcome = find_step(
+            sample, refitted, coding, goal, tried=tried, precision=precision
+        )
         if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
             settings, outcome = before
             break
@@ -496,7 +539,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         return attempt
 
     def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
-        return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+        return _head_step(task, attempt, settings)
 
     def look(settings: TileSettings) -> Outcome:
         return attempt.sample.run(settings, goal.bounded(attempt.coding))
@@ -516,12 +559,32 @@ def _at_the_promise(task: PlanTask, attempt: Attempt) -> tuple[TileSettings, Out
     goal = task.goal
     if goal.psnr is None:
         return attempt.settings, attempt.outcome
-    missing = goal.psnr + AIM - attempt.outcome.psnr(goal.data_range)
-    if abs(missing) < CLOSE or math.isinf(missing):
+    precision = _precision(task, attempt)
+    missing = goal.psnr + precision.aim - attempt.outcome.psnr(goal.data_range)
+    if abs(missing) < precision.close or math.isinf(missing):
         return attempt.settings, attempt.outcome
     settings = attempt.settings
     settings = replace(settings, step=step_after_gain(settings.step, -missing))
-    return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+    return _head_step(task, attempt, settings)
+
+
+def _head_step(
+    task: PlanTask, attempt: Attempt, settings: TileSettings
+) -> tuple[TileSettings, Outcome]:
+    """Return settings with the step that keeps the promise, and their outcome."""
+    return find_step(
+        attempt.sample,
+        settings,
+        attempt.coding,
+        task.goal,
+        tries=HEAD_TRIES,
+        precision=_precision(task, attempt),
+    )
+
+
+def _precision(task: PlanTask, attempt: Attempt) -> Precision:
+    """Return the precision of the last search for the step."""
+    return replace(QUICK, slope=task.slope) if attempt.quick else EXACT
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:
@@ -612,10 +675,14 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES or sample.is_single:
+    elif sample.is_single or prod(sample.blocks.tile) > (
+        2 * PRICED_VERTICES if attempt.quick else LARGE * TRIAL_VERTICES
+    ):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)
         settings, _ = choose_transform(trials, attempt.settings, goal.bounded(coding))
-    settings, outcome = find_step(sample, settings, coding, goal, tries=4, close=NEAR)
+    tries, slope = (2, task.slope) if attempt.quick else (4, None)
+    near = replace(NEAR, slope=slope)
+    settings, outcome = find_step(sample, settings, coding, goal, tries=tries, precision=near)
     return replace(attempt, settings=settings, outcome=outcome)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fhash_codec.compact.goal import (
     EXCHANGE,
+    MAX_SLOPE,
+    MIN_SLOPE,
     RATIO_SLACK,
     SLOPE,
     Goal,
@@ -59,14 +61,16 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
 
 
 def choose_quantiser(
-    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, *, fast: bool
 ) -> tuple[TileSettings, Coding, Outcome]:
     """Return settings and coding with the trellis if that makes a sample smaller, and the outcome.
 
     Otherwise those with the plain quantiser are returned. Either have a better step: the trial of
     the plain quantiser tells where the search for the step begins.
+
+    fast: whether the plain quantiser is tried with the fast coder.
     """
-    plain = sample.run(settings, goal.bounded(coding))
+    plain = sample.run(settings, goal.bounded(replace(coding, fast=fast)))
     settings = replace(settings, step=step_after(settings, plain, goal))
     other, other_coding = on_trellis(settings, coding)
     outcome = sample.run(other, goal.bounded(other_coding))
@@ -91,15 +95,16 @@ def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, C
     return settings, replace(coding, weight=WEIGHT)
 
 
-def step_after(settings: TileSettings, outcome: Outcome, goal: Goal) -> float:
+def step_after(settings: TileSettings, outcome: Outcome, goal: Goal, slope: float = SLOPE) -> float:
     """Return the step at which a promised PSNR should be reached, by one outcome of the settings.
 
-    For other promises it is the step of the settings.
+    For other promises it is the step of the settings. slope: dB per factor of e.
     """
     psnr = outcome.psnr(goal.data_range)
     if goal.psnr is None or not math.isfinite(psnr):
         return settings.step
-    return step_after_gain(settings.step, min(max(psnr - goal.psnr, -SLOPE), SLOPE))
+    gain = min(max(psnr - goal.psnr, -SLOPE), SLOPE)
+    return step_after_gain(settings.step, gain * SLOPE / slope)
 
 
 def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal: Goal) -> bool:
@@ -117,10 +122,59 @@ def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal:
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
-AIM = 0.005
-"""dB above the PSNR asked for that a search aims at: all tiles should not fall short again."""
-CLOSE = 0.004
-"""Distance in dB from that aim at which a search ends."""
+
+
+APART = 0.01
+"""Difference of log steps from which on two trials tell a slope."""
+
+
+@dataclass
+class Slope:
+    """Fall of the PSNR of a series with the step, as the last trials have found it.
+
+    Attributes:
+        slope: dB per factor of e.
+    """
+
+    slope: float = SLOPE
+    _before: tuple[float, float] | None = None
+
+    def restart(self) -> None:
+        """Forget the last trial: the next one has another transform or other tiles."""
+        self._before = None
+
+    def note(self, step: float, psnr: float) -> None:
+        """Take up a trial, the PSNR in dB of a step."""
+        log_step = math.log(step)
+        if self._before is not None and abs(self._before[0] - log_step) > APART:
+            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
+            if math.isfinite(fall):
+                self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
+        self._before = log_step, psnr
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Distance in dB to which a search for the step comes near a promised PSNR.
+
+    Attributes:
+        aim: above the PSNR asked for: all tiles should not fall short again.
+        close: distance from that aim at which a search ends.
+        slope: what the search begins with, and what it finds; None for the usual one.
+    """
+
+    aim: float
+    close: float
+    slope: Slope | None = None
+
+
+EXACT = Precision(0.005, 0.004)
+"""Precision of the last search."""
+QUICK = Precision(0.013, 0.012)
+"""The same where seconds count more than the 0.1 % of the bytes that this may cost."""
+NEAR = Precision(0.005, 0.03)
+"""Precision before a head is tried: candidates are compared at equal quality, and the step is
+searched once more for the best."""
 STEPS_TO_OCTAVE = 3
 """Steps per octave that are tried under a strict bound."""
 MAX_STEP_NUMBER = 15
@@ -172,10 +226,10 @@ def with_step(
     return replace(settings, step=step, double=double, quantum=quantum, clip=beyond)
 
 
-def psnr_search(settings: TileSettings) -> PsnrSearch:
+def psnr_search(settings: TileSettings, slope: float = SLOPE) -> PsnrSearch:
     """Begin a search for the step of a PSNR within the steps that the settings allow."""
     data_range = settings.high - settings.low
-    return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE)
+    return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE, slope)
 
 
 def require_reach(goal: Goal, settings: TileSettings, outcome: Outcome) -> None:
@@ -202,7 +256,7 @@ def find_step(
     *,
     tries: int = 5,
     tried: list[Outcome] | None = None,
-    close: float = CLOSE,
+    precision: Precision = EXACT,
 ) -> tuple[TileSettings, Outcome]:
     """Return settings with the step that keeps the promise on the sample, and their outcome.
 
@@ -210,7 +264,7 @@ def find_step(
 
     tries: number of trials for a PSNR; the other searches derive theirs from it.
     tried: list to which a search for a PSNR appends all its outcomes.
-    close: distance in dB from the PSNR at which a search for it ends.
+    precision: of a search for a PSNR.
 
     Raises InputError for a ratio that is out of reach.
     """
@@ -218,7 +272,7 @@ def find_step(
         if goal.data_range == 0:
             return settings, sample.run(settings, coding)
         outcomes = [] if tried is None else tried
-        return _step_for_psnr(sample, settings, coding, goal, tries, outcomes, close)
+        return _step_for_psnr(sample, settings, coding, goal, tries, outcomes, precision)
     if goal.error is not None:
         if goal.error == 0:
             return settings, sample.run(settings, replace(coding, error=0.0))
@@ -240,26 +294,30 @@ def _step_for_psnr(
     goal: Goal,
     tries: int,
     tried: list[Outcome],
-    close: float,
+    precision: Precision,
 ) -> tuple[TileSettings, Outcome]:
     """Search for the step of the PSNR of a goal; the trial nearest to it."""
     assert goal.psnr is not None
-    target = goal.psnr + AIM
-    secants = psnr_search(settings)
+    target, slope = goal.psnr + precision.aim, precision.slope
+    secants = psnr_search(settings, SLOPE if slope is None else slope.slope)
 
     def run(settings: TileSettings) -> tuple[TileSettings, Outcome]:
         tried.append(sample.run(settings, coding))
+        if slope is not None:
+            slope.note(settings.step, tried[-1].psnr(goal.data_range))
         return settings, tried[-1]
 
     def following(trial: tuple[TileSettings, Outcome], _number: int) -> TileSettings | None:
         reached = trial[1].psnr(goal.data_range)
-        if abs(reached - target) < close or math.isinf(reached):
+        if abs(reached - target) < precision.close or math.isinf(reached):
             return None
         return replace(trial[0], step=secants.after(trial[0].step, reached, target))
 
     def missed(trial: tuple[TileSettings, Outcome]) -> float:
         return abs(trial[1].psnr(goal.data_range) - target)
 
+    if slope is not None:
+        slope.restart()
     return search(
         run(settings), following, run, tries - 1, lambda new, best: missed(new) < missed(best)
     )

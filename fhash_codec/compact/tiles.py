@@ -17,7 +17,7 @@ import numpy as np
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
-from fhash_formats.series import ArraySeries, Series, step_blocks
+from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
@@ -257,14 +257,14 @@ class Blocks:
 
     def _load(self, steps: range) -> Tile:
         """Read the box at some steps from the series; an array in memory is not copied."""
-        held = self._series.values if isinstance(self._series, ArraySeries) else None
+        held = self._series.held
         if held is not None and held.dtype == self.source_dtype and not self.origin:
             values = held[(slice(steps.start, steps.stop), *self._extent.box.slices())]
             values.flags.writeable = False  # it is the caller's
             return Tile(values, self._masks(steps))
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
         for place, block in step_blocks(steps, self._series.shape[1:]):
-            frames = self._series.read_steps(block)[:, *self._extent.box.slices()]
+            frames = self._series.block(block)[:, *self._extent.box.slices()]
             if frames.dtype.kind == "f" and self.dtype.kind != "f":
                 # Missing values are outside the coreset; any integer may stand there.
                 least = np.fmin.reduce(frames, axis=(1, 2, 3), keepdims=True, initial=np.inf)

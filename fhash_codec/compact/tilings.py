@@ -17,11 +17,12 @@ from fhash_codec.compact.attempt import (
     Tiling,
     burden,
     cheap_tiling,
+    is_small,
     region_vertices,
     tiles_to_try,
 )
 from fhash_codec.compact.goal import EXCHANGE, exchange, step_after_gain
-from fhash_codec.compact.sample import Sample, priced, strata
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced, strata
 from fhash_codec.compact.step import find_step
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
@@ -208,7 +209,10 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
 
     size: bytes of the series, roughly.
     """
-    config = task.config
+    config, shape = task.config, task.blocks.shape
+    few = config.effort <= MAX_PRICED_EFFORT and config.access != "fast"
+    if few and is_small(shape):
+        return Tiling(tile=shape, price=1.0)
     if config.effort > 1 and "tiles" not in config.without:
         return None
     return cheap_tiling(task.blocks.shape, size, config.access)
@@ -336,12 +340,13 @@ class _Prices:
 def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     """Return the tile of the least burden among those tried whose price is allowed."""
     allowed = max(PRICES[access] - MARGIN, 1.0)
+    bits = 8 * min(prices.sizes.values()) / prod(shape)
 
     def work(tile: Shape) -> float:
         return region_vertices(shape, tile)
 
     def burden_of(tile: Shape) -> float:
-        return burden(access, prices.price(tile), work(tile))
+        return burden(access, prices.price(tile), work(tile), bits)
 
     def best() -> Shape:
         return min((tile for tile in prices.sizes if prices.price(tile) <= allowed), key=burden_of)
@@ -351,7 +356,7 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     while len(prices.sizes) < TRIALS:
         least, limit = burden_of(best()), FASTER * work(best())
         likely = [
-            (burden(access, prices.foretold(tile), work(tile)), tile)
+            (burden(access, prices.foretold(tile), work(tile), bits), tile)
             for tile in prices.candidates
             if tile not in prices.sizes and work(tile) < limit and prices.foretold(tile) <= allowed
         ]

@@ -237,7 +237,9 @@ def choose_transform(
         lowest, axes = min([(lowest, axes), *all_tried], key=itemgetter(0))
     if isinstance(sample, PricedSample):
         best = [axes for _, axes in sorted(all_tried, key=itemgetter(0))[:CODED]]
-        lowest, axes = _cheapest(sample.sample, settings, best, coding)
+        # Prices are those of the fast coder; the other one finds much more in some transforms.
+        slow = replace(coding, fast=False)
+        lowest, axes = _cheapest(sample.sample, settings, best, slow)
     return _along(settings, axes), lowest
 
 

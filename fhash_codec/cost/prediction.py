@@ -18,7 +18,6 @@ from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_
 from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
     EFFORTS,
-    MIN_BYTES,
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
@@ -271,13 +270,13 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     limit = MAX_SEARCHED_VERTICES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     searched = work.tiles(tile, limit)
     size = work.bytes_of_tiles
-    if size < MIN_BYTES:
+    spent = EFFORTS[config.effort]
+    if not spent.tries(size, work.vertices):
         return {}
     strict = bool(look.task.goal.error)
     # Without a bound the tiles are coded already, and are only decoded.
     known = rates.search if strict else rates.decode
     pairs = work.wall(known, tile, searched)
-    spent = EFFORTS[config.effort]
     seconds = {"head trial": pairs + _training(head, spent.trial.budget, 1.0, 1.0)}
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:

@@ -319,7 +319,7 @@ def _frames_around(series: Series, key_frames: Sequence[int]) -> FramesAround:
             place = list(key_frames).index(step)
             first = key_frames[place - 1] if place else 0
             end = key_frames[place + 1] if place + 1 < len(key_frames) else last
-        return (series.read(each) for each in range(max(first, 0), min(end, last) + 1))
+        return (series.frame(each) for each in range(max(first, 0), min(end, last) + 1))
 
     return around
 
@@ -377,7 +377,7 @@ def _histogram(
     """Counts (BINS,) of the finite values of all key frames, over the range of the series."""
     counts = np.zeros(BINS, dtype=np.int64)
     for done, step in enumerate(key_frames):
-        for piece in pieces(series.read(step)):
+        for piece in pieces(series.frame(step)):
             unit = value_range.to_unit(finite_values(piece))
             counts += np.bincount(
                 np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
@@ -525,7 +525,7 @@ def find_extent(
     )
     without_vertices = set(features)
     for steps in _neighbours(key_frames, series):
-        frames = series.read_steps(steps)
+        frames = series.block(steps)
         masks = [feature.select_steps(frames, steps) for feature in features]
         without_vertices -= {
             feature for feature, mask in zip(features, masks, strict=True) if mask.any()

@@ -18,7 +18,14 @@ from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
 from fhash_formats.support.arrays import Values
+from fhash_formats.support.threads import map_ahead, thread_pool
 from fhash_formats.support.values import exact_number
+
+HELD_BYTES = 1 << 28
+"""Bytes of a series whose frames stay in memory after the scan, at most."""
+
+BLOCKS_AHEAD = 2
+"""Blocks of frames that are looked at while the next one is read, at most."""
 
 MOST = 2.0
 """Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
@@ -266,14 +273,31 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     """
     figures = _Figures(series)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
-    steps = series.shape[0]
-    for block, frames in series.blocks(range(steps)):
-        if figures.add(frames) < frames.size:
-            _add_missing(missing, block, frames)
-        if ranks is not None:
-            ranks.add(frames)
-        progress("scanning", block.stop, steps, "")
+    steps, size = series.shape[0], prod(series.shape) * series.dtype.itemsize
+    # the encoder and the measurement read all frames once more
+    kept = series.held is None and size <= HELD_BYTES
+    held = np.empty(series.shape, series.dtype) if kept else None
+
+    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int]:
+        block, frames = at
+        if held is not None:
+            held[block.start : block.stop] = frames
+        own = _Figures(series)
+        return block, frames, own, own.add(frames)
+
+    with thread_pool() as workers:
+        looks = map_ahead(workers, look, series.blocks(range(steps)), BLOCKS_AHEAD)
+        for block, frames, own, finite in looks:
+            figures.join(own)
+            if finite < frames.size:
+                _add_missing(missing, block, frames)
+            if ranks is not None:
+                ranks.add(frames)
+            progress("scanning", block.stop, steps, "")
     series.check()
+    if held is not None:
+        held.flags.writeable = False
+        series.held = held
     if figures.mean.count == 0:
         raise InputError(
             f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; "

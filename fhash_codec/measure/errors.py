@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from fhash_codec import native
 from fhash_codec.measure.value_range import Ranks, ValueRange, pieces, power_of_two
 from fhash_formats.errors import InputError
 from fhash_formats.support.arrays import Double, Mask, Values
+from fhash_formats.support.threads import in_threads, usable_threads
 from fhash_formats.support.values import exact_number, is_wide_integer
 
 LANES = 256
@@ -394,7 +396,7 @@ class Errors:
         return self._unscaled(math.sqrt(squares / count) if count else 0.0, count)
 
     def _unscaled(self, value: float, count: float) -> float | None:
-        figure = value / self._scale
+        figure = float(value) / float(self._scale)
         return figure if count and math.isfinite(figure) else None
 
 
@@ -427,7 +429,7 @@ Passes = Callable[[], Iterable[Values]]
 def find_bulk(passes: Passes, value_range: ValueRange, *, whole: bool = False) -> ValueRange | None:
     """The bulk: the range from the 1st to the 99th percentile of the finite values of a series.
 
-    passes: called once or twice; memory is bounded by one of its arrays.
+    passes: called once or twice; memory is bounded by one of its arrays for each thread.
     value_range: of the series, in data units.
     whole: whether the values are whole numbers, as the ends of the bulk then are.
 
@@ -441,15 +443,27 @@ def find_bulk(passes: Passes, value_range: ValueRange, *, whole: bool = False) -
         width = (high - low) / BINS
         if not 0 < width < math.inf or not math.isfinite(BINS / (high - low)):
             return None
-        counts = np.zeros(BINS, np.int64)
-        for values in passes():
-            histogram(values, counts, scale=scale, low=low, factor=BINS / (high - low))
-        first, last = _ends(counts)
+        share = (iter(passes()), Lock(), scale, low, BINS / (high - low))
+        counts = in_threads(lambda each: _counts(*each), [share] * usable_threads())
+        first, last = _ends(sum(counts, np.zeros(BINS, np.int64)))
         # A thousandth of a bin more than the bins span, for the rounding of the bins themselves.
         low, high = low + (first - 0.001) * width, low + (last + 1.001) * width
         if last + 1 - first >= MIN_BINS or (whole and width < 0.5):
             return _rounded(low / scale, high / scale, value_range, whole=whole)
     return None
+
+
+def _counts(
+    arrays: Iterator[Values], lock: Lock, scale: float, low: float, factor: float
+) -> npt.NDArray[np.int64]:
+    """The histogram of the arrays that no other thread takes; see `histogram`."""
+    counts = np.zeros(BINS, np.int64)
+    while True:
+        with lock:
+            values = next(arrays, None)
+        if values is None:
+            return counts
+        histogram(values, counts, scale=scale, low=low, factor=factor)
 
 
 def bulk_of_ranks(

@@ -547,10 +547,7 @@ def measure_quality(
     begun = time.perf_counter()
     steps, *frame = shape
     threads, waiting, with_ssim = usable_threads(), deque[Future[Comparison]](), set(measured)
-    if neighbours is None:
-        blocks = [block for _, block in step_blocks(range(steps), frame)]
-    else:
-        blocks = [range(step, step + 1) for step in range(steps)]
+    blocks = [block for _, block in step_blocks(range(steps), frame)]
     at_once = max(1, min(FRAMES_HELD, len(blocks), VERTICES_HELD // max(prod(frame), 1)))
 
     def collect() -> None:
@@ -570,17 +567,19 @@ def measure_quality(
             reading = time.perf_counter()
             original, decoded = original_frames(block), decode(block)
             comparer.seconds += time.perf_counter() - reading
-            waiting.append(
-                workers.submit(
-                    comparer.compare,
-                    block,
-                    original,
-                    decoded,
-                    None if neighbours is None else neighbours(block.start),
-                    measured=with_ssim,
-                    threads=-(-threads // at_once),
+            for part in [block] if neighbours is None else [range(n, n + 1) for n in block]:
+                inside = slice(part.start - block.start, part.stop - block.start)
+                waiting.append(
+                    workers.submit(
+                        comparer.compare,
+                        part,
+                        original[inside],
+                        decoded[inside],
+                        None if neighbours is None else neighbours(part.start),
+                        measured=with_ssim,
+                        threads=-(-threads // at_once),
+                    )
                 )
-            )
             del original, decoded
         while waiting:
             collect()

@@ -48,8 +48,6 @@ PROTOTYPES: Prototypes = {
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
     # gram.cpp
     **{f"fhash_gram_{kind}": (*(ARRAY, INTEGER, INTEGER, INTEGER), REAL, ARRAY) for kind in _KINDS},
-    # price.cpp
-    "fhash_price": (*(ARRAY,) * 3, INTEGER, REAL, ARRAY),
     # head_inputs.cpp
     "fhash_head_inputs": (
         *(*(ARRAY,) * 4, INTEGER, ARRAY, ARRAY, INTEGER),

@@ -17,7 +17,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.devices import enough_memory, same_bits, training_device
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.network import Architecture
-from fhash_codec.progress import Progress, silent, stage
+from fhash_codec.progress import Progress, silent, stage, tell
 from fhash_formats.errors import (
     FhashWarning,
     InputError,
@@ -369,16 +369,20 @@ class _Fitting:
 
     def _choose_device(self) -> torch.device:
         """Return the device, by the plan without further rounds: the same at each continuation."""
+        from fhash_codec.paper.engines.native import cpu_seconds
         from fhash_codec.paper.engines.slab import needed_bytes
         from fhash_codec.paper.train import usual_batches, usual_epochs
 
         samples, bricks = len(self._coreset.values), len(self._coreset.bricks)
         batches = usual_batches(samples, bricks, self._config.batch)
-        return training_device(
+        epochs = self._config.epochs or usual_epochs(batches)
+        device, why = training_device(
             self._config.device,
-            samples * (self._config.epochs or usual_epochs(batches)),
+            cpu_seconds(self._architecture, samples * epochs),
             needed_bytes(self._architecture, self._coreset, batches),
         )
+        tell("engine", f"tables and network at their random start, {why}")
+        return device
 
     def _engine(self, plan: TrainingPlan) -> Engine:
         """Return a new engine, in the state of the checkpoint if there is one."""

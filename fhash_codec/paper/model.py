@@ -177,18 +177,15 @@ class PointTables:
         patches: list[Patch] = []
         for level, resolution in enumerate(network.levels):
             part = _region_between(sizes, resolution, low, high)[1:]
-            at = key_index * (resolution[0] - 1) / max(sizes[0] - 1, 1)
-            # On a time node this one is enough.
-            node = min(int(at), resolution[0] - 1)
-            nodes = range(node, node + 1 if at == node else node + 2)
+            nodes, _ = time_nodes(network.key_frames, resolution[0], key_index)
             numbers = network.embedding_size * math.prod(axis.stop - axis.start for axis in part)
             frames = [network.sparse_frame(level, n) for n in nodes] if numbers > small else [None]
             held = [frame for frame in frames if frame is not None]
             if held:
-                patches.append(SparsePatch.of_frames(held, node))
+                patches.append(SparsePatch.of_frames(held, nodes.start))
                 continue
             values = network.read(level, (slice(nodes.start, nodes.stop), *part))
-            patches.append(Patch.of(values, (node, *(axis.start for axis in part))))
+            patches.append(Patch.of(values, (nodes.start, *(axis.start for axis in part))))
         return cls(network, sizes, network.levels, tuple(patches))
 
     @property
@@ -235,6 +232,16 @@ class PointTables:
             levels=tuple((1, *level[1:]) for level in self.levels),
             patches=tuple(patches),
         )
+
+
+def time_nodes(key_frames: int, resolution: int, key_index: float) -> tuple[range, float]:
+    """Return the time nodes of a level around a time, and the share of the second, in [0, 1).
+
+    On a time node this one is enough.
+    """
+    at = key_index * (resolution - 1) / max(key_frames - 1, 1)
+    node = min(int(at), resolution - 1)
+    return range(node, node + 1 if at == node else node + 2), at - node
 
 
 def corners_before(

@@ -388,6 +388,7 @@ class Series(ABC):
             unpacked; they are hardly ever data.
         remark: what is to be said of the times, "" for nothing.
         not_stored: what of the values nobody wrote; None where nothing is known of such.
+        held: all frames (t, z, y, x) as `read` gives them; None where they are not in memory.
         defaults: default fill values of the format that were met in the frames read so far, of an
             array that declares no other. Among floats they are missing.
     """
@@ -407,6 +408,7 @@ class Series(ABC):
     unlikely: frozenset[float] = frozenset()
     remark: str = ""
     not_stored: NotStored | None = None
+    held: npt.NDArray[Any] | None = None
     defaults: AbstractSet[float] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 
@@ -448,6 +450,17 @@ class Series(ABC):
         frames = [self.read(step) for step in steps]
         return frames[0][None] if len(frames) == 1 else np.stack(frames)
 
+    def block(self, steps: range) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of neighbouring steps, which are read unless they are held."""
+        if self.held is None:
+            return self.read_steps(steps)
+        return np.ascontiguousarray(self.held[steps.start : steps.stop])
+
+    def frame(self, step: int) -> npt.NDArray[Any]:
+        """The frame (z, y, x) of a step, which is read unless it is held."""
+        frame: npt.NDArray[Any] = self.block(range(step, step + 1))[0]
+        return frame
+
     def require_step(self, step: int) -> None:
         """Raise RegionError for a step outside the series; negative steps are outside, too."""
         if not 0 <= step < self.shape[0]:
@@ -473,13 +486,13 @@ class Series(ABC):
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
-        for step in range(self.shape[0]):
-            yield self.read(step)
+        for _, frames in self.blocks(range(self.shape[0])):
+            yield from frames
 
     def blocks(self, steps: range) -> Iterator[tuple[range, npt.NDArray[Any]]]:
         """Yield some neighbouring steps with their frames (t, z, y, x), cut by `step_blocks`."""
         for _, block in step_blocks(steps, self.shape[1:]):
-            yield block, self.read_steps(block)
+            yield block, self.block(block)
 
     def __enter__(self) -> Self:
         return self
@@ -612,6 +625,7 @@ class ArraySeries(Series):
         self.shape = check_values(self.source, values.shape, values.dtype)
         self.dtype = values.dtype.newbyteorder("=")
         self.values = values
+        self.held = values if values.dtype == self.dtype else None
         self.coords = {
             axis: index_coordinate(axis, n) for axis, n in zip(AXES, self.shape, strict=True)
         } | dict(coords or {})

@@ -29,8 +29,11 @@ from fhash_codec.devices import (
     need_torch,
     same_bits,
     threads_for,
+    torch_threads,
     training_device,
 )
+from fhash_codec.paper.engines.native import cpu_seconds
+from fhash_codec.paper.network import Architecture
 from fhash_codec.progress import OTHER, Parts, attribute, recording, skip, stage
 from fhash_codec.records import Record, limits
 from fhash_codec.rendering.scenes import Scene
@@ -141,14 +144,29 @@ def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_training_takes_the_device_where_that_pays_and_fits() -> None:
     with pretended_cuda() as pretended:
         pretended.free = 2**30
-        assert training_device("cpu", CUDA_PAYS, 0).type == "cpu"
-        assert training_device("auto", CUDA_PAYS - 1, 0).type == "cpu"
-        assert training_device("auto", CUDA_PAYS, 2**30).type == "cuda"
-        assert training_device("cuda", 1, 2**30).type == "cuda"
+        for name, seconds, needed, found in (
+            ("cpu", 1e9, 0, "on the CPU, as --device says"),
+            ("auto", CUDA_PAYS - 0.1, 0, "on the CPU, as the CPU takes about 3.9 s, and CUDA pays"),
+            ("auto", CUDA_PAYS, 2**30, "on CUDA, as the CPU takes about 4.0 s, and CUDA pays"),
+            ("cuda", 0.1, 2**30, "on CUDA, as --device says"),
+        ):
+            device, why = training_device(name, seconds, needed)
+            assert why.startswith(found)
+            assert (device.type == "cuda") == ("on CUDA" in found)
         with pytest.raises(InputError, match=r"3\.0 GiB .* 1\.0 GiB are free; use --device cpu"):
             training_device("cuda", 1, 3 * 2**30)
         with pytest.warns(FhashWarning, match="takes the CPU"):
-            assert training_device("auto", CUDA_PAYS, 3 * 2**30).type == "cpu"
+            assert training_device("auto", CUDA_PAYS, 3 * 2**30)[0].type == "cpu"
+    assert training_device("auto", CUDA_PAYS, 0)[1] == "on the CPU, as torch finds no CUDA device"
+
+
+def test_more_threads_and_smaller_models_take_fewer_seconds() -> None:
+    taken = []
+    for width, threads in ((64, 1), (64, 2), (16, 2)):
+        with torch_threads(threads):
+            taken.append(cpu_seconds(Architecture.for_box((9, 9, 9), 2, width=width), 10**7))
+    assert taken[0] == 2 * taken[1]
+    assert 0.1 < taken[2] < taken[1] / 4
 
 
 def test_memory_that_runs_out_is_one_line_with_advice() -> None:

@@ -353,7 +353,7 @@ def test_a_container_opens_as_its_source_does(made, coords: bool | str) -> None:
         error = np.abs(wanted[name].values - found[name].values)
         assert np.nanmax(error) <= stored[name].attrs["fhash_max_error"] * (1 + 1e-6)
         np.testing.assert_array_equal(np.isnan(wanted[name]), np.isnan(found[name]))
-        assert stored[name].attrs["fhash_psnr"] >= 45
+        assert stored[name].attrs.get("fhash_psnr", np.inf) >= 45  # none where it is exact
         same = found.assign({name: found[name].copy(data=wanted[name].values)})
         xr.testing.assert_identical(without_own(wanted), without_own(same))
         for each in wanted.variables:

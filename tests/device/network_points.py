@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 
 def measured_points(
     device: str, shape: tuple[int, ...], side: int, seconds: float
-) -> list[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """Measure places in networks, in the order of rays and at random.
 
     Fused kernels, which CUDA must have, are compared with the host: all values and most slopes,
@@ -29,7 +29,7 @@ def measured_points(
     from fhash_codec.rendering.stream_fields import HostInference
     from fhash_codec.rendering.torch_arrays import TorchArrays
 
-    there, results = torch.device(device), []
+    there = torch.device(device)
     wait = torch.cuda.synchronize if device == "cuda" else (lambda: None)
     # Off the borders of cells, where slopes jump and rounding chooses the side.
     z, y, x = (np.linspace(0.0137, size - 1.0291, side) for size in shape[1:])
@@ -67,14 +67,12 @@ def measured_points(
                     apart = np.abs(given["fused"] - given["host"]) / np.abs(given["host"]).max()
                     result[f"{kind}_median"] = float(np.median(apart))
                     result[f"{kind}_beyond_1e-4"] = float((apart > 1e-4).mean())
-            results.append(result)
-    if wrong := [
-        r
-        for r in results
-        if r.get("values_beyond_1e-4", 0.0) > 0 or r.get("slopes_beyond_1e-4", 0.0) > 0.01
-    ]:
-        raise AssertionError(f"fused kernels differ from the host: {wrong}")
-    return results
+            if (
+                result.get("values_beyond_1e-4", 0.0) > 0
+                or result.get("slopes_beyond_1e-4", 0) > 0.01
+            ):
+                result["failed"] = "fused kernels differ from the host"
+            yield result
 
 
 def random_network(shape: tuple[int, ...], layers: int, sparse: bool) -> Any:

@@ -1,14 +1,18 @@
-"""Figures that only a machine with a GPU can give: `python tests/device/run.py FOLDER`.
+"""Figures that only a machine with a GPU can give: `make device`, or run.py FOLDER (docs/gpu.md).
 
-It takes at most 8 minutes and needs no network. Each part writes FOLDER/figures.json anew, with the
-parts before it, so that a run that is cut off leaves what it has. A part that fails is recorded
-with its error, and makes the exit code 1. Pictures and selftest need zarr and its requirements and
-are left out, with the reason, where they are missing; wheels in a folder on PYTHONPATH will do.
+It takes at most 7 minutes and needs no network; selftest needs zarr, for which wheels in a folder
+on PYTHONPATH will do. Each part is a process of its own with a limit in seconds, so that one that
+hangs or breaks the device leaves time to the others, and keeps what it has. FOLDER/figures.json is
+written anew after each part. Whatever fails or is left out makes the exit code 1.
 
-Parts: oracle (gradients and values of fused and slab against the naive engine in float64), speed
-(steps one after another, without waiting for each), points (places in a network by fused kernels
-and on the host: how far apart, and how many a second), bench (`fhash bench train`), curve (PSNR
-against seconds of training), pictures (adaptive ray marching through the network), selftest.
+Parts, the most important first:
+- machine: device, software, peaks, seconds to start CUDA
+- oracle: gradients, values and bits of fused and slab, against the naive engine in float64
+- speed: training and evaluation by model and batch, steps one after another, and memory
+- curve: PSNR against seconds of training
+- card: the commands encode, diff and render (pictures and a film), on the device
+- points: places in a network by fused kernels and on the host
+- selftest: `fhash selftest`, whose trainings choose the device
 
 `--device cpu --quick` tries the script itself without a GPU; its figures mean nothing.
 """
@@ -18,15 +22,19 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,66 +43,148 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / name) for name in ("", "formats", "cli", "benchmarks", "tests/device")]
 sys.path.append(str(ROOT / "tests" / "codec"))  # the readable paper
-NEEDED = ("zarr", "numcodecs")
-"""Packages without which no file can be written."""
 FHASH = "import sys; from fhash_cli.main import main; sys.argv[0] = 'fhash'; sys.exit(main())"
 """Program of the command line, which need not be installed."""
-TOTAL_SECONDS = 460.0
-"""Seconds after which no further part begins."""
+TOTAL_SECONDS = 410.0
+"""Seconds of all parts."""
+MODELS = ((64, 1), (64, 2), (16, 1), (128, 2))
+"""Width and hidden layers of the measured models."""
+
+Result = dict[str, Any]
+"""A result of a part; the key `failed` says what is wrong with it."""
 
 
-class Sizes:
-    """Sizes of a run."""
+class Run:
+    """The settings of a run, and the folders that it writes to."""
 
-    def __init__(self, quick: bool) -> None:
+    def __init__(self, options: argparse.Namespace, work: Path) -> None:
+        quick = options.quick
+        self.device, self.folder, self.work = options.device, options.folder, work
+        self.on_cuda = self.device == "cuda"
+        self.engines = ("slab", "fused", "native") if self.on_cuda else ("slab", "native")
         self.shape = (2, 12, 16, 20) if quick else (8, 96, 128, 128)
-        self.batches = (1 << 12,) if quick else (1 << 16, 1 << 18, 1 << 20)
-        self.seconds = 0.2 if quick else 4.0
+        self.batches = (1 << 12,) if quick else (1 << 16, 1 << 14, 1 << 18, 1 << 20)
+        self.seconds = 0.05 if quick else 0.5
         self.curve_seconds = 0.5 if quick else 15.0
         self.pixels = 32 if quick else 1024
         self.epochs = 1 if quick else 20
         self.side = 16 if quick else 160
+        self.cases = ["--case", "layers"] if quick else []
+
+    @property
+    def data(self) -> Path:
+        """A made series, which takes seconds to simulate and is kept for all parts."""
+        from fhash_codec.simulation.simulate import simulate
+
+        path = self.work / "front.npy"
+        if not path.exists():
+            series = simulate("front", self.shape)
+            np.save(path, np.stack([series.read(step) for step in range(self.shape[0])]))
+        return path
+
+    def device_of(self, engine: str) -> Any:
+        """Return the torch device of an engine: the native one computes on the CPU."""
+        import torch
+
+        return torch.device("cpu" if engine == "native" else self.device)
+
+    def wait(self) -> None:
+        """Wait until the device has done its work."""
+        import torch
+
+        if self.on_cuda:
+            torch.cuda.synchronize()
 
 
 def main() -> int:
-    """Run the parts; return the exit code."""
+    """Run the parts, or one of them in this process; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     parser.add_argument("--quick", action="store_true", help="tiny sizes: tries the script")
-    parser.add_argument("--parts", help="only these, separated by commas")
+    parser.add_argument("--parts", default=",".join(PARTS), help="only these, with commas between")
+    parser.add_argument("--work", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.work:
+        return run_part(options.parts, Run(options, options.work))
     options.folder.mkdir(parents=True, exist_ok=True)
+    begun, failed, figures = time.monotonic(), False, {}
+    with tempfile.TemporaryDirectory() as work:
+        for name in options.parts.split(","):
+            part_begun = time.monotonic()
+            limit = min(PARTS[name][1], TOTAL_SECONDS - (part_begun - begun))
+            results = results_of(name, limit, Path(work))
+            failed |= any("failed" in result for result in results)
+            seconds = round(time.monotonic() - part_begun, 1)
+            figures[name] = {"seconds": seconds, "figures": results}
+            (options.folder / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
+    # Whoever reads the end of a long log sees what counts most.
+    for name, part in reversed(figures.items()):
+        print(f"== {name}, {part['seconds']} s")
+        for result in part["figures"]:
+            print(json.dumps(rounded(result)))
+    print("FAILED" if failed else "all parts did well")
+    return int(failed)
+
+
+def results_of(name: str, limit: float, work: Path) -> list[Result]:
+    """Run a part in a process group of its own; return what it has written until its end."""
+    if limit <= 0:
+        return [{"failed": f"left out: {TOTAL_SECONDS:.0f} seconds are over"}]
+    words = [*sys.argv[1:], "--parts", name, "--work", str(work)]
+    child = subprocess.Popen([sys.executable, __file__, *words], process_group=0)
+    wrong = ""
+    try:
+        if code := child.wait(limit):
+            wrong = f"exit code {code}"
+    except subprocess.TimeoutExpired:
+        wrong = f"stopped after {limit:.0f} seconds"
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+    lines = work / f"{name}.jsonl"
+    results = (
+        [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    )
+    if wrong and not any("failed" in result for result in results):
+        results.append({"failed": wrong})
+    return results
+
+
+def run_part(name: str, run: Run) -> int:
+    """Write the results of a part, each at once; return the exit code."""
     try:
         version("fhash")
     except PackageNotFoundError:
-        sys.path.append(str(described(options.folder / "site")))
-    parts: dict[str, Callable[..., Any]] = {
-        "oracle": oracle,
-        "speed": speed,
-        "points": points,
-        "bench": bench,
-        "curve": curve,
-        "pictures": pictures,
-        "selftest": selftest,
-    }
-    chosen = options.parts.split(",") if options.parts else list(parts)
-    begun, failed = time.monotonic(), False
-    figures: dict[str, Any] = {"machine": machine(options.device)}
-    for name in chosen:
-        part_begun = time.monotonic()
-        left = TOTAL_SECONDS - (part_begun - begun)
+        sys.path.append(str(described(run.work / "site")))
+    failed = False
+    with (run.work / f"{name}.jsonl").open("w") as lines:
+
+        def write(result: Result) -> None:
+            print(name, json.dumps(rounded(result)), flush=True)
+            print(json.dumps(result), file=lines, flush=True)
+
         try:
-            if left < 0:
-                raise TimeoutError(f"not begun: {TOTAL_SECONDS:.0f} seconds are over")
-            result = parts[name](options.device, Sizes(options.quick), options.folder, left)
+            for result in PARTS[name][0](run):
+                failed |= "failed" in result
+                write(result)
         except Exception as error:
             traceback.print_exc()
-            result, failed = {"error": f"{type(error).__name__}: {error}"}, True
-        figures[name] = {"figures": result, "seconds": time.monotonic() - part_begun}
-        print(name, json.dumps(figures[name]), flush=True)
-        (options.folder / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")
+            write({"failed": short(error)})
+            return 1
     return int(failed)
+
+
+def short(error: Exception) -> str:
+    """Return an error in one line."""
+    return f"{type(error).__name__}: {error}"[-800:]
+
+
+def rounded(value: Any) -> Any:
+    """Return a result with three digits of each number, and without long lists."""
+    if isinstance(value, dict):
+        return {name: rounded(inner) for name, inner in value.items() if name != "history"}
+    return float(f"{value:.3g}") if isinstance(value, float) else value
 
 
 def described(folder: Path) -> Path:
@@ -116,271 +206,325 @@ def described(folder: Path) -> Path:
     return folder
 
 
-def machine(device: str) -> dict[str, Any]:
-    """Describe the device and the software."""
+def machine(run: Run) -> Iterator[Result]:
+    """Describe the device and the software; measure the start of CUDA and its peaks."""
+    begun = time.perf_counter()
     import torch
 
+    imported = time.perf_counter()
+    torch.zeros(1, device=run.device).cpu()
+    started = time.perf_counter()
     found = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "python": sys.version.split()[0],
         "torch": torch.__version__,
-        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name() if run.on_cuda else "cpu",
+        "import_torch_s": imported - begun,
+        "start_device_s": started - imported,
     }
-    if device == "cuda":
-        from fhash_codec.paper.engines.fused.program import Unavailable, find_nvrtc
+    if run.on_cuda:
+        from fhash_codec.paper.engines.fused.program import find_nvrtc
 
-        try:
-            nvrtc = find_nvrtc()
-            compiler = f"{nvrtc.path} {nvrtc.version}"
-        except Unavailable as error:
-            compiler = str(error)
-        found |= {"nvrtc": compiler, "cuda": str(torch.version.cuda)}
-    return found
+        nvrtc = find_nvrtc()
+        found |= {"nvrtc": f"{nvrtc.path} {nvrtc.version}", "cuda": str(torch.version.cuda)}
+    yield found
+    from fhash_bench.engines import Peaks
+
+    for kind in dict.fromkeys(("cpu", run.device)):
+        peaks = Peaks(torch.device(kind))
+        peaks.measure()
+        yield {
+            f"{kind} {peak['what']} {peak['path'] or peak['precision']}": peak["gflops"]
+            or peak["gb_s"]
+            for peak in peaks.to_json()
+        }
 
 
-def engine_names(device: str) -> tuple[str, ...]:
-    """Return the engines that are measured."""
-    return ("fused", "slab") if device == "cuda" else ("slab",)
-
-
-def gather(series: Any, feature: str = "all", **model: int) -> tuple[Any, Any]:
-    """Return coreset and architecture of all key frames of a series."""
+def coreset_of(series: Any, feature: str, dilation: int = 1) -> Any:
+    """Return the coreset of all steps of a series."""
     from fhash_codec.config import EncodeConfig
     from fhash_codec.paper.encode import select
     from fhash_codec.progress import silent
 
-    config = EncodeConfig(profile="paper", features=(feature,), **model)
-    selected = select(series, config, silent)
-    return selected.coreset, selected.architecture
+    config = EncodeConfig(profile="paper", features=(feature,), dilation=dilation)
+    return select(series, config, silent).coreset
 
 
-def oracle(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str, Any]]:
+@cache
+def made_coreset(data: Path, feature: str) -> Any:
+    """Return the coreset of all steps of the made series."""
+    from fhash_formats.series import ArraySeries
+
+    return coreset_of(ArraySeries(np.load(data)), feature)
+
+
+def architecture_of(coreset: Any, width: int, layers: int) -> Any:
+    """Return a model of a coreset with the usual levels."""
+    from fhash_codec.paper.network import Architecture
+
+    shape, steps = coreset.box.shape, len(coreset.key_frames)
+    return Architecture.for_box(shape, steps, hidden_layers=layers, width=width)
+
+
+def oracle(run: Run) -> Iterator[Result]:
     """Compare a step and the values of each engine with the naive engine in float64, on the CPU.
 
-    The mean of the gradients after the first step is a tenth of the gradient.
+    The mean of the gradients after the first step is a tenth of the gradient. Two trainings that
+    are to have the same bits are compared, too.
     """
     import torch
     from readable_paper import NaiveEngine
 
+    from fhash_codec.devices import same_bits
     from fhash_codec.paper.engines import make_engine
     from fhash_formats.series import ArraySeries
 
     noise = ArraySeries(np.random.default_rng(3).random((3, 9, 20, 35), dtype=np.float32))
-    results = []
-    for width, layers in ((64, 1), (64, 2), (128, 2), (16, 1), (64, 0)):
-        coreset, architecture = gather(
-            noise, "interval:0.3:1", width=width, hidden_layers=layers, dilation=0
-        )
-        every, rates = np.arange(len(coreset.bricks)), np.full(9, 0.01)
-        naive = NaiveEngine(architecture, coreset, rates, seed=1)
+    coreset = coreset_of(noise, "interval:0.3:1", dilation=0)
+    every, rates = np.arange(len(coreset.bricks)), np.full(9, 0.01)
+    for width, layers in (*MODELS, (64, 0)):
+        model = architecture_of(coreset, width, layers)
+        naive = NaiveEngine(model, coreset, rates, seed=1)
         naive.train(every)
         layer_gradients = [
             torch.column_stack([weight.grad, bias.grad]).flatten()
             for weight, bias in zip(naive.model.weights, naive.model.biases, strict=True)
         ]
         tables = torch.cat([table.grad.flatten() for table in list(naive.model.tables)[1:]])
-        for name in engine_names(device):
-            engine: Any = make_engine(
-                name, architecture, coreset, rates, seed=1, device=torch.device(device)
+        for name in run.engines[:-1]:
+            make = partial(
+                make_engine, name, model, coreset, rates, seed=1, device=run.device_of(name)
             )
-            engine.train(every)
-            used = engine.upsampling.used.cpu()
-            expected = torch.cat([tables[used], *layer_gradients]).numpy()
-            apart = np.abs(10 * engine.flat_mean.cpu().numpy() - expected) / np.abs(expected).max()
-            values = np.abs(engine.infer(every).cpu().numpy() - naive.infer(every).numpy())
-            results.append(
-                {
-                    "engine": name,
-                    "model": f"{width}x{layers}",
+            result: Result = {"engine": name, "model": f"{width}x{layers}"}
+            try:
+                engine: Any = make()
+                engine.train(every)
+                used = engine.upsampling.used.cpu()
+                expected = torch.cat([tables[used], *layer_gradients]).numpy()
+                apart = np.abs(10 * engine.flat_mean.cpu().numpy() - expected)
+                apart /= np.abs(expected).max()
+                values = np.abs(engine.infer(every).cpu().numpy() - naive.infer(every).numpy())
+                trained = []
+                for _ in range(2):
+                    with same_bits(torch.device(run.device), True):
+                        engine = make()
+                        for _ in range(4):
+                            engine.train(every)
+                        trained.append(engine.flat.cpu().numpy())
+                result |= {
                     "gradient_median": float(np.median(apart)),
                     "gradient_beyond_1e-5": float((apart > 1e-5).mean()),
                     "value_median": float(np.median(values)),
                     "value_beyond_1e-3": float((values > 1e-3).mean()),
+                    "same_bits": bool(np.array_equal(*trained)),
                 }
-            )
-    wrong = [r for r in results if r["gradient_median"] > 1e-7 or r["gradient_beyond_1e-5"] > 1e-3]
-    if wrong:
-        raise AssertionError(f"gradients differ from the oracle's: {wrong}")
-    return results
+                if result["gradient_median"] > 1e-7 or result["gradient_beyond_1e-5"] > 1e-3:
+                    result["failed"] = "gradients differ from the oracle's"
+                elif not result["same_bits"]:
+                    result["failed"] = "two trainings differ"
+            except Exception as error:
+                traceback.print_exc()
+                result["failed"] = short(error)
+            yield result
 
 
-def speed(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str, Any]]:
-    """Measure training and evaluation, steps one after another, without waiting for each."""
+def speed(run: Run) -> Iterator[Result]:
+    """Measure training and evaluation by model and batch, and what an engine takes of the device.
+
+    An engine that hangs leaves the figures of those before it.
+    """
+    for name in run.engines:
+        for width, layers in MODELS:
+            yield measured(run, name, "all", width, layers)
+        yield measured(run, name, "interval:0.25:2", 64, 1)
+
+
+def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Result:
+    """Return rates of an engine, 10^6 samples a second by the samples of a batch."""
     import torch
 
+    from fhash_codec.devices import threads_for
     from fhash_codec.paper.engines import make_engine
+    from fhash_codec.paper.engines.slab import needed_bytes
     from fhash_codec.paper.train import plan_training
-    from fhash_codec.simulation.simulate import simulate
 
-    series, results = simulate("front", sizes.shape), []
-    wait = torch.cuda.synchronize if device == "cuda" else (lambda: None)
+    coreset = made_coreset(run.data, feature)
+    architecture, counts = architecture_of(coreset, width, layers), np.diff(coreset.offsets)
+    result: Result = {"engine": name, "model": f"{width}x{layers}", "of": feature}
+    result |= {"train": {}, "infer": {}}
 
-    def measured(do: Callable[[Any], Any], batches: list[Any], counts: Any) -> float:
-        for chosen in batches[:4]:
-            do(chosen)
-        wait()
-        begun, samples = time.perf_counter(), 0
-        while time.perf_counter() - begun < sizes.seconds / 4:
-            for chosen in batches[:64]:
-                do(chosen)
-                samples += int(counts[chosen].sum())
-            wait()
-        return samples / (time.perf_counter() - begun) / 1e6
+    def rate(do: Callable[[Any], Any], batches: list[Any], seconds: float) -> float:
+        """Return the rate after a time without measurement, in which graphs are captured."""
+        samples, begun, done = 0, 0.0, 0
+        for limit in (seconds / 2, seconds):
+            samples, begun = 0, time.perf_counter()
+            while time.perf_counter() - begun < limit:
+                for _ in range(16):
+                    chosen, count = batches[done % len(batches)]
+                    do(chosen)
+                    samples, done = samples + count, done + 1
+                run.wait()
+        return float(f"{samples / (time.perf_counter() - begun) / 1e6:.4g}")
 
-    for layers in (1, 2):
-        coreset, architecture = gather(series, hidden_layers=layers, width=64)
-        counts = np.diff(coreset.offsets)
-        for batch in sizes.batches:
+    try:
+        begun = time.perf_counter()
+        rates, device = np.full(1 << 18, 0.001), run.device_of(name)
+        engine = make_engine(name, architecture, coreset, rates, seed=0, device=device)
+        run.wait()
+        result["start_s"] = time.perf_counter() - begun
+        for batch in run.batches:
             plan = plan_training(
-                coreset, epochs=1, learning_rate=0.01, schedule="constant", batch=batch, seed=0
+                coreset, epochs=1, learning_rate=0.001, schedule="constant", batch=batch, seed=0
             )
-            for name in engine_names(device):
-                engine = make_engine(
-                    name,
-                    architecture,
-                    coreset,
-                    np.full(1 << 20, 0.001),
-                    seed=0,
-                    device=torch.device(device),
-                )
-                batches = plan.order(0)
-                train = measured(engine.train, batches, counts)
+            # Several epochs: in training, too, few batches are of the same shape as others.
+            batches = [
+                (chosen, int(counts[chosen].sum()))
+                for epoch in range(8)
+                for chosen in plan.order(epoch)
+            ]
+            with threads_for(plan.batch_samples):
+                trained = rate(engine.train, batches, run.seconds)
                 engine.settle()
-                results.append(
-                    {
-                        "engine": name,
-                        "model": f"64x{layers}",
-                        "batch": plan.batch_samples,
-                        "train_msamples_s": train,
-                        "infer_msamples_s": measured(engine.infer, batches, counts),
-                    }
+                result["train"][plan.batch_samples] = trained
+                result["infer"][plan.batch_samples] = rate(engine.infer, batches, run.seconds / 2)
+            if device.type == "cuda" and "device_mb" not in result:
+                result["device_mb"] = torch.cuda.max_memory_allocated() / 1e6
+                expected = needed_bytes(architecture, coreset, plan.batches)
+                result["expected_mb"] = expected / 1e6
+    except Exception as error:
+        traceback.print_exc()
+        result["failed"] = short(error)
+    if run.on_cuda:
+        torch.cuda.reset_peak_memory_stats()
+    return result
+
+
+def curve(run: Run) -> Iterator[Result]:
+    """Train for some seconds with each engine; the history has PSNR against seconds."""
+    from fhash_codec.devices import threads_for
+    from fhash_codec.paper.engines import make_engine
+    from fhash_codec.paper.train import Breaks, TrainingProgress, plan_training, train
+
+    coreset = made_coreset(run.data, "all")
+    plan = plan_training(
+        coreset, epochs=run.epochs, learning_rate=0.01, schedule="cosine", batch=0, seed=0
+    )
+    for name, (width, layers) in product(run.engines, MODELS[:2]):
+        result: Result = {"engine": name, "model": f"{width}x{layers}"}
+        try:
+            begun, model = time.perf_counter(), architecture_of(coreset, width, layers)
+            engine = make_engine(
+                name, model, coreset, plan.rates, seed=0, device=run.device_of(name)
+            )
+            ready, reached = time.perf_counter() - begun, TrainingProgress()
+            with threads_for(plan.batch_samples):
+                train(engine, plan, coreset, reached, Breaks(budget_seconds=run.curve_seconds))
+            history = reached.history
+            result |= {"start_s": ready, "seconds": reached.seconds, "epochs": reached.epoch}
+            for level in (30, 40, 50):
+                result[f"to_{level}_db"] = next(
+                    (p["seconds"] for p in history if (p["psnr"] or 200) >= level), None
                 )
-    return results
+            result |= {"psnr": history[-1]["psnr"], "history": history}
+        except Exception as error:
+            traceback.print_exc()
+            result["failed"] = short(error)
+        yield result
 
 
-def points(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str, Any]]:
+def card(run: Run) -> Iterator[Result]:
+    """Encode the made series, decode it, and draw it, as a user does."""
+    from PIL import Image
+
+    path, data = run.work / "front.fhz", run.data
+    for engine, expected in (("slab", "slab"), ("auto", run.engines[1])):
+        words = ["encode", str(data), "-o", str(path), "--force", "--profile", "paper", "--explain"]
+        words += ["--device", run.device, "--engine", engine, "--epochs", str(run.epochs)]
+        encoded = fhash(words)
+        trained = fhash(["info", str(path)])["training"]
+        result = {
+            "command": "encode",
+            **{name: trained[name] for name in ("engine", "device")},
+            **{name: encoded[name] for name in ("call_s", "seconds", "psnr", "bytes")},
+            "stages": {each["stage"]: each["seconds"] for each in encoded["stages"]},
+        }
+        if (trained["device"], trained["engine"]) != (run.device, expected):
+            result["failed"] = f"{expected} on {run.device} is expected"
+        yield result
+    compared = fhash(["diff", str(data), str(path)])
+    result = {"command": "diff", **{name: compared[name] for name in ("call_s", "seconds", "psnr")}}
+    if not abs(compared["psnr"] - encoded["psnr"]) < 0.01:
+        result["failed"] = "another PSNR than that of encode"
+    yield result
+    size = f"{run.pixels}x{run.pixels}"
+    drawn = {}
+    for march, device in (("arm", run.device), ("stream", run.device), ("arm", "cpu")):
+        picture = run.folder / f"{march}-{device}.png"
+        words = ["render", str(path), "-o", str(picture), "--force", "--size", size, "--explain"]
+        found = fhash([*words, "--march", march, "--device", device])
+        result = {"command": march, "device": device}
+        result |= {name: found[name] for name in ("call_s", "seconds", "counters")}
+        drawn[march] = np.asarray(Image.open(picture).convert("RGB"), np.float64) / 255
+        result["mean"] = float(drawn[march].mean())
+        first = drawn.setdefault("first", drawn[march])
+        result["rms_from_first"] = float(np.sqrt(np.square(drawn[march] - first).mean()))
+        if (march, device) == ("arm", "cpu") and result["rms_from_first"] > 0.002:
+            result["failed"] = "another picture than on the device"
+        yield result
+    film, size = run.folder / "film.gif", f"{run.pixels // 2}x{run.pixels // 2}"
+    words = ["render", str(path), "-o", str(film), "--force", "--size", size, "--march", "arm"]
+    found = fhash([*words, "--device", run.device, "--animate", "time", "--frames", "24"])
+    yield {"command": "film", **{name: found[name] for name in ("call_s", "seconds")}}
+
+
+def points(run: Run) -> Iterator[Result]:
     """Measure places in networks, in the order of rays and at random; compare the kernels."""
     from network_points import measured_points
 
-    return measured_points(device, sizes.shape, sizes.side, sizes.seconds / 8)
+    yield from measured_points(run.device, run.shape, run.side, run.seconds / 2)
 
 
-def bench(device: str, sizes: Sizes, folder: Path, left: float) -> Any:
-    """Return what `fhash bench train` prints as JSON."""
-    words = ["bench", "train", "--device", device, "--json", "-q"]
-    words += ["--seconds", "0.2" if sizes.pixels < 100 else "6"]
-    words += ["--engines", ",".join(engine_names(device))]
-    return json.loads(fhash(words, left))
-
-
-def curve(device: str, sizes: Sizes, folder: Path, left: float) -> list[dict[str, Any]]:
-    """Train for some seconds with each engine; the history has PSNR against seconds."""
-    import torch
-
-    from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.train import Breaks, TrainingProgress, plan_training, train
-    from fhash_codec.simulation.simulate import simulate
-
-    series, results = simulate("front", sizes.shape), []
-    for layers in (1, 2):
-        coreset, architecture = gather(series, hidden_layers=layers, width=64)
-        plan = plan_training(
-            coreset, epochs=sizes.epochs, learning_rate=0.01, schedule="cosine", batch=0, seed=0
-        )
-        for name in engine_names(device):
-            begun = time.perf_counter()
-            engine = make_engine(
-                name, architecture, coreset, plan.rates, seed=0, device=torch.device(device)
-            )
-            ready, reached = time.perf_counter() - begun, TrainingProgress()
-            train(engine, plan, coreset, reached, Breaks(budget_seconds=sizes.curve_seconds))
-            results.append(
-                {
-                    "engine": name,
-                    "model": f"64x{layers}",
-                    "samples": len(coreset.values),
-                    "seconds_to_start": ready,
-                    "history": reached.history,
-                    "seconds_to": {
-                        level: next(
-                            (p["seconds"] for p in reached.history if (p["psnr"] or 200) >= level),
-                            None,
-                        )
-                        for level in (30, 40, 50)
-                    },
-                }
-            )
-    return results
-
-
-def pictures(device: str, sizes: Sizes, folder: Path, left: float) -> Any:
-    """Encode a made series and march through its network on the device."""
-    if missing := missing_packages():
-        return {"left_out": f"missing: {missing}"}
-    begun = time.monotonic()
-    data, run = folder / "front.npy", folder / "front.fhz"
-    from fhash_codec.simulation.simulate import simulate
-
-    series = simulate("front", sizes.shape)
-    np.save(data, np.stack([series.read(step) for step in range(2)]))
-    words = [
-        "encode",
-        str(data),
-        "-o",
-        str(run),
-        "--profile",
-        "paper",
-        "--device",
-        device,
-        "--force",
-    ]
-    fhash([*words, "-q", "--epochs", str(min(sizes.epochs, 5)), "--hidden-layers", "1"], left)
-    results = {}
-    for march in ("arm", "stream"):
-        words = ["render", str(run), "-o", str(folder / f"{march}.png"), "--force", "-q", "--json"]
-        words += ["--march", march, "--device", device, "--explain"]
-        words += ["--size", f"{sizes.pixels}x{sizes.pixels}"]
-        left_now = left - (time.monotonic() - begun)
-        results[march] = json.loads(fhash(words, left_now))
-    data.unlink()
-    return results
-
-
-def selftest(device: str, sizes: Sizes, folder: Path, left: float) -> Any:
+def selftest(run: Run) -> Iterator[Result]:
     """Return what does not hold in `fhash selftest`, whose trainings choose the device."""
-    if missing := missing_packages():
-        return {"left_out": f"missing: {missing}"}
-    words = ["selftest", "--json", "-q"]
-    if sizes.pixels < 100:
-        words += ["--case", "layers"]
-    found = json.loads(fhash(words, left))
-    failed = [
+    found = fhash(["selftest", *run.cases], allowed=(0, 1))
+    wrong = [
         {"case": case["name"], **finding}
         for case in found["cases"]
         for finding in case["findings"]
         if not finding["holds"]
     ]
-    return {"holds": found["holds"], "cases": len(found["cases"]), "failed": failed}
+    result = {"cases": len(found["cases"]), "call_s": found["call_s"]}
+    yield result if found["holds"] else result | {"failed": wrong}
 
 
-def missing_packages() -> str:
-    """Return the packages that writing files needs and that are not here."""
-    return ", ".join(name for name in NEEDED if find_spec(name) is None)
-
-
-def fhash(words: list[str], seconds: float) -> str:
-    """Run the command line; return what it prints."""
+def fhash(words: list[str], allowed: tuple[int, ...] = (0,)) -> dict[str, Any]:
+    """Run the command line; return what it prints as JSON, and `call_s`, its seconds in all."""
+    begun = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", FHASH, *words],
+        [sys.executable, "-c", FHASH, *words, "--json"],
         capture_output=True,
         text=True,
-        timeout=max(seconds, 1),
         env={**os.environ, "PYTHONPATH": ":".join(sys.path)},
         check=False,
     )
-    if done.returncode:
+    # A warning says that kernels cannot be had, which a user may overlook.
+    if done.returncode not in allowed or "cannot be had" in done.stderr:
         raise RuntimeError(f"fhash {' '.join(words)}: exit {done.returncode}: {done.stderr[-800:]}")
-    return done.stdout
+    print(done.stderr, end="", file=sys.stderr)
+    return {**json.loads(done.stdout), "call_s": time.perf_counter() - begun}
+
+
+PARTS: dict[str, tuple[Callable[[Run], Iterator[Result]], float]] = {
+    "machine": (machine, 60.0),
+    "oracle": (oracle, 100.0),
+    "speed": (speed, 170.0),
+    "curve": (curve, 90.0),
+    "card": (card, 120.0),
+    "points": (points, 40.0),
+    "selftest": (selftest, 150.0),
+}
+"""The parts and their limits in seconds."""
 
 
 if __name__ == "__main__":

@@ -68,6 +68,10 @@ GOLDENS = {
         max_error=0.0, effort=2, timings=False, features=("interval:700:9000",), dilation=0
     ),
     "compact-trellis": EncodeConfig(psnr=50.0, effort=2, timings=False),
+    "compact-fast": EncodeConfig(psnr=60.0, effort=2, timings=False, access="fast"),
+    "compact-fast-bound": EncodeConfig(
+        max_error=1e-4, effort=3, timings=False, access="fast", features=("interval:0.5:2",)
+    ),
     "compact-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
     "compact-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
     "paper-transform": EncodeConfig(

@@ -18,6 +18,8 @@ COMPACT = [
     "compact-mask",
     "compact-predictor",
     "compact-psnr",
+    "compact-fast",
+    "compact-fast-bound",
     "compact-classes",
     "compact-clip",
     "compact-counts",

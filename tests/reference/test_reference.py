@@ -164,7 +164,12 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
     mask = random.random(shape) < 0.7 if masked else None
     if kind.kind == "f" and draw(st.booleans()):
         values[random.random(shape) < 0.05] = draw(st.sampled_from([np.nan, np.inf]))
-    coding = Coding(weight=0.09, error=error, own_settings=draw(st.booleans()))
+    coding = Coding(
+        weight=draw(st.sampled_from([0.0, 0.09])),
+        error=error,
+        own_settings=draw(st.booleans()),
+        fast=not trellis and draw(st.booleans()),
+    )
     return values, settings, coding, mask
 
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reference.bands import bands_of
+from reference.bands import bands_of, single_band
+from reference.fast import decode_fast
 from reference.head import apply_head, unpack_head
-from reference.integers import decode_block, decode_integers
+from reference.integers import decode_integers
 from reference.labels import LabelDecoder, number_in, unpack_labelled, unpack_planes
 from reference.masks import mask_levels, unpack_mask
 from reference.predictor import decode_predicted, passes_of
@@ -22,7 +23,7 @@ Settings = dict[str, Any]
 
 TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY = range(5)
 """Kinds of streams, the lower three bits of the flags."""
-OWN, MISSING, RESIDUAL, MASKED = 8, 16, 32, 64
+OWN, MISSING, RESIDUAL, MASKED, FAST = 8, 16, 32, 64, 128
 """Other bits of the flags."""
 
 
@@ -30,7 +31,8 @@ class Stream:
     """The parts of a stream.
 
     Attributes:
-        kind: what it is, and `masked` whether it says which values are occupied.
+        kind: what it is, and `masked` whether it says which values are occupied, `fast` whether its
+            integers are those of the fast coder.
         sections: the sections by name.
         settings: its own settings, or those that it shares.
         shape, dtype: of the tile (t, z, y, x), less the origin.
@@ -42,7 +44,7 @@ class Stream:
         if crc32c(data[4:]) != int.from_bytes(data[:4], "little"):
             raise ValueError("the checksum of a tile differs")
         flags, data = data[4], data[5:]
-        self.kind, self.masked = flags & 7, bool(flags & MASKED)
+        self.kind, self.masked, self.fast = flags & 7, bool(flags & MASKED), bool(flags & FAST)
         there = {
             "settings": flags & OWN,
             "missing": flags & MISSING,
@@ -184,7 +186,12 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
     """The values of a tile coded by transform: before head and residual, and in their type."""
     settings, shape, number = stream.settings, stream.shape, stream.working.type
     bands = bands_of(settings["axes"], shape)
-    integers = decode_integers(stream.sections["body"], shape, bands, settings["trellis"])
+    body = stream.sections["body"]
+    integers = (
+        decode_fast(body, shape, bands)
+        if stream.fast
+        else decode_integers(body, shape, bands, settings["trellis"])
+    )
     with np.errstate(all="ignore"):
         coefficients = dequantised(integers, settings, stream.working)
         values = inverse(coefficients, settings["axes"]) + number(settings["center"])
@@ -192,7 +199,9 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
         if "head" in settings:
             after = apply_head(before, settings["head"])
         if "residual" in stream.sections:
-            residual = decode_block(stream.sections["residual"], shape)
+            coded = stream.sections["residual"]
+            decode = decode_fast if stream.fast else decode_integers
+            residual = decode(coded, shape, single_band(shape))
             after = after.astype(np.float64) + residual * np.float64(settings["quantum"])
     return before, cast(after, stream.dtype)
 

@@ -29,6 +29,7 @@ from fhash_cli.output import Progress, emit, extent, number, size, table
 if TYPE_CHECKING:
     from fhash_bench.labels import LabelBench
     from fhash_bench.rate.measuring import RateBench
+    from fhash_bench.rate.table import RateTable
 
 NONE = "none"
 """Name that stands for no peer at all."""
@@ -96,12 +97,10 @@ def quality_options(command: Command) -> Command:
     return command
 
 
-def filters_of(peers: Sequence[Peer]) -> list[str]:
-    """Names of the filters among the peers, once each; all there are where none was named."""
-    from fhash_bench.rate.measuring import PEERS
-
+def filters_of(peers: Sequence[Peer], default: Sequence[str]) -> list[str]:
+    """Names of the filters among the peers, once each; the default where none was named."""
     given = [peer.name for peer in peers if not peer.path]
-    return [name for name in dict.fromkeys(given or PEERS) if name != NONE]
+    return [name for name in dict.fromkeys(given or default) if name != NONE]
 
 
 def programs_of(peers: Sequence[Peer]) -> dict[str, str]:
@@ -133,6 +132,12 @@ def _profiles() -> tuple[str, ...]:
     from fhash_bench.rate.measuring import PROFILES
 
     return (*PROFILES, NONE)
+
+
+def _accesses() -> tuple[str, ...]:
+    from fhash_codec.config import ACCESSES
+
+    return ACCESSES
 
 
 @click.command(
@@ -180,12 +185,13 @@ def rate(
 
     Without --target and --bound: 35, 40, 45, 50 and 60 dB, and bounds of 5, 2, 1, 0.5 and 0.1 % of
     the range. Quality is measured on the decoded values. DATA is held in memory, and may be
-    generated:KIND: plateau, noise, labels, smooth, thin, long or short. The other codecs come with
+    generated:KIND: plateau, noise, labels, smooth, turbulence, thin, long or short. The
+    other codecs come with
     pip install 'fhash[bench]'; programs are named by their paths.
     """
     check_plot(plot, force, [data])
     with Progress(quiet=quiet) as progress, opened(data, source, progress) as series:
-        from fhash_bench.rate.measuring import PROFILES
+        from fhash_bench.rate.measuring import PEERS, PROFILES
         from fhash_bench.rate.rate import BOUNDS, TARGETS, bench_rate
         from fhash_bench.rate.rate import plot as draw
 
@@ -195,7 +201,7 @@ def rate(
             settings,
             targets=TARGETS if every else targets,
             bounds=BOUNDS if every else bounds,
-            names=filters_of(peers),
+            names=filters_of(peers, PEERS),
             named=programs_of(peers),
             profiles=[name for name in profiles or PROFILES if name != NONE],
             speed=speed,
@@ -311,7 +317,9 @@ def _access_table(result: RateBench) -> str:
 
 
 @click.command(
-    "table", cls=BaseCommand, short_help="bench rate on many series, as one table; goes on"
+    "table",
+    cls=BaseCommand,
+    short_help="size, speed and access on many series, one core, as one table; goes on",
 )
 @click.argument("data", type=click.Path(), nargs=-1)
 @series_options
@@ -319,14 +327,35 @@ def _access_table(result: RateBench) -> str:
     "--generated", "with_generated", is_flag=True, help="Add every generated series to DATA."
 )
 @quality_options
-@peer_option
+@click.option(
+    "--effort",
+    "efforts",
+    type=click.IntRange(1, 9),
+    multiple=True,
+    metavar="N",
+    help="Of fhash; repeat. Default: 1, 5 and 7.",
+)
+@click.option(
+    "--access",
+    "accesses",
+    type=one_of("access", _accesses),
+    multiple=True,
+    help="Of fhash, with each effort; repeat. Default: balanced.",
+)
+@click.option(
+    "--peer",
+    "peers",
+    type=PEER,
+    multiple=True,
+    help="As of bench rate. Default: SPERR, SZ3 and ZFP.",
+)
 @click.option(
     "--speed/--no-speed",
     default=True,
     show_default=True,
     help="Measure speed and access too, of every codec at every quality.",
 )
-@setting_options("effort", "tile", "seed")
+@setting_options("tile", "seed", "without")
 @click.option(
     "-o",
     "folder",
@@ -334,7 +363,8 @@ def _access_table(result: RateBench) -> str:
     type=click.Path(file_okay=False),
     default="bench-table",
     show_default=True,
-    help="Folder of the cells, one JSON file each; finished cells are not measured again.",
+    help="Folder of the cells, one JSON file each, and of table.csv; finished cells are not"
+    " measured again.",
 )
 @json_option
 @quiet_option
@@ -344,6 +374,8 @@ def rate_table(
     with_generated: bool,
     targets: tuple[float, ...],
     bounds: tuple[float, ...],
+    efforts: tuple[int, ...],
+    accesses: tuple[str, ...],
     peers: tuple[Peer, ...],
     speed: bool,
     settings: dict[str, Any],
@@ -351,17 +383,24 @@ def rate_table(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Compare the profile compact with other codecs on each DATA; the table is in Markdown.
+    """Compare fhash with other codecs on each DATA: bytes, and seconds of the processor.
 
-    Without --target and --bound: 35, 45 and 60 dB, and bounds of 5, 1 and 0.1 % of the range. A row
-    has the bytes, those of one tile, the best peer in its best layout, and speed and access of
-    both. DATA may be generated:KIND: plateau, noise, labels, smooth, thin, long or short.
+    Without --target and --bound: 45 and 60 dB, and bounds of 1 and 0.1 % of the range. All run on
+    one thread. DATA is held in memory, and may be generated:KIND: plateau, noise, labels, smooth,
+    turbulence, thin, long or short.
     """
     if not data and not with_generated:
         raise click.UsageError("Missing DATA; or give --generated")
     with Progress(quiet=quiet) as progress:
         from fhash_bench.rate.generated import GENERATED, PREFIX, is_generated
-        from fhash_bench.rate.table import BOUNDS, TARGETS, bench_table
+        from fhash_bench.rate.table import (
+            BOUNDS,
+            EFFORTS,
+            FILTERS,
+            TARGETS,
+            bench_table,
+            own_coders,
+        )
 
         if all(is_generated(name) for name in data):
             source.refuse_without_data()
@@ -373,15 +412,46 @@ def rate_table(
                 for name in names
             },
             Path(folder),
-            settings,
+            own_coders(efforts or EFFORTS, accesses, settings),
             targets=TARGETS if every else targets,
             bounds=BOUNDS if every else bounds,
-            names=filters_of(peers),
+            names=filters_of(peers, FILTERS),
             named=programs_of(peers),
             speed=speed,
             progress=progress,
         )
-    emit(result.to_dict(), result.markdown(), as_json)
+    emit(result.to_dict(), _table_text(result), as_json)
+
+
+def _table_text(result: RateTable) -> str:
+    """A row for each series, quality and codec, and how they were measured."""
+    header = ("series", "quality", "codec", "bytes", "encode MB/s", "decode MB/s", "region ms")
+    rows = [
+        (
+            Path(cell.series).name,
+            _quality(cell.goal, cell.asked),
+            cell.codec,
+            f"{cell.bytes:,}" if cell.bytes else "-",
+            number(cell.encode_mb_s, digits=3),
+            number(cell.decode_mb_s, digits=3),
+            number(cell.region_ms, digits=3),
+            number(cell.psnr, digits=4),
+            number(cell.max_error and 100 * cell.max_error, "%", digits=3)
+            + ("" if cell.reached else " !"),
+            cell.setting or cell.why or "-",
+        )
+        for cell in result.cells
+    ]
+    seconds = number(result.startup_seconds, "s", digits=2)
+    return "\n".join(
+        [
+            table([(*header, "PSNR", "error", "layout"), *rows]),
+            "",
+            *result.notes,
+            f"start-up of fhash, a whole `fhash encode` of 16 values: {seconds},"
+            " which the speed of encoding does not hold",
+        ]
+    )
 
 
 @click.command("labels", cls=BaseCommand, short_help="sizes of labels without loss, beside xz")

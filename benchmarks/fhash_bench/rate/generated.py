@@ -92,6 +92,15 @@ def _smooth(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     return _waves(seed, (16, 32, 48, 48), 3.0, 1.5), np.linspace(0, 1, 16)
 
 
+def _turbulence(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
+    """Kolmogorov's spectrum: an octave of waves has the amplitude k^(-1/3); 8 x 48 x 64 x 64.
+
+    The times are uneven.
+    """
+    times = np.cumsum(np.random.default_rng(seed).uniform(0.2, 1.8, 8))
+    return _waves(seed, (8, 48, 64, 64), 32.0, 1 / 3), times
+
+
 def _thin(seed: int) -> tuple[Single, npt.NDArray[np.float64]]:
     """Turbulence in three layers: one thin axis; 20 x 3 x 96 x 112."""
     return _waves(seed, (20, 3, 96, 112), 24.0, 1.0), np.linspace(0, 1, 20)
@@ -124,6 +133,7 @@ GENERATED: dict[str, Callable[[int], tuple[Single, npt.NDArray[np.float64]]]] = 
     "noise": _noise,
     "labels": _labels,
     "smooth": _smooth,
+    "turbulence": _turbulence,
     "thin": _thin,
     "long": _long,
     "short": _short,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -24,8 +22,10 @@ from fhash_bench.rate.peers import (
     AnyVariant,
     PeerFiles,
     ProgramVariant,
+    Spent,
     folder_of,
     small_chunks,
+    spent,
     there_and_back,
 )
 from fhash_codec.boxes import Box
@@ -38,43 +38,6 @@ from fhash_codec.volume import decoded_type
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, MissingDependencyError, QualityError
 from fhash_formats.series import ArraySeries, Series
-
-LEAST = 1e-6
-"""Seconds that work takes at least, so that a rate of it is finite."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spent:
-    """Seconds of some work.
-
-    Attributes:
-        wall: from its beginning to its end.
-        core: of all cores in user mode, together, those of programs that it ran included.
-    """
-
-    wall: float
-    core: float
-
-
-def spent(work: Callable[[], object]) -> Spent:
-    """Do some work and return the seconds that it took."""
-    wall, core = time.perf_counter(), user_seconds()
-    work()
-    return Spent(
-        wall=max(LEAST, time.perf_counter() - wall), core=max(LEAST, user_seconds() - core)
-    )
-
-
-def user_seconds() -> float:
-    """Seconds in user mode of this process and of the programs that it ran, so far."""
-    try:
-        import resource
-    except ImportError:  # only Unix has it
-        times = os.times()
-        return times.user + times.children_user
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return sum(resource.getrusage(kind).ru_utime for kind in kinds)
-
 
 PEERS = ("SZ3", "SPERR", "ZFP", "BitRound", "Blosc")
 """Names of the peers."""
@@ -115,7 +78,7 @@ class Speed:
 
     Attributes:
         encode_mb_s, decode_mb_s: by the clock on the wall.
-        encode_core_mb_s, decode_core_mb_s: by the time of all cores in user mode, so those of one.
+        encode_core_mb_s, decode_core_mb_s: by the time of all cores, so those of one.
         encode_runs: runs of encoding.
     """
 
@@ -137,6 +100,7 @@ class Access:
         region: lengths (z, y, x).
         bytes: size of all the data in this layout.
         psnr: dB of all the data.
+        milliseconds: by the clock on the wall. core_milliseconds: of all cores together.
         bytes_read: bytes that one region takes.
     """
 
@@ -146,6 +110,7 @@ class Access:
     bytes: int
     psnr: float | None
     milliseconds: float
+    core_milliseconds: float
     bytes_read: int
 
 
@@ -304,22 +269,19 @@ class Own:
         return self._trials[config]
 
     def decode(self, config: EncodeConfig) -> Spent:
-        """Open the file and decode every frame; what it took."""
+        """Open the file and decode all of it; what it took."""
 
         def decode() -> None:
             with open_volume(self._paths[config]) as volume:
-                for step in range(volume.shape[0]):
-                    volume.read(step)
+                volume.read_steps(range(volume.shape[0]))
 
         return spent(decode)
 
-    def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, float]:
-        """Open the file and read a region of one step; bytes read of the file, and seconds."""
-        begun = time.perf_counter()
+    def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, Spent]:
+        """Read a region of one step of the file; bytes read of it, and seconds after opening."""
         with open_volume(self._paths[config]) as volume:
-            volume.read(step, region)
-            count = volume.container.bytes_read
-        return count, time.perf_counter() - begun
+            seconds = spent(lambda: volume.read(step, region))
+            return volume.container.bytes_read, seconds
 
 
 RUNS = 3
@@ -331,7 +293,7 @@ PLACES = 8
 REGION = 16
 """Vertices of a region along each axis."""
 
-Read = Callable[[int, Box], tuple[int, float]]
+Read = Callable[[int, Box], tuple[int, Spent]]
 """A function of a step and a region: bytes read, and seconds."""
 
 
@@ -388,7 +350,8 @@ def access_of(
         region=(z, y, x),
         bytes=trial.bytes,
         psnr=shown_psnr(trial),
-        milliseconds=1000 * median(seconds for _, seconds in measured),
+        milliseconds=1000 * median(seconds.wall for _, seconds in measured),
+        core_milliseconds=1000 * median(seconds.core for _, seconds in measured),
         bytes_read=round(median(touched for touched, _ in measured)),
     )
 

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +41,38 @@ SMALL_CHUNK = 32
 """Vertices along an axis of a chunk, as a user who reads regions would choose."""
 
 Spans = list[tuple[int, int]]
+
+LEAST_SECONDS = 1e-6
+"""Seconds that work takes at least, so that a rate of it is finite."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spent:
+    """Seconds of some work.
+
+    Attributes:
+        wall: from its beginning to its end.
+        core: of all cores together, those of programs that it ran included.
+    """
+
+    wall: float
+    core: float
+
+
+def spent(work: Callable[[], object]) -> Spent:
+    """Do some work and return the seconds that it took."""
+    wall, core = time.perf_counter(), core_seconds()
+    work()
+    return Spent(
+        wall=max(LEAST_SECONDS, time.perf_counter() - wall),
+        core=max(LEAST_SECONDS, core_seconds() - core),
+    )
+
+
+def core_seconds() -> float:
+    """Seconds of all cores that this process and the programs that it ran took so far."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
 
 
 def all_filters() -> dict[str, tuple[Variant, ...]]:
@@ -692,16 +724,15 @@ class PeerFiles:
         with opened_file(self._path) as file:
             read_all(file, self._variant, self._values.shape)
 
-    def read_region(self, step: int, region: Box) -> tuple[int, float]:
-        """Bytes that a region of one step takes, and seconds; a program must decode everything."""
-        begun = time.perf_counter()
+    def read_region(self, step: int, region: Box) -> tuple[int, Spent]:
+        """Bytes that a region of one step takes, and seconds after opening the file.
+
+        A program must decode everything.
+        """
         if isinstance(self._variant, ProgramVariant):
             assert self._coded is not None
-            self._variant.decode(self._coded)
-            return self._coded.bytes, time.perf_counter() - begun
-        shape = self._values.shape
+            return self._coded.bytes, spent(self.decode)
+        where = (self._variant, self._values.shape, step, region)
         with opened_file(self._path) as file:
-            read_region(file, self._variant, shape, step, region)
-        spent = time.perf_counter() - begun
-        with opened_file(self._path) as file:
-            return touched_bytes(file, self._variant, shape, step, region), spent
+            taken = spent(lambda: read_region(file, *where))
+            return touched_bytes(file, *where), taken

@@ -35,9 +35,9 @@ NOTES = (
     " both may exceed what was asked by up to 6 dB, as their PSNR says",
     "peers run on one thread as HDF5 filters; fhash takes the threads it takes by default",
     "the price of tiles sets the bytes of the default beside those of one tile at the same promise",
-    "MB/s of a core are 10^6 bytes of the array for each second that all cores together spent in"
-    " user mode; a program's own start counts",
-    "access opens the file anew, the operating system has it in memory; bytes read are those of"
+    "MB/s of a core are 10^6 bytes of the array for each second that all cores together spent;"
+    " a program's own start counts",
+    "access reads a file that was just opened, which memory holds; bytes read are those of"
     " whole chunks for a peer, and all that is read of the file, directory included, for fhash;"
     " a program decodes everything",
 )

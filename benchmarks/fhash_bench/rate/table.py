@@ -1,25 +1,34 @@
-"""Table of fhash beside its best peer on many series, cell by cell: `fhash bench table`."""
+"""Table of fhash and its peers on many series, one core, cell by cell: `fhash bench table`."""
 
 from __future__ import annotations
 
+import csv
+import io
+import subprocess
+import sys
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
-from math import prod
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fhash_bench.kept import file_name, load, of_fields, save
-from fhash_bench.rate.measuring import OWN, PEERS, Access, Bench, Best, Speed, TilePrice, shown_psnr
-from fhash_bench.rate.peers import AnyVariant
-from fhash_bench.rate.rate import NOTES, all_variants, bench_of, check, goals_of
+from fhash_bench.rate.measuring import OWN, Bench, shown_psnr
+from fhash_bench.rate.peers import AnyVariant, spent
+from fhash_bench.rate.rate import all_variants, bench_of, check, goals_of
 from fhash_codec.cost.plan import machine
 from fhash_codec.progress import Progress, silent
-from fhash_formats.series import Series
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries, Series
+from fhash_formats.support.files import replacing
+from fhash_formats.support.threads import at_most
 
-CELL_VERSION = 1
+CELL_VERSION = 2
 """Number of the way in which cells are measured; cells of another number are not taken."""
 
 
@@ -53,14 +62,13 @@ class RateCell:
 
     Attributes:
         series, shape, dtype, raw_bytes: the series.
-        codec: as the user names it.
+        codec: name of a peer, or of fhash with its effort and its access.
         goal, asked: the quality: `psnr` in dB, or `bound` as a share of the range.
         reached: whether the codec reached it; where it did not, the other figures are of its
             closest trial.
         bytes, psnr, max_error, setting: as of `Point`; None where nothing was measured.
-        encode_mb_s, decode_mb_s, encode_core_mb_s, decode_core_mb_s: as of `Speed`.
-        region_ms, region_bytes: as of `Access`.
-        one_tile_bytes, tile_price, tile_steps: as of `TilePrice`, of the profile compact alone.
+        encode_mb_s, decode_mb_s: 10^6 bytes for each second of the processor.
+        region_ms: milliseconds of the processor for a region. region_bytes: as of `Access`.
         why: why nothing was measured.
     """
 
@@ -73,18 +81,13 @@ class RateCell:
     asked: float
     reached: bool
     bytes: int | None = None
+    encode_mb_s: float | None = None
+    decode_mb_s: float | None = None
+    region_ms: float | None = None
+    region_bytes: int | None = None
     psnr: float | None = None
     max_error: float | None = None
     setting: str = ""
-    encode_mb_s: float | None = None
-    encode_core_mb_s: float | None = None
-    decode_mb_s: float | None = None
-    decode_core_mb_s: float | None = None
-    region_ms: float | None = None
-    region_bytes: int | None = None
-    one_tile_bytes: int | None = None
-    tile_price: float | None = None
-    tile_steps: int | None = None
     why: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -98,112 +101,81 @@ class RateCell:
         return replace(cell, shape=tuple(cell.shape))
 
 
-def cell_of(
-    about: Mapping[str, Any],
-    best: Best,
-    speed: Speed | None,
-    access: Access | None,
-    tiles: TilePrice | None,
-) -> RateCell:
-    """A cell of what was measured. about: series, codec and quality."""
-    figures: dict[str, Any] = {
-        "reached": best.reached,
-        "bytes": best.trial.bytes,
-        "psnr": shown_psnr(best.trial),
-        "max_error": best.trial.max_error,
-        "setting": best.setting,
-    }
-    if speed is not None:
-        for name in ("encode_mb_s", "encode_core_mb_s", "decode_mb_s", "decode_core_mb_s"):
-            figures[name] = getattr(speed, name)
-    if access is not None:
-        figures |= {"region_ms": access.milliseconds, "region_bytes": access.bytes_read}
-    if tiles is not None:
-        figures |= {
-            "one_tile_bytes": tiles.one_tile_bytes,
-            "tile_price": tiles.price,
-            "tile_steps": tiles.steps,
-        }
-    return RateCell(**about, **figures)
-
-
-TARGETS = (35.0, 45.0, 60.0)
+TARGETS = (45.0, 60.0)
 """PSNR in dB."""
-BOUNDS = (0.05, 0.01, 0.001)
+BOUNDS = (0.01, 0.001)
 """Largest errors as shares of the range."""
+EFFORTS = (1, 5, 7)
+"""Efforts of fhash: the fastest, the default, and a thorough one."""
+FILTERS = ("SPERR", "SZ3", "ZFP")
+"""Peers."""
 COMPACT = "compact"
 """The profile that is measured."""
+CSV = "table.csv"
+"""Name of the table beside the cells, which grows with them."""
+NOTES = (
+    "one thread, the series in memory; seconds are those of the processor, and the best of some"
+    " runs counts; MB are 10^6 bytes of the array",
+    "bytes and files of a peer are of the smallest of its layouts and modes that reached the"
+    " quality, whose chunks alone count; bytes of fhash are the whole file",
+    "encoding ends with the written file, decoding with the whole array in memory; a region has up"
+    " to 16 x 16 x 16 vertices of one step, and is read from a file that was just opened",
+    "PSNR and largest error, a share of the range, are measured on decoded values; ! marks a"
+    " quality that was not reached",
+)
 
 Opening = Callable[[], AbstractContextManager[Series]]
 """A function that opens a series."""
+Search = Callable[[Bench], object]
+"""A function that lets a bench find the best setting of a codec."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateTable:
-    """Cells of every series, codec and quality.
+    """Cells of every series, quality and codec.
 
     Attributes:
         cells: in the order in which they were asked for.
         measured: how many of them were measured in this run; the others were there.
+        startup_seconds: of the processor, for a whole `fhash encode` of 16 values, which the
+            speed of encoding does not hold.
         machine: this machine. notes: how the figures were taken.
     """
 
     cells: tuple[RateCell, ...]
     measured: int
+    startup_seconds: float
     machine: dict[str, Any]
-    notes: tuple[str, ...]
-
-    def rows(self) -> list[tuple[RateCell, RateCell | None]]:
-        """fhash's cell and that of its best peer, for each series and quality.
-
-        The best peer is the smallest that reached the quality; None where none did.
-        """
-        rows = []
-        for cell in self.cells:
-            if not cell.codec.startswith(OWN):
-                continue
-            peers = [
-                other
-                for other in self.cells
-                if (other.series, other.goal, other.asked) == (cell.series, cell.goal, cell.asked)
-                and other.reached
-                and not other.codec.startswith(OWN)
-            ]
-            best = min(peers, key=lambda other: other.bytes or 0, default=None)
-            rows.append((cell, best))
-        return rows
-
-    def markdown(self) -> str:
-        """A table with a row for each series and quality, and what was not measured."""
-        lines = [[name for name, _ in COLUMNS], ["---" for _ in COLUMNS]]
-        lines += [[column(own, peer) for _, column in COLUMNS] for own, peer in self.rows()]
-        text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        missing = [
-            f"- not measured: {cell.series}, {cell.codec}, {_quality(cell)}: {cell.why}"
-            for cell in self.cells
-            if cell.why
-        ]
-        return "\n".join([text, *([""] if missing else []), *missing])
+    notes: tuple[str, ...] = NOTES
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, the table in Markdown included."""
-        return {
-            "cells": [cell.to_dict() for cell in self.cells],
-            "measured": self.measured,
-            "table": self.markdown(),
-            "machine": self.machine,
-            "notes": list(self.notes),
+        """JSON values."""
+        return {**asdict(self), "cells": [cell.to_dict() for cell in self.cells]}
+
+
+def own_coders(
+    efforts: Sequence[int], accesses: Sequence[str], settings: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Settings of fhash by name, such as "fhash 5 fast": each effort with each access."""
+    return {
+        f"{OWN}{effort} {access}".removesuffix(" balanced"): {
+            **settings,
+            "effort": effort,
+            "access": access,
         }
+        for effort in efforts
+        for access in accesses or ("balanced",)
+    }
 
 
 def bench_table(
     sources: Mapping[str, Opening],
     folder: Path,
-    settings: Mapping[str, Any] | None = None,
+    coders: Mapping[str, Mapping[str, Any]],
     *,
     targets: Sequence[float] = TARGETS,
     bounds: Sequence[float] = BOUNDS,
-    names: Sequence[str] = PEERS,
+    names: Sequence[str] = FILTERS,
     named: Mapping[str, str] | None = None,
     speed: bool = True,
     progress: Progress = silent,
@@ -212,207 +184,144 @@ def bench_table(
 
     Args:
         sources: functions that open series, by name.
-        folder: place of the cells. Those that are there already, of the same numbers and settings,
-            are taken as they are.
-        settings, targets, bounds, names, named: as of `bench_rate`.
+        folder: place of the cells, and of all of them as a CSV file. Cells that are there already,
+            of the same numbers and settings, are taken as they are.
+        coders: settings of fhash by name, as `own_coders` gives them.
+        targets, bounds, names, named: as of `bench_rate`.
         speed: also measure encoding, decoding and access, of each codec at each quality.
 
     Raises errors as `bench_rate` does, and OutputError where a cell cannot be written.
     """
-    settings = settings or {}
-    check(settings, targets, bounds, [*names, *(named or {})], [COMPACT])
+    for settings in coders.values():
+        check(settings, targets, bounds, [*names, *(named or {})], [COMPACT])
     variants, refused = all_variants(names, named or {})
-    goals = goals_of(targets, bounds)
+    searches: dict[str, tuple[Any, Search]] = {
+        name: (settings, partial(Bench.search_profile, settings=settings, profile=COMPACT))
+        for name, settings in coders.items()
+    }
+    for codec, several in variants.items():
+        searches[codec] = ([each.name for each in several], partial(_search_all, several))
+    goals, measured = goals_of(targets, bounds), 0
     cells: list[RateCell] = []
-    measured = 0
-    for number, (name, opened) in enumerate(sources.items()):
-        progress("series", number, len(sources), name)
-        with opened() as series:
-            run = _Run(name, series, folder, settings, goals, speed=speed, progress=progress)
-            cells += run.of_fhash()
-            for codec, several in variants.items():
-                cells += run.peer(codec, several)
-            cells += [
-                run.refused(codec, goal, why) for codec, why in refused.items() for goal in goals
-            ]
-            measured += run.measured
-    return RateTable(cells=tuple(cells), measured=measured, machine=machine(), notes=NOTES)
+    total = len(sources) * len(goals) * len(searches)
+    with at_most(1):
+        for name, opened in sources.items():
+            with opened() as series:
+                run = _Run(name, series, speed)
+            for goal in goals:
+                for codec, (told, search) in searches.items():
+                    progress("table", len(cells), total, f"{name}, {codec}, {goal[0]} {goal[1]:g}")
+                    path, cell = run.kept(folder, codec, goal, told)
+                    if cell is None:
+                        cell = run.measure(codec, goal, search)
+                        save(path, cell.to_dict())
+                        measured += 1
+                    cells.append(cell)
+                    _write(folder / CSV, cells)
+                cells += [run.refused(codec, goal, why) for codec, why in refused.items()]
+        startup = startup_seconds()
+    return RateTable(
+        cells=tuple(cells), measured=measured, startup_seconds=startup, machine=machine()
+    )
+
+
+def _search_all(variants: Sequence[AnyVariant], bench: Bench) -> None:
+    for variant in variants:
+        bench.search(variant)
+
+
+def startup_seconds() -> float:
+    """Seconds of the processor for a whole `fhash encode` of 16 values."""
+    with tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder:
+        np.save(f"{folder}/a.npy", np.arange(16.0).reshape(2, 2, 2, 2))
+        words = ["encode", f"{folder}/a.npy", "-o", f"{folder}/a.fhz", "--effort", "1", "-q"]
+        program = [sys.executable, "-m", "fhash_cli.main", *words]
+        return spent(lambda: subprocess.run(program, check=True, stdout=subprocess.DEVNULL)).core
+
+
+def _write(path: Path, cells: Sequence[RateCell]) -> None:
+    """Write cells as a CSV file, complete or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(RateCell.__dataclass_fields__))
+    writer.writeheader()
+    writer.writerows({**cell.to_dict(), "shape": "x".join(map(str, cell.shape))} for cell in cells)
+    with replacing(path, force=True) as temporary:
+        temporary.write_text(text.getvalue(), encoding="utf-8", newline="")
 
 
 class _Run:
-    """Cells of one series.
+    """Cells of one series, which is held in memory."""
 
-    Attributes:
-        measured: cells that were not there.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        series: Series,
-        folder: Path,
-        settings: Mapping[str, Any],
-        goals: Sequence[tuple[str, float]],
-        *,
-        speed: bool,
-        progress: Progress,
-    ) -> None:
-        self._name, self._series, self._folder = name, series, folder
-        self._settings, self._goals, self._progress = settings, goals, progress
-        self._speed, self.measured = speed, 0
-        checksum = 0
-        for frame in series.frames():
-            checksum = zlib.crc32(frame.tobytes(), checksum)
-        self._identity = {"checksum": checksum, "shape": list(series.shape), "speed": speed}
-
-    def of_fhash(self) -> list[RateCell]:
-        """fhash at each quality; a cell is kept before the next one begins."""
-        return [
-            cell
-            for goal in self._goals
-            for cell in self._cells(
-                f"{OWN}{COMPACT}",
-                [goal],
-                lambda bench: bench.search_profile(self._settings, COMPACT),
-                self._settings,
-            )
-        ]
-
-    def peer(self, codec: str, variants: Sequence[AnyVariant]) -> list[RateCell]:
-        """A peer at all qualities, whose searches help each other."""
-
-        def search(bench: Bench) -> None:
-            for variant in variants:
-                bench.search(variant)
-
-        told = {"variants": [variant.name for variant in variants]}
-        return self._cells(codec, self._goals, search, told)
-
-    def refused(self, codec: str, goal: tuple[str, float], why: str) -> RateCell:
-        """The cell of a peer that cannot be measured, which is not kept."""
-        return RateCell(**self._about(codec, goal), reached=False, why=why)
-
-    def _cells(
-        self,
-        codec: str,
-        goals: Sequence[tuple[str, float]],
-        search: Callable[[Bench], None],
-        told: Mapping[str, Any],
-    ) -> list[RateCell]:
-        """Cells of a codec: those that are kept, and the others measured together."""
-        requests = {
-            goal: Request(
-                series=self._name,
-                codec=codec,
-                goal=goal[0],
-                asked=goal[1],
-                settings={**self._identity, **told},
-            )
-            for goal in goals
+    def __init__(self, name: str, series: Series, speed: bool) -> None:
+        values = np.stack(list(series.frames()))
+        self._name, self._speed = name, speed
+        self._series = ArraySeries(
+            values, name=series.name, units=series.units, coords=series.coords
+        )
+        self._series.source = series.source
+        self._identity = {
+            "checksum": zlib.crc32(values.tobytes()),
+            "shape": list(values.shape),
+            "speed": speed,
         }
-        paths = {goal: self._folder / request.filename for goal, request in requests.items()}
-        kept = {goal: load(path, RateCell.from_dict) for goal, path in paths.items()}
-        missing = [goal for goal, cell in kept.items() if cell is None]
-        if missing:
-            for goal, cell in self._measure(codec, missing, search).items():
-                save(paths[goal], cell.to_dict())
-                kept[goal] = cell
-                self.measured += 1
-        return [cell for cell in kept.values() if cell is not None]
 
-    def _measure(
-        self,
-        codec: str,
-        goals: list[tuple[str, float]],
-        search: Callable[[Bench], None],
-    ) -> dict[tuple[str, float], RateCell]:
-        """Search and time a codec for some qualities."""
+    def kept(
+        self, folder: Path, codec: str, goal: tuple[str, float], told: Any
+    ) -> tuple[Path, RateCell | None]:
+        """Place of a cell, and the cell where it is there."""
+        request = Request(
+            series=self._name,
+            codec=codec,
+            goal=goal[0],
+            asked=goal[1],
+            settings={**self._identity, "told": told},
+        )
+        path = folder / request.filename
+        return path, load(path, RateCell.from_dict)
+
+    def measure(self, codec: str, goal: tuple[str, float], search: Search) -> RateCell:
+        """Search and time a codec for a quality; what cannot be encoded says why."""
+        figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory(prefix="fhash-bench-") as scratch:
-            bench = bench_of(self._series, Path(scratch), goals, self._progress)
-            bench.total = len(goals)
-            search(bench)
-            tiles = {(price.goal, price.asked): price for price in bench.tiles}
-            cells = {}
-            for goal in goals:
+            try:
+                bench = bench_of(self._series, Path(scratch), [goal], silent)
+                bench.price_tiles = False
+                search(bench)
                 best = next(iter(bench.best[goal].values()), None)
                 if best is None:
                     why = next(iter(bench.refused.values()), "it has no such goal")
-                    cells[goal] = self.refused(codec, goal, why)
-                    continue
+                    return self.refused(codec, goal, why)
                 if self._speed:
                     bench.time(best)
-                cells[goal] = cell_of(
-                    self._about(codec, goal),
-                    best,
-                    bench.speeds[-1] if self._speed else None,
-                    bench.access[-1] if self._speed else None,
-                    tiles.get(goal),
-                )
-        return cells
+                    (speed,), (access,) = bench.speeds, bench.access
+                    figures = {
+                        "encode_mb_s": speed.encode_core_mb_s,
+                        "decode_mb_s": speed.decode_core_mb_s,
+                        "region_ms": access.core_milliseconds,
+                        "region_bytes": access.bytes_read,
+                    }
+            except InputError as error:
+                return self.refused(codec, goal, str(error))
+        return replace(
+            self.refused(codec, goal, ""),
+            reached=best.reached,
+            bytes=best.trial.bytes,
+            psnr=shown_psnr(best.trial),
+            max_error=best.trial.max_error,
+            setting="" if codec.startswith(OWN) else best.setting,
+            **figures,
+        )
 
-    def _about(self, codec: str, goal: tuple[str, float]) -> dict[str, Any]:
-        """The series, a codec and a quality."""
-        series = self._series
-        return {
-            "series": self._name,
-            "shape": tuple(series.shape),
-            "dtype": series.dtype.name,
-            "raw_bytes": prod(series.shape) * series.dtype.itemsize,
-            "codec": codec,
-            "goal": goal[0],
-            "asked": goal[1],
-        }
-
-
-def _quality(cell: RateCell) -> str:
-    """The quality in words."""
-    return f"{cell.asked:g} dB" if cell.goal == "psnr" else f"{100 * cell.asked:g} %"
-
-
-def _bytes(cell: RateCell | None) -> str:
-    """Bytes with commas; marked where the quality was not reached."""
-    if cell is None or cell.bytes is None:
-        return "-"
-    return f"{cell.bytes:,}{'' if cell.reached else ' (missed)'}"
-
-
-def _share(top: int | None, bottom: int | None) -> str:
-    return "-" if not top or not bottom else f"{top / bottom:.3f}"
-
-
-def _each(values: Iterable[float | None]) -> str:
-    """Figures of three digits, with strokes between them."""
-    return " / ".join("-" if value is None else f"{value:.3g}" for value in values)
-
-
-Column = Callable[[RateCell, RateCell | None], str]
-"""A function of the cells of fhash and its best peer, that gives a field."""
-
-COLUMNS: tuple[tuple[str, Column], ...] = (
-    ("series", lambda own, peer: own.series),
-    ("quality", lambda own, peer: _quality(own)),
-    ("fhash, bytes", lambda own, peer: _bytes(own)),
-    ("one tile", lambda own, peer: f"{own.one_tile_bytes or 0:,}"),
-    ("tiles cost", lambda own, peer: _each([own.tile_price])),
-    ("best peer", lambda own, peer: "-" if peer is None else peer.setting),
-    ("its bytes", lambda own, peer: _bytes(peer)),
-    ("its / ours", lambda own, peer: _share(None if peer is None else peer.bytes, own.bytes)),
-    (
-        "encode MB/s, core / wall",
-        lambda own, peer: _each([own.encode_core_mb_s, own.encode_mb_s]),
-    ),
-    (
-        "decode MB/s, core / wall",
-        lambda own, peer: _each([own.decode_core_mb_s, own.decode_mb_s]),
-    ),
-    ("region ms", lambda own, peer: _each([own.region_ms])),
-    (
-        "peer: encode / decode MB/s of a core, region ms",
-        lambda own, peer: (
-            "-"
-            if peer is None
-            else _each([peer.encode_core_mb_s, peer.decode_core_mb_s, peer.region_ms])
-        ),
-    ),
-)
-"""Columns of the table: name, and what stands there."""
+    def refused(self, codec: str, goal: tuple[str, float], why: str) -> RateCell:
+        """The cell of a codec of which nothing is measured."""
+        return RateCell(
+            series=self._name,
+            shape=tuple(self._series.shape),
+            dtype=self._series.dtype.name,
+            raw_bytes=self._series.values.nbytes,
+            codec=codec,
+            goal=goal[0],
+            asked=goal[1],
+            reached=False,
+            why=why,
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 import sys
 from collections.abc import Callable
@@ -31,17 +32,15 @@ from fhash_bench.rate.measuring import (
     Own,
     Point,
     RateBench,
-    Spent,
     access_of,
     promised,
     random_regions,
     shown_psnr,
     speed_of,
-    spent,
-    user_seconds,
 )
+from fhash_bench.rate.peers import Spent, core_seconds, spent
 from fhash_bench.rate.rate import bench_rate, plot
-from fhash_bench.rate.table import RateCell, RateTable, Request, bench_table
+from fhash_bench.rate.table import CSV, RateCell, Request, bench_table, own_coders
 from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
 from fhash_codec.cost.peers import EXACT, Trial
@@ -112,10 +111,10 @@ def test_both_times_are_above_0() -> None:
 
 
 def test_programs_count() -> None:
-    before = user_seconds()
+    before = core_seconds()
     times = spent(lambda: subprocess.run([sys.executable, "-c", "sum(range(3000000))"], check=True))
     assert times.core > 0.005
-    assert user_seconds() - before >= times.core * 0.99
+    assert core_seconds() - before >= times.core * 0.99
 
 
 Field = Callable[..., np.ndarray]
@@ -205,9 +204,9 @@ def test_own_figures_are_those_of_diff(tmp_path: Path, field: Field) -> None:
     assert trial.psnr == pytest.approx(report["psnr"], abs=1e-9)
     assert trial.max_error == pytest.approx(report["max_abs_error"] / data_range)
     assert own.trial(config) is trial
-    count, seconds = own.read_region(config, 1, ((0, 6), (4, 20), (4, 20)))
+    count, taken = own.read_region(config, 1, ((0, 6), (4, 20), (4, 20)))
     assert 0 < count <= trial.bytes
-    assert seconds > 0
+    assert min(taken.wall, taken.core) > 0
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -303,11 +302,12 @@ def test_places_are_the_same_for_all_and_within_the_series() -> None:
 def test_access_is_the_median_without_the_first() -> None:
     answers = iter([(10**6, 99.0), (1, 0.001), (3, 0.003), (2, 0.002)])
 
-    def read(step: int, box: Box) -> tuple[int, float]:
-        return next(answers)
+    def read(step: int, box: Box) -> tuple[int, Spent]:
+        count, seconds = next(answers)
+        return count, Spent(wall=seconds, core=2 * seconds)
 
     access = access_of("a", "b", TRIAL, (3, 20, 5, 40), read, 3)
-    assert (access.milliseconds, access.bytes_read) == (2.0, 2)
+    assert (access.milliseconds, access.core_milliseconds, access.bytes_read) == (2.0, 4.0, 2)
     assert access.region == (16, 5, 16)
 
 
@@ -361,67 +361,51 @@ def source(values: np.ndarray):
 
 def test_cells_are_measured_once(field: Field, tmp_path: Path) -> None:
     sources = {"wave": source(field()), "other": source(field((2, 3, 9, 9)))}
+    coders = own_coders((1, 2), (), {})
     options = {"targets": (40.0,), "bounds": (0.05,), "names": ("SZ3", "ZFP")}
-    first = bench_table(sources, tmp_path, {"effort": 1}, **options)
-    assert first.measured == len(first.cells) == len(list(tmp_path.iterdir())) == 12
+    first = bench_table(sources, tmp_path, coders, **options)
+    assert first.measured == len(first.cells) == len(list(tmp_path.glob("*.json"))) == 16
     for cell in first.cells:
         assert cell.reached
-        assert cell.decode_core_mb_s > 0
-        assert cell.region_ms > 0
-        assert (cell.tile_price is not None) == (cell.codec == "fhash compact")
-    again = bench_table(sources, tmp_path, {"effort": 1}, **options)
+        assert min(cell.encode_mb_s, cell.decode_mb_s, cell.region_ms) > 0
+    assert [cell.codec for cell in first.cells[:4]] == ["fhash 1", "fhash 2", "SZ3", "ZFP"]
+    assert 0.01 < first.startup_seconds < 60
+    again = bench_table(sources, tmp_path, coders, **options)
     assert again.measured == 0
     assert again.cells == first.cells
     next(tmp_path.glob("wave_ZFP_bound*")).unlink()
-    assert bench_table(sources, tmp_path, {"effort": 1}, **options).measured == 1
+    assert bench_table(sources, tmp_path, coders, **options).measured == 1
     changed = {"wave": source(2 * field())}
-    assert bench_table(changed, tmp_path, {"effort": 1}, **options, speed=False).measured == 6
+    assert bench_table(changed, tmp_path, coders, **options, speed=False).measured == 8
+
+
+def test_a_run_that_is_cut_off_keeps_its_cells(field: Field, tmp_path: Path) -> None:
+    def cut(stage: str, done: int, total: int, note: str) -> None:
+        assert (stage, total) == ("table", 2)
+        if done == 1:
+            raise KeyboardInterrupt
+
+    options = {"targets": (40.0,), "bounds": (), "names": ("SZ3",), "speed": False}
+    sources, coders = {"a, b": source(field((2, 3, 9, 9)))}, own_coders((1,), ("fast",), {})
+    with pytest.raises(KeyboardInterrupt):
+        bench_table(sources, tmp_path, coders, **options, progress=cut)
+    with (tmp_path / CSV).open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["series"], row["shape"], row["codec"]) == ("a, b", "2x3x9x9", "fhash 1 fast")
+    assert bench_table(sources, tmp_path, coders, **options).measured == 1
 
 
 def test_a_codec_that_cannot_be_measured_says_why(field: Field, tmp_path: Path) -> None:
-    sources = {"line": source(field((1, 1, 1, 64)))}
-    table = bench_table(
-        sources, tmp_path, {"effort": 1}, targets=(40.0,), bounds=(), names=("SPERR",), speed=False
-    )
-    cell = table.cells[1]
+    sources, coders = {"line": source(field((1, 1, 1, 64)))}, own_coders((1,), (), {})
+    options = {"targets": (40.0,), "bounds": (), "speed": False}
+    cell = bench_table(sources, tmp_path, coders, names=("SPERR",), **options).cells[1]
     assert cell.why.startswith("SPERR ")
-    assert f"- not measured: line, SPERR, 40 dB: {cell.why}" in table.markdown()
-    assert table.rows() == [(table.cells[0], None)]
+    assert (cell.reached, cell.bytes) == (False, None)
+    flat = {"flat": source(np.ones((2, 3, 4, 5)))}
+    for cell in bench_table(flat, tmp_path, coders, names=("SZ3",), **options).cells:
+        assert "is constant" in cell.why
     with pytest.raises(InputError, match="peer is 'zip'"):
-        bench_table(sources, tmp_path, names=("zip",))
-
-
-def cell(codec: str, count: int, *, reached: bool = True) -> RateCell:
-    return RateCell(
-        series="a",
-        shape=(1, 2, 3, 4),
-        dtype="float32",
-        raw_bytes=96,
-        codec=codec,
-        goal="bound",
-        asked=0.01,
-        reached=reached,
-        bytes=count,
-        setting=f"{codec} best",
-        decode_core_mb_s=12.345,
-        one_tile_bytes=800 if codec.startswith("fhash") else None,
-        tile_price=1.25 if codec.startswith("fhash") else None,
-    )
-
-
-def test_the_best_peer_is_the_smallest_that_reached_it() -> None:
-    cells = (cell("fhash compact", 1000), cell("A", 900, reached=False), cell("B", 2000))
-    table = RateTable(cells=cells, measured=0, machine={}, notes=())
-    assert table.rows() == [(cells[0], cells[2])]
-    row = table.markdown().splitlines()[2]
-    assert row == (
-        "| a | 1 % | 1,000 | 800 | 1.25 | B best | 2,000 | 2.000 | - / - | 12.3 / - | - |"
-        " - / 12.3 / - |"
-    )
-    missed = RateTable(
-        cells=(cell("fhash compact", 1000, reached=False),), measured=0, machine={}, notes=()
-    )
-    assert "| 1,000 (missed) | 800 | 1.25 | - | - | - |" in missed.markdown()
+        bench_table(sources, tmp_path, coders, names=("zip",))
 
 
 def test_the_plot_needs_matplotlib(

@@ -141,20 +141,13 @@ class Statistics:
         """
         import numpy as np
 
+        from fhash_codec.features.scan import scan_rows
         from fhash_codec.measure.value_range import pieces
-        from fhash_formats.support.values import exact_number
 
-        gaps = np.isnan(frame)
-        frame = frame if integers is None else integers
-        values = frame[~gaps] if gaps.any() else frame.reshape(-1)
         self.all, self.inside = self.all + frame.size, self.inside + inside
-        if values.size:
-            self.low, self.high = (
-                min(self.low, exact_number(values.min().item())),
-                max(self.high, exact_number(values.max().item())),
-            )
-        for piece in pieces(values):
-            self.mean.add(piece)
+        for piece in pieces(frame if integers is None else integers[~np.isnan(frame)]):
+            _, low, high = scan_rows(piece[None], self.mean)
+            self.low, self.high = min(self.low, low), max(self.high, high)
 
     def result(self) -> dict[str, float | None]:
         """JSON values; None where no vertex has a value."""
@@ -256,7 +249,19 @@ class Selection:
     def frames(
         self, volume: Volume, statistics: Statistics, progress: Callback
     ) -> Iterator[npt.NDArray[Any]]:
-        """Decode the frames (z, y, x), small ones together; all are added to the statistics."""
+        """Decode the frames (z, y, x), small ones together; all are added to the statistics.
+
+        The next ones are decoded while the caller writes those that it has.
+        """
+        from fhash_formats.support.threads import one_ahead
+
+        for frames in one_ahead(self._blocks(volume, statistics, progress)):
+            yield from frames
+
+    def _blocks(
+        self, volume: Volume, statistics: Statistics, progress: Callback
+    ) -> Iterator[npt.NDArray[Any]]:
+        """Frames (t, z, y, x) of some steps at a time."""
         from fhash_formats.support.values import is_wide_integer
 
         background, done = self.outside == "background", 0
@@ -266,11 +271,11 @@ class Selection:
             # float64 has not every integer of 64 bits.
             integers = self._integers(volume, steps) if wide else None
             statistics.add(frames, inside, integers)
-            yield from convert(
-                frames, self.kind, fill=self.fill, background=background, integers=integers
-            )
             done += len(steps)
             progress("decoding", done, len(self.steps), "")
+            yield convert(
+                frames, self.kind, fill=self.fill, background=background, integers=integers
+            )
 
     def _integers(self, volume: Volume, steps: Sequence[float]) -> npt.NDArray[Any]:
         """The frames (t, z, y, x) of some whole steps as the integers that the file holds."""

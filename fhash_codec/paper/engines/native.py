@@ -245,6 +245,27 @@ CPU = torch.device("cpu")
 """The device of the engine."""
 
 
+RATES = {"x86-64-v4": 65e9, "x86-64-v3": 50e9, "baseline": 25e9}
+"""Operations a second of a training in one thread, by the instructions (docs/results.md).
+
+They are within a factor of 2 on three machines. No clock is read: where a series is trained must
+not depend on the load of the machine, since each device has bits of its own.
+"""
+
+
+def cpu_seconds(architecture: Architecture, samples: int) -> float:
+    """Return about how long a training takes on the CPU in torch's threads.
+
+    Args:
+        architecture: the sizes of the model.
+        samples: samples that the training takes, those of all epochs.
+    """
+    # Forward, and backward to the inputs and to the weights: three products of 2 operations each.
+    operations = 6 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
+    rate = RATES[(machine_paths() or ["baseline"])[0]] * torch.get_num_threads()
+    return samples * operations / rate
+
+
 def refusal(architecture: Architecture, device: torch.device) -> str | None:
     """Return why a model cannot be trained by the native engine here; None if it can."""
     if device.type != "cpu":

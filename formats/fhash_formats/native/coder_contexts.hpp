@@ -9,6 +9,7 @@
 #include <cstring>
 #include <vector>
 
+#include "bands.hpp"
 #include "mixing.hpp"
 
 namespace {
@@ -19,19 +20,12 @@ const int DECISIONS = 16;                   // slots of a context
 const int UNARY = 14;                       // magnitudes from this one on have an escape code
 const int SHARED = 2;  // decisions from this one on are one for both quantisers; those of class 1
                        // before it have the slots and weights from UNARY on
-const int KINDS = 64;                       // kinds of bands
 const int LEVELS = 128;                     // quarter octaves of the expected magnitude
 const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
 const int MAX_MAGNITUDE = 4095;             // as contexts see it, so that sums stay in 32 bits
 const int PADDING = 2;                      // zeros beside a row of magnitudes
 const int LOG_PADDING = 4;                  // zeros beside a row of logarithms
 const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
-
-// Columns of the table of bands (transform/coder.py). LOW, HIGH and SHIFT are the first of
-// four columns, for t, z, y and x. BAND and SHIFT are columns within a reference.
-enum Column { LOW = 0, HIGH = 4, KIND = 8, REFERENCES = 9, BAND = 0, SHIFT = 1 };
-const int REFERENCE_COUNT = 4, REFERENCE_COLUMNS = 5;
-const int COLUMNS = REFERENCES + REFERENCE_COUNT * REFERENCE_COLUMNS;
 
 // Weights of neighbours in the expected magnitude, in 1/1024.
 const int LEFT = 184, LEFT2 = 20;                 // the left neighbour, and the second one
@@ -129,17 +123,12 @@ struct Sums {
     }
 };
 
-struct Reference {
-    int band, shift[4];
-};
-struct Band {
-    int low[4], size[4], kind;
-    Reference references[REFERENCE_COUNT];
+struct Band : BandPlace {
     int64_t stride[3];                 // of magnitudes, along t, z and y
     std::vector<uint16_t> magnitudes;  // rows with PADDING zeros at both ends
     std::vector<uint8_t> filled;       // by row: whether it has a magnitude above 0
     std::vector<int16_t> logs;         // rows of logarithms, see coder_signs.hpp
-    bool any;                          // whether the band has one
+    bool any = false;                  // whether the band has one
 };
 
 // A row of a band.
@@ -150,28 +139,6 @@ struct Row {
     const uint16_t* references[REFERENCE_COUNT];  // row of each reference for this row, or null
     int reference_y[REFERENCE_COUNT];             // index of that row along y
 };
-
-// Read the table of `count` bands. False for a band that does not lie within the shape.
-inline bool read_bands(const int32_t* table, const int64_t* shape, std::vector<Band>& bands) {
-    for (size_t b = 0; b < bands.size(); b++) {
-        const int32_t* const row = table + b * COLUMNS;
-        Band& band = bands[b];
-        for (int a = 0; a < 4; a++) {
-            const int32_t low = row[LOW + a], high = row[HIGH + a];
-            if (low < 0 || low > high || high > shape[a]) return false;
-            band.low[a] = low;
-            band.size[a] = high - low;
-        }
-        band.kind = row[KIND];
-        for (int k = 0; k < REFERENCE_COUNT; k++) {
-            const int32_t* const reference = row + REFERENCES + k * REFERENCE_COLUMNS;
-            band.references[k].band = reference[BAND];
-            for (int a = 0; a < 4; a++) band.references[k].shift[a] = reference[SHIFT + a];
-        }
-        band.any = false;
-    }
-    return true;
-}
 
 // Find the row of each reference that stands for this row; none where it and the rows above and
 // below it are zeros, which add nothing. Whether the row of the parent is filled.

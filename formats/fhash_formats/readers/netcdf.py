@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
+from math import prod
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf import (
     Column,
     Packing,
@@ -49,14 +52,20 @@ from fhash_formats.readers.common.variables import (
     plain_name,
 )
 from fhash_formats.readers.hdf5 import is_hdf5, require_filters
-from fhash_formats.series import AXES, Coordinate, SourceMetadata, shown_name
-from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import STORED, is_wide_integer, json_attributes, text_of
+from fhash_formats.series import (
+    AXES,
+    COORDINATES,
+    Coordinate,
+    SourceMetadata,
+    references,
+    shown_name,
+)
+from fhash_formats.support.values import STORED, decoded_text, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Exact = Callable[[Values, tuple[slice, ...]], Values]
+    Groups = Mapping[str, "xr.Dataset | Group"]
 
 DEFAULT_FILLS = {
     "i2": -32767,
@@ -80,60 +89,155 @@ def magic_of(path: Path) -> bytes:
         return file.read(4)
 
 
-@contextmanager
-def quietly() -> Iterator[None]:
-    """Silence xarray's warnings about a file (several fill values, bounds that are missing).
+class Array:
+    """A variable of a file, decoded by the CF conventions: what a reader needs of xarray's.
 
-    None of them changes the values that are read.
+    Attributes:
+        stored: as the file has it.
+        dims, shape, dtype: of the values; an array of letters is one of texts.
+        attrs, encoding: what the file says of it.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+
+    def __init__(self, source: str, stored: Stored, chunks: Any, *, letters: bool) -> None:
+        self.stored, self.attrs = stored, stored.attributes
+        self.encoding = {**stored.attributes, "dtype": stored.dtype, "chunksizes": chunks}
+        self.dims, self.shape, self.dtype = stored.dimensions, stored.shape, stored.dtype
+        self._letters, self._packing = letters, None
+        if letters:
+            self.dims, self.dtype = self.dims[:-1], np.dtype(f"S{self.shape[-1]}")
+            self.shape = self.shape[:-1]
+        with suppress(InputError):  # which the variable that is chosen raises, see `declared`
+            self._packing = declared(source, self)
+        if self._packing is not None:
+            self.dtype = self._packing.dtype
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        return prod(self.shape)
+
+    def __getitem__(self, places: Any) -> npt.NDArray[Any]:
+        if self._letters:
+            stored = np.ascontiguousarray(self.stored.read((*np.index_exp[places], slice(None))))
+            return stored.view(f"S{stored.shape[-1]}")[..., 0]
+        values = self.stored.read(np.index_exp[places])
+        return values if self._packing is None else self._packing.unpack(values)
+
+    def to_numpy(self) -> npt.NDArray[Any]:
+        """All values."""
+        return self[...]
 
 
-def open_groups(
-    source: str, path: Path, head: bytes, *, raw: bool = False, decoded: bool = True
-) -> Mapping[str, xr.Dataset]:
-    """Datasets of all groups by path, "/" first.
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """A group of a file, as a Dataset of xarray is one; `coords` are names of variables."""
 
-    raw: leave values packed. decoded: whether attributes that name variables are taken out, and
-    these made coordinates; if not, everything is as it is stored.
+    variables: Mapping[str, Array]
+    coords: Sequence[str]
+    attrs: Mapping[str, Any]
+
+
+def _group(
+    source: str, variables: Mapping[str, tuple[Stored, Any]], attributes: Mapping[str, Any]
+) -> Group:
+    """The group of stored variables, each with the shape of its chunks.
+
+    Coordinates are what a dimension is called, and what the attributes of CF name, if all that one
+    attribute names is there (xarray's `decode_coords="all"`).
     """
-    import xarray as xr
+    stored = [each for each, _ in variables.values()]
+    coords = {name for each in stored for name in each.dimensions}
+    for told in ({COORDINATES: attributes.get(COORDINATES)}, *(each.attributes for each in stored)):
+        for key, found in groupby(references(told), itemgetter(0)):
+            names = {name for _, name in found}
+            if key == COORDINATES or (key != "ancillary_variables" and names <= {*variables}):
+                coords |= names
+    # a dimension of letters is the last one, has no variable, and nothing else has it
+    other = {*variables, *(name for each in stored for name in each.dimensions[:-1])}
+    other |= {name for each in stored if each.dtype.kind != "S" for name in each.dimensions}
+    arrays = {}
+    for name, (each, chunks) in variables.items():
+        letters = each.dtype == "S1" and each.dimensions and each.dimensions[-1] not in other
+        arrays[name] = Array(source, each, chunks, letters=bool(letters and each.shape[-1]))
+    return Group(
+        variables=arrays, coords=[name for name in arrays if name in coords], attrs=attributes
+    )
 
-    options: dict[str, Any] = {
-        "decode_times": False,
-        "decode_timedelta": False,
-        "decode_coords": "all",
-        "cache": False,
-        "chunks": None,
-        "mask_and_scale": not raw,
-    }
-    if not decoded:
-        options |= {"decode_coords": False, "concat_characters": False, "mask_and_scale": False}
+
+def open_groups(source: str, path: Path, head: bytes) -> tuple[dict[str, Group], Callable[[], Any]]:
+    """All groups of a file by path, "/" first, and what closes them."""
     if head in CLASSIC:
-        from fhash_formats.readers.netcdf3 import ClassicStore
+        from fhash_formats.readers.netcdf3 import read_header
 
         with refusing(f"{source} cannot be read as classic NetCDF"):
-            return {"/": xr.open_dataset(ClassicStore(path), engine="store", **options)}
+            header = read_header(path)
+        arrays = {
+            name: (_stored(each, each.attributes), None) for name, each in header.variables.items()
+        }
+        return {"/": _group(source, arrays, header.attributes)}, lambda: None
+    import h5netcdf
+
     # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
-    return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+    file = h5netcdf.File(path, "r", phony_dims="access", decode_vlen_strings=True)
+    try:
+        return dict(_groups_of(source, "/", file)), file.close
+    except BaseException:
+        file.close()
+        raise
 
 
-def close_groups(groups: Mapping[str, xr.Dataset]) -> None:
-    """Close the datasets of all groups."""
-    with quietly():
-        for dataset in groups.values():
-            dataset.close()
+def _groups_of(source: str, name: str, group: Any) -> Iterator[tuple[str, Group]]:
+    arrays = {
+        key: (_stored(each, _attributes_of(each)), each.chunks)
+        for key, each in group.variables.items()
+    }
+    yield name, _group(source, arrays, _attributes_of(group))
+    for key, inner in group.groups.items():
+        yield from _groups_of(source, f"{name.rstrip('/')}/{key}", inner)
 
 
-def declared(source: str, array: xr.Variable) -> Packing | None:
-    """The packing of a variable that xarray unpacks; None for types that cannot be packed."""
+def _attributes_of(described: Any) -> dict[str, Any]:
+    """Attributes in an HDF5 file, with bytes as texts unless they stand for missing values."""
+    return {
+        key: decoded_text(value)
+        if isinstance(value, bytes) and key not in ("_FillValue", "missing_value")
+        else value
+        for key, value in described.attrs.items()
+    }
+
+
+def _stored(array: Any, attributes: Mapping[str, Any]) -> Stored:
+    """A variable of h5netcdf, or a ClassicArray; numbers in native byte order."""
+    text = array.dtype.kind == "O" and (array.dtype.metadata or {}).get("vlen") in (str, bytes)
+    # without what h5py notes of the stored type, such as enumerations
+    dtype = np.dtype(str if text else array.dtype.newbyteorder("=").str)
+    if attributes.get("dtype") == "bool":  # as xarray writes booleans
+        dtype, attributes = np.dtype(bool), {**attributes}
+        del attributes["dtype"]
+
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        values = np.asarray(array[places])
+        return values if dtype.kind in "UO" else values.astype(dtype, copy=False)
+
+    return Stored(
+        dimensions=tuple(map(str, array.dimensions)),
+        shape=array.shape,
+        dtype=dtype,
+        attributes=attributes,
+        read=read,
+    )
+
+
+def declared(source: str, array: xr.Variable | Array) -> Packing | None:
+    """The packing of a variable; None for types that cannot be packed."""
     stored = np.dtype(array.encoding.get("dtype", array.dtype))
     return packing(source, stored, array.encoding) if stored.kind in "iuf" else None
 
 
-def default_fill(array: xr.Variable, packed: Packing | None) -> float | int | None:
+def default_fill(array: xr.Variable | Array, packed: Packing | None) -> float | int | None:
     """The number that NetCDF puts where nobody wrote, as it is read.
 
     None for bytes, and where the variable declares a fill value of its own.
@@ -145,41 +249,6 @@ def default_fill(array: xr.Variable, packed: Packing | None) -> float | int | No
         return None
     value: float | int = packed.unpack(np.array([stored], packed.stored))[0].item()
     return value
-
-
-def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:
-    """A test that tells a fill value from its neighbours; None where float64 suffices.
-
-    xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
-    """
-    stored = np.dtype(encoding.get("dtype", np.float32))
-    if not is_wide_integer(stored):
-        return None
-    plain = {
-        key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-        for key, value in encoding.items()
-    }
-    packed = packing(source, stored, plain)
-    if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
-        return None
-
-    def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
-        if not np.isnan(values).any():
-            return values
-        return packed.unpack(_stored(path, name, ranges))
-
-    return exact
-
-
-def _stored(path: Path, name: str, ranges: tuple[slice, ...]) -> Values:
-    if magic_of(path) in CLASSIC:
-        from fhash_formats.readers.netcdf3 import read_header
-
-        return read_header(path).variables[name].read(ranges)
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[name][ranges])
 
 
 def check_filters(source: str, path: Path, name: str) -> None:
@@ -208,14 +277,13 @@ def _metadata(
     """
     source = str(path)
     with refusing(f"{source} cannot be read as NetCDF"):
-        with quietly():
-            opened = open_groups(source, path, magic_of(path), decoded=False)
+        opened, close = open_groups(source, path, magic_of(path))
         try:
             scope = [opened[group] for group in groups if group in opened]
             variables = {
-                str(name): stored_variable(array)
-                for dataset in reversed(scope)
-                for name, array in dataset.variables.items()
+                name: array.stored
+                for group in reversed(scope)
+                for name, array in group.variables.items()
             }
             wanted = Wanted(
                 source=source,
@@ -226,30 +294,23 @@ def _metadata(
             )
             return metadata_of(wanted, variables, scope[0].attrs, arranged)
         finally:
-            close_groups(opened)
+            close()
 
 
 def stored_variable(array: xr.Variable) -> Stored:
-    """A variable of a dataset of which nothing was decoded."""
+    """A variable of xarray of which nothing was decoded."""
     return Stored(
         dimensions=tuple(map(str, array.dims)),
         shape=array.shape,
         dtype=array.dtype,
         attributes=dict(array.attrs),
-        read=partial(_values, array),
+        read=lambda places: array[places].to_numpy(),
     )
-
-
-def _values(array: xr.Variable, places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
-    with quietly():
-        values: npt.NDArray[Any] = array[places].to_numpy()
-    # without what xarray notes of the stored type, such as enumerations
-    return values if values.dtype.kind == "O" else np.asarray(values, dtype=values.dtype.str)
 
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
 MADE_UP = "phony_dim_"
-"""Prefix of the names that xarray makes up for dimensions without one."""
+"""Prefix of the names that h5netcdf makes up for dimensions without one."""
 
 
 def matches(head: bytes, path: Path) -> bool:
@@ -276,21 +337,20 @@ def open_netcdf(path: Path, request: Request) -> FileSeries:
     """Open the series in a NetCDF file: the only suitable variable of any group, or a named one."""
     source, stamp = str(path), Stamp.of(path)
     head = magic_of(path)
-    with quietly(), refusing(f"{source} cannot be read as NetCDF"):
-        groups = open_groups(source, path, head)
+    with refusing(f"{source} cannot be read as NetCDF"):
+        groups, close = open_groups(source, path, head)
         try:
-            return _series(source, path, stamp, groups, request)
+            files = StoredFiles(source=source, stamp=stamp, close=close)
+            return _series(source, path, files, groups, request)
         except BaseException:
-            close_groups(groups)
+            close()
             raise
 
 
 class NetcdfFile(FileOfArrays):
-    """The variables of an open NetCDF file."""
+    """The variables of an open NetCDF file, or of datasets of xarray."""
 
-    def __init__(
-        self, source: str, path: Path, groups: Mapping[str, xr.Dataset], request: Request
-    ) -> None:
+    def __init__(self, source: str, path: Path, groups: Groups, request: Request) -> None:
         self.path, self.groups = path, groups
         found = [
             Variable(
@@ -306,12 +366,12 @@ class NetcdfFile(FileOfArrays):
         ]
         super().__init__(source, request, found)
 
-    def array(self, variable: Variable) -> xr.Variable:
+    def array(self, variable: Variable) -> xr.Variable | Array:
         """The stored array of a variable; of the first step where it has one array a step."""
         group, name = variable.handle
         return self.groups[group].variables[name]
 
-    def scope(self, variable: Variable) -> list[xr.Dataset]:
+    def scope(self, variable: Variable) -> list[xr.Dataset | Group]:
         """The group of a variable and those around it."""
         return [
             self.groups[place] for place in _upwards(variable.handle[0]) if place in self.groups
@@ -336,20 +396,11 @@ class NetcdfFile(FileOfArrays):
     def _reading(self, variable: Variable) -> Read:
         check_filters(self.source, self.path, variable.name)
         array = self.array(variable)
-        exact = None
-        if not self.request.raw_values:
-            exact = exactly_filled(self.source, self.path, variable.name, array.encoding)
-
-        def read(ranges: tuple[slice, ...]) -> Any:
-            with quietly():
-                values = array[ranges].to_numpy()
-                return values if exact is None else exact(values, ranges)
-
-        return read
+        assert isinstance(array, Array), "a dataset of xarray reads its values itself"
+        return array.stored.read if self.request.raw_values else array.__getitem__
 
     def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
         """Coordinates of the axes, of what was selected, and of scalars that lie beside."""
-        group, name = variable.handle
         names = [str(dimension) for dimension in self.array(variable).dims]
         if variable.members:
             names.insert(0, MADE_UP + "step")
@@ -360,7 +411,6 @@ class NetcdfFile(FileOfArrays):
             kept,
             layout.shape,
             self.scope(variable),
-            self.groups[group][name],
             self.request.axes is not None,
         )
 
@@ -382,7 +432,7 @@ class NetcdfFile(FileOfArrays):
         return float(array.to_numpy().reshape(-1)[0]), str(array.attrs.get("units", ""))
 
 
-def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column | None:
+def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset | Group]) -> Column | None:
     """The column along a dimension: its namesake, also of texts, else numbers along it."""
     if dimension.startswith(MADE_UP):
         return None
@@ -403,54 +453,39 @@ def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column 
 
 
 def _series(
-    source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request
+    source: str, path: Path, files: StoredFiles, groups: Groups, request: Request
 ) -> FileSeries:
     found = NetcdfFile(source, path, groups, request)
     variable = found.choose(request.var)
     layout = found.arrange(variable)
     array = found.array(variable)
-    packed = declared(source, array)
-    without = STORED
-    if request.raw_values:
-        stored = open_groups(source, path, magic_of(path), raw=True)
-        opened = [groups, stored]
-        found = NetcdfFile(source, path, stored, request)
-        array = found.array(variable)
+    packed, without = declared(source, array), STORED
+    dtype = array.dtype
+    if request.raw_values and packed is not None:
         # counts have not the unit of the values
-        without |= {"units"} if packed is not None and packed.scaled else frozenset()
-        packed = None
-    else:
-        opened = [groups]
-
-    def close() -> None:
-        for each in opened:
-            close_groups(each)
-
-    try:
-        members = [each.name for each in variable.members or (variable,)]
-        parts, beside = hdf5_parts(source, path, members)
-        chunks = array.encoding.get("chunksizes")
-        # without names, dimensions have those of the axes
-        names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
-        series = FileSeries(
-            files=StoredFiles(source=source, stamp=stamp, close=close, beside=beside),
-            name=plain_name(shown_name(variable.name, names)),
-            values=StoredValues(
-                shape=layout.shape,
-                dtype=array.dtype,
-                axes=layout.axes,
-                fetch=layout.fetch(found.reading(variable)),
-                chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
-                packing=packed,
-                not_stored=not_stored(parts, layout, joined=bool(variable.members)),
-                default_fill=None if request.raw_values else default_fill(array, packed),
-            ),
-            coords=NetcdfFile(source, path, groups, request).coordinates(variable, layout),
-            attributes=json_attributes(array.attrs, without=without) | layout.attributes(),
-        )
-    except BaseException:
-        close()
-        raise
+        without |= {"units"} if packed.scaled else frozenset()
+        packed, dtype = None, array.encoding["dtype"]
+    members = [each.name for each in variable.members or (variable,)]
+    parts, beside = hdf5_parts(source, path, members)
+    chunks = array.encoding.get("chunksizes")
+    # without names, dimensions have those of the axes
+    names = {each.name or axis for each, axis in zip(layout.kept, layout.axes, strict=True)}
+    series = FileSeries(
+        files=replace(files, beside=beside),
+        name=plain_name(shown_name(variable.name, names)),
+        values=StoredValues(
+            shape=layout.shape,
+            dtype=dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(found.reading(variable)),
+            chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
+            packing=packed,
+            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+            default_fill=None if request.raw_values else default_fill(array, packed),
+        ),
+        coords=found.coordinates(variable, layout),
+        attributes=json_attributes(array.attrs, without=without) | layout.attributes(),
+    )
     if not variable.members and not any(str(name).startswith(MADE_UP) for name in array.dims):
         series.metadata = partial(
             _metadata,
@@ -466,13 +501,13 @@ def _series(
 def list_netcdf(path: Path, request: Request) -> list[Listed]:
     """The variables of a NetCDF file."""
     source = str(path)
-    with quietly(), refusing(f"{source} cannot be read as NetCDF"):
-        groups = open_groups(source, path, magic_of(path))
+    with refusing(f"{source} cannot be read as NetCDF"):
+        groups, close = open_groups(source, path, magic_of(path))
         try:
             found = NetcdfFile(source, path, groups, replace(request, raw_values=False))
             return listing(source, found.variables, found.dimensions, request, found.packing)
         finally:
-            close_groups(groups)
+            close()
 
 
 def _upwards(group: str) -> list[str]:
@@ -484,7 +519,9 @@ def _upwards(group: str) -> list[str]:
     return ["/" + "/".join(parts[:count]) for count in range(len(parts), -1, -1)]
 
 
-def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, xr.Variable]]:
+def _along(
+    dimension: str, scope: Sequence[xr.Dataset | Group]
+) -> Iterator[tuple[str, xr.Variable | Array]]:
     """Number variables along one dimension alone: its namesake, then coordinates, then the rest.
 
     A made-up dimension has none: xarray shares those by length, and a length has no meaning.
@@ -505,7 +542,7 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
                     yield str(key), array
 
 
-def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
+def _role(dimension: str, scope: Sequence[xr.Dataset | Group]) -> str | None:
     for name, array in _along(dimension, scope):
         role = role_of_coordinate(name, array.attrs)
         if role is not None:
@@ -513,7 +550,7 @@ def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
     return role_of_name(dimension)
 
 
-def _columns(dataset: xr.Dataset) -> dict[str, Column]:
+def _columns(dataset: xr.Dataset | Group) -> dict[str, Column]:
     """Variables of a dataset that may be coordinates, by lower-case name."""
     arrays = [
         (str(key), array)
@@ -533,8 +570,7 @@ def _coordinates(
     axes: Sequence[str],
     dimensions: Sequence[str],
     shape: Sequence[int],
-    scope: Sequence[xr.Dataset],
-    values: xr.DataArray,
+    scope: Sequence[xr.Dataset | Group],
     certain: bool,
 ) -> dict[str, Coordinate]:
     """Coordinate of each dimension: its namesake, else one along it whose CF role is its axis.
@@ -570,7 +606,8 @@ def _coordinates(
                 continue
         if found is not None:
             coords[axis] = coordinate(source, found.name, found.read(), found.attributes)
-    for key, scalar in values.coords.items():
+    for key in map(str, scope[0].coords):
+        scalar = scope[0].variables[key]
         role = role_of_coordinate(str(key), scalar.attrs)
         if (
             scalar.ndim == 0

@@ -1,4 +1,4 @@
-"""Classic NetCDF files (NetCDF-3): CDF-1, CDF-2 and CDF-5, as a data store of xarray.
+"""Classic NetCDF files (NetCDF-3): CDF-1, CDF-2 and CDF-5.
 
 The layout is that of the NetCDF classic format specification
 (https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html): a header with
@@ -18,10 +18,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from xarray import Variable
-from xarray.backends import BackendArray
-from xarray.backends.common import AbstractDataStore
-from xarray.core import indexing
 
 from fhash_formats.support.values import decoded_text
 
@@ -56,7 +52,7 @@ class Header:
     variables: dict[str, ClassicArray]
 
 
-class ClassicArray(BackendArray):
+class ClassicArray:
     """An array of a classic file, read as it is indexed; the file is open no longer than that.
 
     Attributes:
@@ -88,13 +84,7 @@ class ClassicArray(BackendArray):
         last = sum((n - 1) * stride for n, stride in zip(self.shape, self.strides, strict=True))
         return self.begin + last + self.dtype.itemsize
 
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> npt.NDArray[Any]:
-        found: npt.NDArray[Any] = indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.BASIC, self.read
-        )
-        return found
-
-    def read(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
+    def __getitem__(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
         """The stored numbers at integers and slices, big-endian."""
         if 0 in self.shape:
             return np.empty(self.shape, self.dtype)[key]
@@ -108,28 +98,6 @@ class ClassicArray(BackendArray):
             copied: npt.NDArray[Any] = stored[key].copy()
             del stored  # the map cannot be closed before
         return copied
-
-
-class ClassicStore(AbstractDataStore):
-    """A classic file as xarray opens it (`xr.open_dataset(store, engine="store")`)."""
-
-    def __init__(self, path: Path) -> None:
-        self.header = read_header(path)
-
-    def get_variables(self) -> dict[str, Variable]:
-        return {
-            name: Variable(array.dimensions, indexing.LazilyIndexedArray(array), array.attributes)
-            for name, array in self.header.variables.items()
-        }
-
-    def get_attrs(self) -> dict[str, Any]:
-        return self.header.attributes
-
-    def get_dimensions(self) -> dict[str, int | None]:
-        return self.header.lengths
-
-    def get_encoding(self) -> dict[str, Any]:
-        return {"unlimited_dims": {k for k, n in self.header.lengths.items() if n is None}}
 
 
 class _Bytes:

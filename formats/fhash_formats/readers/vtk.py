@@ -394,12 +394,12 @@ class _Dataset:
 
 def is_vtkhdf(head: bytes, path: Path) -> bool:
     """Whether this is an HDF5 file with a group VTKHDF, whatever its suffix."""
-    import h5py
-
     if not is_hdf5(head):
         return False
     if path.suffix.lower() in VTKHDF_SUFFIXES:
         return True
+    import h5py
+
     try:
         with h5py.File(path, "r") as file:
             return "VTKHDF" in file

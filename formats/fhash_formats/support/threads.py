@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from itertools import count
 from math import prod
 from threading import Lock
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from fhash_formats.errors import InputError, RegionError
 
@@ -216,6 +216,17 @@ def map_ahead(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def one_ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """Yield the items, the next of which is made in another thread meanwhile."""
+    with thread_pool() as pool:
+        end = object()
+        waiting = pool.submit(next, items, end)
+        while (item := waiting.result()) is not end:
+            waiting = pool.submit(next, items, end)
+            yield cast(Item, item)
+            del item  # its memory is free before the one after the next is made
 
 
 class _Threads:

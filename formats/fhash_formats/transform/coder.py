@@ -220,6 +220,7 @@ def encode_integers(
     scaled: npt.NDArray[np.float32] | None = None,
     weight: float = 0.0,
     trellis: bool = False,
+    fast: bool = False,
 ) -> Encoded:
     """Code integers in the bands of a table; integers outside the bands count as 0.
 
@@ -232,7 +233,11 @@ def encode_integers(
         weight: squared steps that a bit is worth.
         trellis: whether the integers are those of two quantisers. Raises InputError
             for integers that are not, and does not go with `scaled`.
+        fast: whether to code them by the fast coder (native/fast.cpp), which has no trellis.
     """
+    if fast:
+        assert not trellis
+        return _encode_fast(integers, table, scaled, weight)
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
     given = np.ascontiguousarray(integers, dtype=np.int32)
@@ -268,24 +273,148 @@ def decode_integers(
     table: Table,
     *,
     trellis: bool = False,
+    fast: bool = False,
 ) -> Integers:
-    """The integers (t, z, y, x) of a shape, int32; `trellis` as for the encoder.
+    """The integers (t, z, y, x) of a shape, int32; `trellis` and `fast` as for the encoder.
 
     Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
     """
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
-    code = native.library().fhash_decode(
-        _pointer(integers),
-        trellis,
-        (ctypes.c_int64 * 4)(*shape),
-        *array_arguments(table),
-        *state_arguments(prior_state(trellis)),
-        *array_arguments(source),
-    )
+    where = ((ctypes.c_int64 * 4)(*shape), *array_arguments(table))
+    if fast:
+        prior = fast_prior()
+        code = native.library().fhash_fast_decode(
+            _pointer(integers),
+            *where,
+            _pointer(prior.defaults),
+            _pointer(prior.lookup),
+            *array_arguments(source),
+        )
+    else:
+        code = native.library().fhash_decode(
+            _pointer(integers),
+            trellis,
+            *where,
+            *state_arguments(prior_state(trellis)),
+            *array_arguments(source),
+        )
     if checked(code) < 0:
         raise DamagedFileError("the coded integers are damaged")
     return integers
+
+
+CHOICES = 64
+"""Distributions of the fast coder, of tokens and as many of signs, that a context may have."""
+TOKENS = 16
+"""Symbols of a distribution."""
+FAST_CONTEXTS = 208
+"""Contexts of the fast coder that have a distribution."""
+SLOTS = 2048
+"""Slots of a distribution: the unit of its probabilities."""
+
+_FAST_PRIOR_FILE = Path(__file__).with_name("fast_prior.bin")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastPrior:
+    """The distributions of the fast coder.
+
+    Attributes:
+        slots: uint16 (2 CHOICES + 1, TOKENS), of the SLOTS those of each symbol: distributions of
+            tokens, of signs, and that of nothing.
+        defaults: uint8 (FAST_CONTEXTS,), the distribution of each context unless a tile names
+            another.
+        lookup: uint32 (2 CHOICES + 1, SLOTS), of each slot the symbol (4 bits), its place among the
+            slots of that symbol (12 bits), and their number.
+    """
+
+    slots: npt.NDArray[np.uint16]
+    defaults: npt.NDArray[np.uint8]
+    lookup: npt.NDArray[np.uint32]
+
+
+@cache
+def fast_prior() -> FastPrior:
+    """The prior of the fast coder; it is read-only."""
+    data = _FAST_PRIOR_FILE.read_bytes()
+    count = CHOICES * TOKENS
+    slots = np.zeros((2 * CHOICES + 1, TOKENS), np.uint16)
+    slots[:CHOICES] = np.frombuffer(data, "<u2", count).reshape(CHOICES, TOKENS)
+    # That a sign differs from what is foretold has a probability of (2 n + 1) / 256.
+    slots[CHOICES:-1, 1] = SLOTS // (4 * CHOICES) * (2 * np.arange(CHOICES) + 1)
+    slots[CHOICES:, 0] = SLOTS - slots[CHOICES:, 1]
+    symbols = np.array([np.repeat(np.arange(TOKENS), row) for row in slots])
+    of_symbol = np.take_along_axis(slots.astype(np.int64), symbols, 1)
+    first = np.take_along_axis(np.cumsum(slots, axis=1, dtype=np.int64) - slots, symbols, 1)
+    lookup = symbols | (np.arange(SLOTS) - first) << 4 | of_symbol << 16
+    prior = FastPrior(
+        slots=slots,
+        defaults=np.frombuffer(data, np.uint8, FAST_CONTEXTS, 2 * count),
+        lookup=lookup.astype(np.uint32),
+    )
+    for array in (prior.slots, prior.lookup):
+        array.setflags(write=False)
+    return prior
+
+
+def _encode_fast(
+    integers: Integers, table: Table, scaled: npt.NDArray[np.float32] | None, weight: float
+) -> Encoded:
+    """Code integers by the fast coder; the arguments are those of `encode_integers`."""
+    given = np.ascontiguousarray(integers, dtype=np.int32)
+    chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
+    capacity = max(4096, given.size // 2)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        result = given if chosen is None else np.zeros_like(given)
+        size = _fast(result, chosen, 1.0, weight, given.shape, table, buffer)[0]
+        if size <= capacity:
+            return Encoded(data=buffer[:size].tobytes(), integers=result)
+        capacity = size
+
+
+def foretell(
+    coefficients: npt.NDArray[np.float32], table: Table, scale: float, weight: float
+) -> tuple[float, float]:
+    """The bytes that the fast coder would take for coefficients, and the sum of squared errors.
+
+    Args:
+        coefficients: (t, z, y, x).
+        table: the bands.
+        scale: 1 / quantiser step.
+        weight: squared steps that a bit is worth.
+
+    Returns bytes, and the error in squared steps.
+    """
+    nothing = np.empty(0, np.uint8)
+    return _fast(None, coefficients, scale, weight, coefficients.shape, table, nothing)[1:]
+
+
+def _fast(
+    integers: Integers | None,
+    values: npt.NDArray[np.float32] | None,
+    scale: float,
+    weight: float,
+    shape: Sequence[int],
+    table: Table,
+    buffer: npt.NDArray[np.uint8],
+) -> tuple[int, float, float]:
+    """Call the fast coder; bytes, those that it foretold, and the error."""
+    prior, results = fast_prior(), (ctypes.c_double * 2)()
+    size = native.library().fhash_fast_encode(
+        _pointer(integers),
+        _pointer(values),
+        scale,
+        weight,
+        (ctypes.c_int64 * 4)(*shape),
+        *array_arguments(table),
+        _pointer(prior.slots),
+        _pointer(prior.defaults),
+        *array_arguments(buffer),
+        results,
+    )
+    return checked(size), results[0], results[1]
 
 
 def encode_block(integers: Integers) -> bytes:

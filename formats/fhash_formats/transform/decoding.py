@@ -274,18 +274,23 @@ def _linear_and_residual(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
+    if settings.trellis and stream.fast:
+        raise DamagedFileError("a coded tile is of the fast coder, which has no trellis")
     body, rest = stream.body, stream.residual
     assert body is not None, "a transformed stream has a body"
 
     def coefficients() -> Integers:
         table = band_table(settings.transform, shape)
-        return decode_integers(body, shape, table, trellis=settings.trellis)
+        return decode_integers(body, shape, table, trellis=settings.trellis, fast=stream.fast)
 
     residual = None
     if rest is None or lod:
         integers = coefficients()
     else:
-        decoders = [coefficients, partial(decode_integers, rest, shape, single_band(shape))]
+        decoders = [
+            coefficients,
+            partial(decode_integers, rest, shape, single_band(shape), fast=stream.fast),
+        ]
         integers, residual = in_threads(_call, decoders)
     return linear_values(integers, transform, settings, lod, in_place=True), residual
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
+from fhash_formats.errors import InputError
 from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.transform.coder import (
     HIGH,
@@ -220,14 +221,16 @@ def choose_integers(
 
 
 def code_coefficients(
-    coefficients: Values, settings: TileSettings, weight: float, passes: int
+    coefficients: Values, settings: TileSettings, weight: float, passes: int, *, fast: bool = False
 ) -> tuple[bytes, Integers] | None:
     """The coded coefficients, and the integers that they decode to; None where one is too large.
 
     The arguments are those of `choose_integers`. Without a trellis, 2 passes code the integers that
-    were chosen once more.
+    were chosen once more. fast: whether to code them by the fast coder, which has no trellis.
     """
     table = band_table(settings.transform, coefficients.shape)
+    if settings.trellis and fast:
+        raise InputError("the fast coder has no trellis")
     if settings.trellis:
         path = choose_integers(coefficients, settings, weight, passes)
         if path is None:
@@ -237,14 +240,15 @@ def code_coefficients(
     largest = max(-int(integers.min()), int(integers.max()))
     if largest >= LARGEST:
         return None
-    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    chosen_of = scaled if weight > 0 else None
+    coded = encode_integers(integers, table, scaled=chosen_of, weight=weight, fast=fast)
     chosen = coded.integers
     if largest >= MAX_CHOSEN and weight > 0 and settings.double:
         large = np.abs(integers) >= MAX_CHOSEN
         nearest = np.rint(coefficients / settings.step).astype(np.int32)
         chosen = np.where(large, nearest, chosen)
-    if (passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table)
+    if (passes > 1 and weight > 0 and not fast) or chosen is not coded.integers:
+        coded = encode_integers(chosen, table, fast=fast)
     return coded.data, coded.integers
 
 
@@ -365,6 +369,7 @@ class Coding:
         density: how thoroughly it looks; see `filling.filled`.
         keep_missing: whether values that are not finite come back as they were.
         own_settings: whether the stream holds the settings.
+        fast: whether coefficients and residual are coded by the fast coder, for more bytes.
     """
 
     weight: float = 0.0
@@ -375,6 +380,7 @@ class Coding:
     density: int = 1
     keep_missing: bool = True
     own_settings: bool = False
+    fast: bool = False
 
 
 _DEFAULT_CODING = Coding()
@@ -603,7 +609,8 @@ def _transformed_tile(task: _Task) -> CodedTile:
     transform = transform_for(settings, task.shape)
     target = _target(task, transform)
     coefficients = _free_coefficients(task, transform, target)
-    coded = code_coefficients(coefficients, settings, task.coding.weight, task.coding.passes)
+    weight, passes, fast = task.coding.weight, task.coding.passes, task.coding.fast
+    coded = code_coefficients(coefficients, settings, weight, passes, fast=fast)
     if coded is None:
         return task.exact()
     data, integers = coded
@@ -620,7 +627,8 @@ def _transformed_tile(task: _Task) -> CodedTile:
     decoded = within_range(decoded, settings)
     if error is not None and not within(task.values, decoded, error, task.counted):
         return task.exact()
-    stream = build_stream(TRANSFORMED, task.own_settings, task.missing, data, residual, mask)
+    own = task.own_settings
+    stream = build_stream(TRANSFORMED, own, task.missing, data, residual, mask, fast=fast)
     return task.coded(stream, decoded, int(np.count_nonzero(integers)))
 
 

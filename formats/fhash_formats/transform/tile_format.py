@@ -362,9 +362,11 @@ RESIDUAL = 32
 """Flag of a stream with a residual."""
 MASKED = 64
 """Flag of a stream that says which values are occupied."""
+FAST = 128
+"""Flag of a stream whose integers are those of the fast coder."""
 
 _ALLOWED = {
-    TRANSFORMED: OWN | MISSING | RESIDUAL | MASKED,
+    TRANSFORMED: OWN | MISSING | RESIDUAL | MASKED | FAST,
     PREDICTED: OWN | MISSING | MASKED,
     LABELS: OWN | MASKED,
     EXACT: OWN | MASKED,
@@ -386,6 +388,7 @@ class TileStream:
     Attributes:
         kind: TRANSFORMED, PREDICTED, LABELS, EXACT or EMPTY.
         masked: whether the stream says which values are occupied.
+        fast: whether coefficients and residual are those of the fast coder.
         settings: the tile's own settings.
         missing: missing values.
         body: coefficients, predicted integers, labels or exact values.
@@ -395,6 +398,7 @@ class TileStream:
 
     kind: int
     masked: bool
+    fast: bool
     settings: memoryview | None = None
     missing: memoryview | None = None
     body: memoryview | None = None
@@ -417,6 +421,8 @@ def build_stream(
     body: bytes = b"",
     residual: Integers | None = None,
     mask: bytes | None = None,
+    *,
+    fast: bool = False,
 ) -> bytes:
     """The stream of a tile.
 
@@ -427,8 +433,10 @@ def build_stream(
         body: section of coded coefficients or predicted integers.
         residual: residual in quanta; None for none.
         mask: section of the mask; None for a stream without one.
+        fast: whether the body is, and the residual shall be, of the fast coder.
     """
     flags, sections = _head(kind, settings, mask is not None)
+    flags |= FAST if fast else 0
     if missing:
         flags |= MISSING
         sections.append(missing)
@@ -436,7 +444,7 @@ def build_stream(
         sections.append(body)
     if residual is not None:
         flags |= RESIDUAL
-        sections.append(encode_integers(residual, single_band(residual.shape)).data)
+        sections.append(encode_integers(residual, single_band(residual.shape), fast=fast).data)
     if mask is not None and kind != EMPTY:
         sections.append(mask)
     return seal(flags, sections)
@@ -497,7 +505,10 @@ def parse_stream(data: bytes | memoryview) -> TileStream:
     }
     names = [name for name in there if there[name]]
     sections = _sections(data[_CHECKSUM + 1 :], len(names))
-    return TileStream(kind=kind, masked=masked, **dict(zip(names, sections, strict=True)))
+    fast = bool(flags & FAST)
+    return TileStream(
+        kind=kind, masked=masked, fast=fast, **dict(zip(names, sections, strict=True))
+    )
 
 
 def _sections(data: memoryview, count: int) -> list[memoryview]:

@@ -11,8 +11,6 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.file_series import ENDIANS, parse_dtype
-from fhash_formats.readers.raw import layout_of_name
 from fhash_formats.series import AXES
 from fhash_formats.writers.common import (
     Frame,
@@ -54,6 +52,9 @@ NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are calle
 
 
 def _outputs(path: Path, region: Region) -> list[Path]:
+    from fhash_formats.readers.common.file_series import parse_dtype
+    from fhash_formats.readers.raw import layout_of_name
+
     _, layout = layout_of_name(path.stem)
     if layout.shape is None or layout.dtype is None:
         if not path.name.isprintable():
@@ -79,6 +80,9 @@ def _outputs(path: Path, region: Region) -> list[Path]:
 def _open_raw(
     region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
 ) -> Iterator[Put]:
+    from fhash_formats.readers.common.file_series import ENDIANS
+    from fhash_formats.readers.raw import layout_of_name
+
     _, layout = layout_of_name(outputs[0].stem)
     dtype = (
         little_endian(region.dtype)

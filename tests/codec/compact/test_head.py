@@ -403,9 +403,12 @@ def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:
 def test_at_effort_5_a_perceptron_must_save_a_share_of_the_whole_file() -> None:
     spent = EFFORTS[5]
     assert likely_heads(60_000, 3.0, 4.5, spent) == [PERCEPTRON]
-    assert likely_heads(60_000, 0.1, 4.5, spent) == [PERCEPTRON]
-    assert likely_heads(60_000, 0.1, 4.5, spent, besides=300_000) == []
-    assert likely_heads(60_000, 0.04, 4.5, spent) == []
+    assert likely_heads(60_000, 0.2, 4.5, spent) == [PERCEPTRON]
+    assert likely_heads(60_000, 0.2, 4.5, spent, besides=300_000) == []
+    assert likely_heads(60_000, 0.1, 4.5, spent) == []
+    assert spent.tries(20_000, 1 << 20)
+    assert not spent.tries(2_000, 1 << 20)  # no head saves its own bytes
+    assert not spent.tries(200_000, 1 << 20)  # nor anything at so many bits of a vertex
 
 
 def test_weights_and_products_of_a_head() -> None:

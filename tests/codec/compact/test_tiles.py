@@ -432,7 +432,7 @@ def test_a_price_is_near_the_bytes_and_the_error_of_a_coding(error: float | None
     if error is None:
         assert foretold.squares == pytest.approx(coded.squares, rel=0.15)
     values = np.stack([tile.values for tile in sample.tiles]).astype(np.float64)
-    assert without.size == 0
+    assert without.size <= 2 * len(sample.tiles)  # flags of empty bands
     assert without.squares == pytest.approx(np.sum(values * values), rel=1e-5)
 
 

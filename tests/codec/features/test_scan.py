@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fhash_codec.features import scan as scanning
 from fhash_codec.features.bricks import brick_shape, build_coreset, parse_brick
 from fhash_codec.features.features import (
     Everything,
@@ -34,6 +35,7 @@ from fhash_codec.features.scan import (
 from fhash_codec.measure.value_range import Ranks, pieces
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning, InputError, RegionError
+from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, StepsSeries
 
 Values = npt.NDArray[np.generic]
@@ -196,6 +198,21 @@ def test_missing_values_are_left_out_and_known_by_step() -> None:
     )
     assert seen.mean == pytest.approx(array[finite].mean(dtype=np.float64))
     np.testing.assert_array_equal(finite, finite_masks(seen.missing, range(5), (3, 4, 5)))
+
+
+@pytest.mark.parametrize("block", [1, 150, 1 << 18])
+def test_a_small_series_of_a_file_stays_in_memory(tmp_path, monkeypatch, block) -> None:
+    monkeypatch.setattr("fhash_formats.series.BLOCK", block)
+    values = np.random.default_rng(5).normal(size=(6, 3, 4, 5)).astype(np.float32)
+    np.save(tmp_path / "a.npy", values)
+    with open_series(tmp_path / "a.npy") as series:
+        whole = scan(series, silent)
+        assert series.held.tobytes() == values.tobytes()
+        assert whole == scan(ArraySeries(values), silent)
+    monkeypatch.setattr(scanning, "HELD_BYTES", values.nbytes - 1)
+    with open_series(tmp_path / "a.npy") as series:
+        assert scan(series, silent) == whole
+        assert series.held is None
 
 
 def test_no_finite_value_at_all_is_refused() -> None:

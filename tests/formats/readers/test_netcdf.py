@@ -15,7 +15,7 @@ import xarray as xr
 from stored_series import VALUES, assert_frames, frames, save_netcdf
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.netcdf3 import ClassicStore, read_header
+from fhash_formats.readers.netcdf3 import read_header
 from fhash_formats.readers.registry import list_variables, open_series
 
 DIMS = ("time", "lev", "lat", "lon")
@@ -242,13 +242,12 @@ def test_classic_netcdf3(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("library", ["xarray", "h5netcdf"])
 def test_a_broken_install_ends_in_one_line_that_names_the_library(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(InputError, match=f"cannot be read as NetCDF: .*{library}") as caught:
+    monkeypatch.setitem(sys.modules, "h5netcdf", None)
+    with pytest.raises(InputError, match=r"cannot be read as NetCDF.*h5netcdf") as caught:
         open_series(path)
     assert "\n" not in str(caught.value)
 
@@ -460,14 +459,16 @@ def test_all_types_of_the_three_kinds(tmp_path: Path, kind: int, streaming: bool
     variables = everything(kind)
     lengths = {"x": 5, "t": 0, "y": 2}
     path = classic(tmp_path / "a.nc", kind, lengths, variables, streaming=streaming)
-    found = xr.open_dataset(ClassicStore(path), engine="store", decode_cf=False)
-    assert set(found.variables) == set(variables)
+    header = read_header(path)
+    found = header.variables
+    assert set(found) == set(variables)
     for key, (dims, values, _) in variables.items():
-        assert found[key].dims == dims
-        assert found[key].values.astype(values.dtype).tobytes() == values.tobytes(), key
+        assert found[key].dimensions == dims
+        assert found[key][...].astype(values.dtype).tobytes() == values.tobytes(), key
     if kind < 5 and not streaming:  # as a second reader sees it
+        arrays = {key: (each.dimensions, each[...], each.attributes) for key, each in found.items()}
         with xr.open_dataset(path, engine="scipy", mmap=False, decode_cf=False) as other:
-            xr.testing.assert_identical(other, found)
+            xr.testing.assert_identical(other, xr.Dataset(arrays, attrs=header.attributes))
 
 
 def test_records_of_one_array_alone_are_not_padded(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from fhash_formats.support.threads import (
     common_part,
     in_threads,
     map_ahead,
+    one_ahead,
     region_bounds,
     row_parts,
     share_out,
@@ -271,6 +272,28 @@ def test_what_was_not_begun_is_left_out_after_a_failure(monkeypatch: pytest.Monk
     with thread_pool() as pool, pytest.raises(ValueError, match="two"):
         list(map_ahead(pool, work, range(100), 8))
     assert len(begun) < 100
+
+
+def test_one_item_is_made_ahead_in_another_thread() -> None:
+    made: list[int] = []
+    caller = threading.current_thread()
+
+    def items() -> Iterator[int]:
+        for number in range(5):
+            assert threading.current_thread() is not caller
+            made.append(number)
+            yield number
+        raise ValueError("five")
+
+    found = one_ahead(items())
+    assert next(found) == 0
+    found.close()
+    assert made == [0, 1]
+    made.clear()
+    with pytest.raises(ValueError, match="five"):
+        list(one_ahead(items()))
+    assert made == list(range(5))
+    assert list(one_ahead(iter([]))) == []
 
 
 @pytest.mark.parametrize(("rows", "row", "threads"), [(1, 5, 4), (7, PART, 3), (2, PART, 9)])

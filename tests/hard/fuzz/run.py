@@ -42,13 +42,11 @@ TARGETS = tuple(
     )
 )
 SOURCES = (
-    *("coder", "trellis", "mask", "mask_levels", "predict", "labels"),
+    *("coder", "fast", "trellis", "mask", "mask_levels", "predict", "labels"),
     *("lifting", "head", "quantise", "values", "crc32c"),
 )
 """Files of NATIVE that are always fuzzed."""
-CODEC_SOURCES = (
-    *("gram", "head_inputs", "march_light", "march_slopes", "price", "quality", "train_head"),
-)
+CODEC_SOURCES = (*("gram", "head_inputs", "march_light", "march_slopes", "quality", "train_head"),)
 """Files of CODEC that are always fuzzed."""
 NETWORK_SOURCES = ("peak", "points")
 """Files of NETWORK that are always fuzzed."""

@@ -22,6 +22,7 @@ from fhash_formats.transform.coder import (
     encode_integers,
     encode_labels,
     encode_mask,
+    fast_prior,
     mask_prior_state,
     prior_state,
     single_band,
@@ -59,6 +60,8 @@ NAMES = (
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
 CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
+PLAIN, TRELLIS, FAST = range(3)
+"""Ways to code integers, as inputs of the coder name them."""
 WITH_SEEDS = (CODER, PREDICTOR)
 """Targets that have seeds of their own only; those of all others are random bytes, too."""
 
@@ -122,6 +125,8 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
         for state in (prior_state(False), prior_state(True), mask_prior_state(), blank_state()):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
+        for array in (fast_prior().slots, fast_prior().defaults, fast_prior().lookup):
+            put(array)
         file.write(struct.pack("<q", len(bands)))
         for shape, table in bands:
             put(np.array(shape, np.int64))
@@ -161,9 +166,10 @@ def write_seeds(
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
             scaled = (rng.laplace(0, scale, shape)).clip(-9e8, 9e8)
             path = choose_levels(scaled, table, 0.1)
-            for coded, trellis in ((integers, False), (path, True)):
-                data = encode_integers(coded, table, trellis=trellis).data
-                put(CODER, struct.pack("<HB", number, trellis), data)
+            for how, coded in ((PLAIN, integers), (TRELLIS, path), (FAST, integers)):
+                trellis, fast = how == TRELLIS, how == FAST
+                data = encode_integers(coded, table, trellis=trellis, fast=fast).data
+                put(CODER, struct.pack("<HB", number, how), data)
     for number, (shape, predictor) in enumerate(passes):
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
@@ -179,10 +185,10 @@ def write_seeds(
         for number, (shape, table) in reversed(list(enumerate(bands)))
     }
     for stream, settings, shape in golden_streams():
-        for data, table, trellis in coded_sections(stream, settings, shape):
+        for data, table, how in coded_sections(stream, settings, shape):
             setup = setup_of_bands.get((shape, table.tobytes()))
             if setup is not None:
-                put(CODER, struct.pack("<HB", setup, trellis), data)
+                put(CODER, struct.pack("<HB", setup, how), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):
@@ -234,14 +240,15 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
 
 def coded_sections(
     stream: bytes, settings: TileSettings, shape: tuple[int, ...]
-) -> Iterator[tuple[bytes, Table, bool]]:
-    """Yield the coded integers of a tile: bytes, bands, and whether of two quantisers."""
+) -> Iterator[tuple[bytes, Table, int]]:
+    """Yield the coded integers of a tile: bytes, bands, and how they are coded."""
     parts = parse_stream(stream)
+    plain = FAST if parts.fast else PLAIN
     if parts.kind == TRANSFORMED and parts.body is not None:
         table = band_table(settings.transform, shape)
-        yield bytes(parts.body), table, settings.trellis
+        yield bytes(parts.body), table, TRELLIS if settings.trellis else plain
     if parts.residual is not None:
-        yield bytes(parts.residual), single_band(shape), False
+        yield bytes(parts.residual), single_band(shape), plain
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:

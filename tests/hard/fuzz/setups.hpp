@@ -20,6 +20,13 @@ struct State {
     std::vector<std::uint16_t> simples;
 };
 
+// Distributions of the fast coder.
+struct FastPrior {
+    std::vector<std::uint16_t> slots;
+    std::vector<std::uint8_t> defaults;
+    std::vector<std::uint32_t> lookup;
+};
+
 struct Bands {
     std::vector<std::int64_t> shape;
     std::vector<std::int32_t> table;
@@ -34,6 +41,7 @@ class Setups {
 public:
     State coders[2];  // of one quantiser and of two
     State mask, predictor;
+    FastPrior fast;
     std::vector<Bands> bands;
     std::vector<Passes> passes;
 
@@ -48,6 +56,9 @@ public:
             get(file, state->weights);
             get(file, state->simples);
         }
+        get(file, fast.slots);
+        get(file, fast.defaults);
+        get(file, fast.lookup);
         bands.resize(count(file));
         for (Bands& setup : bands) {
             get(file, setup.shape);

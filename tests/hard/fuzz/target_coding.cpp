@@ -160,15 +160,43 @@ std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vect
     return levels;
 }
 
-// Coefficients with a few hostile ones have a price.
-void of_price(Reader& in) {
-    const Bands& with = setups().bands[in.word() % setups().bands.size()];
-    const std::vector<float> coefficients = repeated<float>(in, volume(with.shape));
+// What the fast coder makes of numbers: null for what is not given.
+int64_t fast(const Bands& with, std::int32_t* q, const float* values, double scale, double weight,
+             std::vector<std::uint8_t>& into) {
     double results[2];
-    require(fhash_price(coefficients.data(), with.shape.data(), with.table.data(), bands_of(with),
-                        std::ldexp(1.0, static_cast<int>(in.within(-60, 60))), results) == 0,
-            "coefficients without a price");
-    require(results[0] >= 0 && results[1] >= 0, "a price below 0");
+    const FastPrior& prior = setups().fast;
+    const int64_t size = fhash_fast_encode(
+        q, values, scale, weight, with.shape.data(), with.table.data(), bands_of(with),
+        prior.slots.data(), prior.defaults.data(), into.data(), length(into), results);
+    require(results[0] >= 0 && !(results[1] < 0), "a price below 0");
+    return size;
+}
+
+// Integers come back from the fast coder, given ones or those chosen of hostile coefficients, which
+// have a price, too.
+void of_fast(Reader& in) {
+    const std::size_t number = in.word() % setups().bands.size();
+    const Bands& with = setups().bands[number];
+    const std::size_t room = 4U * in.byte();
+    const bool choose = in.byte() & 1;
+    std::vector<std::int32_t> q = bounded(in, volume(with.shape), (1 << 30) - 1);
+    const std::vector<float> values = repeated<float>(in, choose ? volume(with.shape) : 0);
+    const double scale = std::ldexp(1.0, static_cast<int>(in.within(-60, 60)));
+    const double weight = in.byte() / 64.0;
+    std::vector<std::uint8_t> none;
+    if (choose)
+        require(fast(with, nullptr, values.data(), scale, weight, none) == 0, "no price");
+    const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
+        if (choose) std::fill(q.begin(), q.end(), 0);
+        return fast(with, q.data(), choose ? values.data() : nullptr, scale, weight, into);
+    });
+    std::vector<std::int32_t> decoded(q.size(), 0);
+    require(fhash_fast_decode(decoded.data(), with.shape.data(), with.table.data(), bands_of(with),
+                              setups().fast.defaults.data(), setups().fast.lookup.data(),
+                              data.data(), length(data)) == 0,
+            "bytes of the fast coder are refused");
+    for (std::size_t i = 0; i < q.size(); i++)
+        require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers of the fast coder");
 }
 
 // Integers of two quantisers: those of a path come back.
@@ -249,7 +277,7 @@ void round_trip(Reader& in) {
         case 1: of_masks(in); break;
         case 2: of_predicted(in); break;
         case 3: of_path<float>(in); break;
-        case 4: of_price(in); break;
+        case 4: of_fast(in); break;
         default: of_path<double>(in);
     }
 }

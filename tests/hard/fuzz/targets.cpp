@@ -30,10 +30,20 @@ namespace {
 
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
-    const int64_t trellis = in.byte() & 1;
+    const std::uint8_t how = in.byte();
+    const int64_t trellis = how & 1;
     const State& prior = setups().coders[trellis];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
+    if (how & 2) {
+        fhash_fast_decode(q.data(), with.shape.data(), with.table.data(),
+                          static_cast<int64_t>(with.table.size() / 29),
+                          setups().fast.defaults.data(), setups().fast.lookup.data(), data.data(),
+                          static_cast<int64_t>(data.size()));
+        for (const std::int32_t number : q)
+            require(std::abs(number) < 1 << 30, "an integer beyond 30 bits");
+        return;
+    }
     fhash_decode(q.data(), trellis, with.shape.data(), with.table.data(),
                  static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
                  static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),

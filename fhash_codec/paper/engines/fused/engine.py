@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -28,7 +29,7 @@ from fhash_codec.paper.engines.fused.program import (
 )
 from fhash_codec.paper.engines.parameters import Chosen, corrections
 from fhash_codec.paper.engines.slab import SlabEngine
-from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch
+from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
 from fhash_codec.paper.network import Architecture, Network, Resolution
 from fhash_formats.errors import FhashWarning, InputError
 
@@ -334,12 +335,86 @@ class PointSizes(Sizes):
         yield f"constexpr bool SPARSE = {str(self.sparse).lower()};"
 
 
+class LevelRecord(ctypes.Structure):
+    """The record `Level` of kernels/points.cu."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("table", "words", "blocks", "within")),
+        ("nothing", ctypes.c_longlong),
+        ("strides", ctypes.c_longlong * 3),
+        ("scale", ctypes.c_double * 3),
+    )
+
+
+class DeviceTables:
+    """The time nodes of a network around a time on a device, for all times between them.
+
+    Attributes:
+        nodes: the time nodes of each level.
+        records: the record of each level, without its table.
+    """
+
+    def __init__(self, network: Network, key: float, device: torch.device) -> None:
+        """Read the nodes and take them to a device; DamagedFileError as in `FusedPoints`."""
+        self.nodes, _ = nodes_of(network, key)
+        patches = PointTables.of_box(network, key).patches
+        self._values = [_sent(patch.values, device) for patch in patches]
+        # The records hold addresses of these tensors.
+        self._bits = [
+            # Signed integers have the same bits, and every operation of torch.
+            {
+                "words": _sent(patch.bits.words.view(np.int64), device),
+                "blocks": _sent(patch.bits.blocks.view(np.int32), device),
+                "within": _sent(patch.bits.within, device),
+            }
+            if isinstance(patch, SparsePatch)
+            else {}
+            for patch in patches
+        ]
+        self.records = [
+            _record(*level) for level in zip(patches, network.levels, self._bits, strict=True)
+        ]
+
+    def at(self, shares: Sequence[float]) -> list[Tensor]:
+        """Return the table of each level at a time, given the share of its second node."""
+        return [
+            values[0] if len(values) == 1 else torch.lerp(values[0], values[1], share)
+            for values, share in zip(self._values, shares, strict=True)
+        ]
+
+
+def nodes_of(network: Network, key: float) -> tuple[list[range], list[float]]:
+    """Return the time nodes of each level around a time, and the share of the second."""
+    found = [time_nodes(network.key_frames, level[0], key) for level in network.levels]
+    return [nodes for nodes, _ in found], [share for _, share in found]
+
+
+def _record(patch: Patch, resolution: Resolution, bits: Mapping[str, Tensor]) -> LevelRecord:
+    """Return the record of a level's part without its table; `bits` are those of a sparse one."""
+    axes = list(zip(resolution, patch.strides, strict=True))[:0:-1]
+    return LevelRecord(
+        nothing=patch.bits.count if isinstance(patch, SparsePatch) else 0,
+        # An axis of one vertex has no corner after it: both corners are the same.
+        strides=(ctypes.c_longlong * 3)(*(step if size > 1 else 0 for size, step in axes)),
+        scale=(ctypes.c_double * 3)(*(size - 1 for size, _ in axes)),
+        **{name: tensor.data_ptr() for name, tensor in bits.items()},
+    )
+
+
+def _sent(array: npt.NDArray[Any], device: torch.device) -> Tensor:
+    """Return an array on a device."""
+    # A copy: torch would warn of numbers that must not be written.
+    return torch.from_numpy(np.array(array, order="C")).to(device)
+
+
 class PointKernels:
     """A device with the kernels that were loaded there, for many networks."""
 
     def __init__(self, device: program.CudaDevice) -> None:
         """Take over a device."""
         self.limits = device.limits
+        self._tables: DeviceTables | None = None
+        self._network: Callable[[], Network | None] = lambda: None
         self._device = device
         self._programs: dict[str, program.CudaProgram] = {}
 
@@ -350,16 +425,23 @@ class PointKernels:
             self._programs[text] = self._device.load(sizes)
         return self._programs[text]
 
+    def tables(self, network: Network, key: float, device: torch.device) -> DeviceTables:
+        """Return the tables around a time: of a film, often those of the picture before."""
+        last = self._tables
+        if (
+            last is None
+            or self._network() is not network
+            or last.nodes != nodes_of(network, key)[0]
+        ):
+            # Both may not fit, and a closed file leaves nothing on the device.
+            self._tables = last = None
+            self._tables = last = DeviceTables(network, key, device)
+            self._network = weakref.ref(network, self._forget)
+        return last
 
-class LevelRecord(ctypes.Structure):
-    """The record `Level` of kernels/points.cu."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("table", "words", "blocks", "within")),
-        ("nothing", ctypes.c_longlong),
-        ("strides", ctypes.c_longlong * 3),
-        ("scale", ctypes.c_double * 3),
-    )
+    def _forget(self, network: Callable[[], Network | None]) -> None:
+        if network is self._network:
+            self._tables = None
 
 
 class PlacesRecord(ctypes.Structure):
@@ -398,21 +480,19 @@ class FusedPoints:
         self._slots = self._sizes.slots(kernels.limits, MAX_BLOCKS)
         self._device = device
         self._spans = [float(max(size - 1, 1)) for size in reversed(network.box_size)]
-        tables = PointTables.of_box(network, key).at(key)
+        tables = kernels.tables(network, key, device)
+        values = tables.at(nodes_of(network, key)[1])
+        records = (LevelRecord * len(values))(*tables.records)
+        for record, table in zip(records, values, strict=True):
+            record.table = table.data_ptr()
         # The records hold addresses of these tensors.
-        self._held: list[Tensor] = []
-        records = [
-            self._record(patch, level)
-            for patch, level in zip(tables.patches, tables.levels, strict=True)
-        ]
-        self._levels = self._sent(
-            np.frombuffer(bytes((LevelRecord * len(records))(*records)), np.uint8)
-        )
-        self._layers = self._sent(
-            np.concatenate([np.column_stack(layer).reshape(-1) for layer in network.layers])
+        self._held = tables, values
+        self._levels = _sent(np.frombuffer(bytes(records), np.uint8), device)
+        self._layers = _sent(
+            np.concatenate([np.column_stack(layer).reshape(-1) for layer in network.layers]), device
         )
         if self._program.new:
-            self._try_kernels(tables)
+            self._try_kernels(PointTables.of_box(network, key).at(key))
             self._program.new = False
         else:
             # A kernel that cannot be launched is found before the first picture.
@@ -466,36 +546,6 @@ class FusedPoints:
         )
         return results
 
-    def _record(self, patch: Patch, resolution: Resolution) -> LevelRecord:
-        """Return the record of a level's part of one time, with its arrays on the device."""
-        arrays: dict[str, npt.NDArray[Any]] = {"table": patch.values.astype(np.float32, copy=False)}
-        nothing = 0
-        if isinstance(patch, SparsePatch):
-            bits = patch.bits
-            # Signed integers have the same bits, and every operation of torch.
-            arrays |= {
-                "words": bits.words.view(np.int64),
-                "blocks": bits.blocks.view(np.int32),
-                "within": bits.within,
-            }
-            nothing = bits.count
-        addresses = {name: self._sent(array).data_ptr() for name, array in arrays.items()}
-        axes = list(zip(resolution, patch.strides, strict=True))[:0:-1]
-        return LevelRecord(
-            nothing=nothing,
-            # An axis of one vertex has no corner after it: both corners are the same.
-            strides=(ctypes.c_longlong * 3)(*(step if size > 1 else 0 for size, step in axes)),
-            scale=(ctypes.c_double * 3)(*(size - 1 for size, _ in axes)),
-            **addresses,
-        )
-
-    def _sent(self, array: npt.NDArray[Any]) -> Tensor:
-        """Return an array on the device, where it stays."""
-        # A copy: torch would warn of numbers that must not be written.
-        tensor = torch.from_numpy(np.array(array, order="C")).to(self._device)
-        self._held.append(tensor)
-        return tensor
-
     def _try_kernels(self, tables: PointTables) -> None:
         """Compare with the host at some places; Unavailable where the kernels differ."""
         last = np.array(tables.sizes[:0:-1]) - 1.0
@@ -504,7 +554,7 @@ class FusedPoints:
         slopes = np.empty((TRIAL_PLACES, 4), np.float32)
         x, y, z = places.T
         PointSampler(tables).sample((np.zeros(1), z, y, x), values, slopes, 1)
-        there = self._sent(places)
+        there = _sent(places, self._device)
         for name, ours, theirs in (
             ("values", self.values(there), values),
             ("slopes", self.slopes(there), slopes[:, :0:-1]),

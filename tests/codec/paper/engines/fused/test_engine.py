@@ -272,6 +272,32 @@ def test_a_call_is_one_launch_and_no_wait(emulated, networks) -> None:
     np.testing.assert_allclose(ours[0], expected[0], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("held", ["dense", "sparse"])
+def test_tables_of_a_film_stay_on_the_device_while_their_time_nodes_do(
+    emulated, networks, held
+) -> None:
+    network = networks.random((5, 13, 18), 4, 2, 2, 2)
+    network = sparse(network)[0] if held == "sparse" else replace(network)
+    places, key = torch.from_numpy(places_in(network)), KEY * 3
+    with pretended_cuda() as pretended:
+        kernels = PointKernels(emulated())
+        copies, first = [], FusedPoints(network, key, device=CUDA, kernels=kernels)
+        for at in (key, key + 0.05, key + 1.5, key):
+            pretended.forget()
+            points = FusedPoints(network, at, device=CUDA, kernels=kernels)
+            copies.append(pretended.counts["copies"])
+            alone = FusedPoints(network, at, device=CUDA, kernels=PointKernels(emulated()))
+            there = places.to(CUDA)
+            assert torch.equal(points.values(there), alone.values(there))
+        # The records of the levels and the layers alone.
+        assert copies[:2] == [2, 2]
+        assert min(copies[2:]) > 2
+        # A picture that is still drawn keeps what it needs.
+        assert torch.equal(first.values(there), points.values(there))
+        del network, points, alone, first
+        assert kernels._tables is None
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
