@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import prod
 from types import EllipsisType
 from typing import Any, NamedTuple, Protocol
 
@@ -102,9 +101,6 @@ def fuse(boxes: Sequence[Box | None]) -> Box | None:
 MAX_LOD = 10
 """Coarsest level of detail: every 1024th vertex."""
 
-BLOCK = 1 << 18
-"""Most vertices of several steps that are read together; they take a few MiB in all forms."""
-
 Index = int | slice | EllipsisType
 """One part of an index."""
 
@@ -165,19 +161,6 @@ def slice_of(positions: range, first: int) -> slice:
     start, stop = positions.start - first, positions.stop - first
     # A stop before the first position would count from the end.
     return slice(start, stop if stop >= 0 else None, positions.step)
-
-
-def step_blocks(steps: range, shape: Sizes) -> Iterator[tuple[slice, range]]:
-    """Cut steps into neighbouring ones that are read together, so that a block stays small.
-
-    steps: of any stride. shape: (z, y, x) of one frame. Yields places in `steps`, and the steps
-    there, which follow one another.
-    """
-    many = max(1, BLOCK // prod(shape)) if steps.step == 1 else 1
-    for place in range(0, len(steps), many):
-        together = steps[place : place + many]
-        alone = together if len(together) > 1 else range(together[0], together[0] + 1)
-        yield slice(place, place + len(together)), alone
 
 
 def checked_region(region: Spans | None, shape: Sequence[int], path: str) -> Box:

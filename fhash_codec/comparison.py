@@ -31,7 +31,7 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Place
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, Series
+from fhash_formats.series import AXES, Series, step_blocks
 from fhash_formats.transform.values import about_origin
 
 FIGURES = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")
@@ -110,9 +110,6 @@ def bytes_on_disk(paths: Iterable[Path]) -> int | None:
 
 LAYER_BYTES = 1 << 30
 """Bytes of decoded frames that are held at a time, at most; a single larger one is allowed."""
-SMALL_BYTES = 1 << 20
-"""Bytes of decoded frames that are read together though their tiles are kept: a call costs more
-than a small frame."""
 QUICK_SSIM_BUDGET = 1 << 20
 """Vertices whose SSIM is measured after an encoding at effort 1."""
 
@@ -206,18 +203,17 @@ def measure(
     exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
     source = volume.value_type.source
     origin, far = volume.value_range.origin(source), volume.value_range.is_far(source)
-    held = series.read if series.held is None else series.held.__getitem__
-    read = partial(_differences, series, origin) if far else held
+    read = partial(_differences, series, origin) if far else series.block
     bulk = _bulk(series, volume)
     about_bulk = None if bulk is None else bulk.moved(-origin)
     quality = measure_quality(
         Comparer(float(data_range), volume.background - origin, about_bulk, observe),
         read,
         DecodedFrames(volume, exact=exact, origin=origin if far else None).read,
-        series.shape[0],
+        series.shape,
         steps_of_ssim(series) if measured is None else measured,
         progress,
-        _neighbours(read, series.shape[0], volume),
+        _neighbours(lambda step: read(range(step, step + 1))[0], series.shape[0], volume),
     )
     series.check()
     figures = quality.to_dict()
@@ -226,16 +222,16 @@ def measure(
     return figures
 
 
-def _differences(series: Series, origin: int, step: int) -> npt.NDArray[Any]:
-    """The frame of a step less an integer."""
-    return about_origin(series.read(step), origin)
+def _differences(series: Series, origin: int, steps: range) -> npt.NDArray[Any]:
+    """The frames of neighbouring steps less an integer."""
+    return about_origin(series.block(steps), origin)
 
 
 class DecodedFrames:
     """The decoded frames of a volume, read in their order.
 
-    A reader of single frames decodes a layer of tiles for each of its steps where the layer is
-    larger than the cache. Then the steps of a layer are decoded together.
+    A layer of tiles would be decoded again and again where it is larger than the cache. Then the
+    steps of a layer are decoded together.
     """
 
     def __init__(self, volume: Volume, *, exact: bool, origin: int | None = None) -> None:
@@ -247,33 +243,33 @@ class DecodedFrames:
         self._volume, self._exact, self._origin = volume, exact, origin
         self._steps, self._frames = range(0), np.empty(0)
         layer = min(volume.chunks[0], volume.shape[0])
-        frame = prod(volume.shape[1:]) * volume.float_dtype.itemsize
-        parts = -(-layer * frame // LAYER_BYTES)
-        is_kept = 2 * layer * frame <= volume.container.cache_bytes
-        few = min(layer, max(1, SMALL_BYTES // frame))
-        self._layer, self._together = layer, few if is_kept else -(-layer // parts)
+        room = layer * prod(volume.shape[1:]) * volume.float_dtype.itemsize
+        parts = -(-room // LAYER_BYTES)
+        is_kept = 2 * room <= volume.container.cache_bytes
+        self._layer, self._together = layer, 1 if is_kept else -(-layer // parts)
 
-    def read(self, step: int) -> npt.NDArray[Any]:
-        """The frame (z, y, x) of a step."""
-        volume = self._volume
+    def read(self, steps: range) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of neighbouring steps."""
         if self._together == 1:
-            if self._origin is not None:
-                alone = range(step, step + 1)
-                return np.asarray(volume.differences_of_steps(alone, self._origin)[0])
-            return volume.values(step) if self._exact else volume.read(step)
+            return self._decoded(steps)
+        # A copy, so that a frame that is still compared does not hold the others.
+        return np.stack([self._frame(step) for step in steps])
+
+    def _decoded(self, steps: range) -> npt.NDArray[Any]:
+        if self._origin is not None:
+            return self._volume.differences_of_steps(steps, self._origin)
+        return (self._volume.values_of_steps if self._exact else self._volume.read_steps)(steps)
+
+    def _frame(self, step: int) -> npt.NDArray[Any]:
+        """A frame (z, y, x), with which the others of its layer are decoded."""
         if step not in self._steps:
             self._frames = np.empty(0)  # its memory is free before more is decoded
             start = step // self._layer * self._layer
             first = start + (step - start) // self._together * self._together
-            end = min(first + self._together, start + self._layer, volume.shape[0])
+            end = min(first + self._together, start + self._layer, self._volume.shape[0])
             self._steps = range(first, end)
-            read = volume.values_of_steps if self._exact else volume.read_steps
-            if self._origin is not None:
-                self._frames = volume.differences_of_steps(self._steps, self._origin)
-            else:
-                self._frames = read(self._steps)
-        # A copy, so that a frame that is still compared does not hold the others.
-        frame: npt.NDArray[Any] = self._frames[step - self._steps.start].copy()
+            self._frames = self._decoded(self._steps)
+        frame: npt.NDArray[Any] = self._frames[step - self._steps.start]
         return frame
 
 
@@ -294,12 +290,12 @@ def _bulk(series: Series, volume: Volume) -> ValueRange | None:
         return None if known["bulk"] is None else ValueRange(*known["bulk"]["range"])
 
     origin = volume.value_range.origin(volume.value_type.source)
-    read = partial(_differences, series, origin) if origin else series.read
+    read = partial(_differences, series, origin) if origin else series.block
 
     def counted_values() -> Iterator[npt.NDArray[Any]]:
-        for step in range(series.shape[0]):
-            frame, mask = read(step), volume.occupancy(step)
-            yield frame if mask.all() else frame[mask]
+        for _, block in step_blocks(range(series.shape[0]), series.shape[1:]):
+            frames, mask = read(block), np.stack([volume.occupancy(step) for step in block])
+            yield frames if mask.all() else frames[mask]
 
     whole = series.dtype.kind in "iu"
     bulk = find_bulk(counted_values, volume.value_range.moved(-origin), whole=whole)

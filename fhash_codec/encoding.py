@@ -246,8 +246,8 @@ class _Measured:
             measured = steps_of_ssim(self._series, ssim_budget(self._config))
             self.quality = measure(self._series, volume, self._progress, measured)
         low, high = header["value_range"]
-        steps = header["domain"]["shape"][0]
-        quality = brief_quality(self._writer, self.quality, high - low, steps)
+        shape = header["domain"]["shape"]
+        quality = brief_quality(self._writer, self.quality, high - low, shape)
         return {**header, "quality": quality}
 
     def figures(self, header: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.occupancy import write_bits
+from fhash_codec.measure.metrics import even_steps
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import (
     SOURCE,
@@ -36,6 +37,7 @@ from fhash_formats.container.header import (
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
+    TOGETHER,
 )
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, Series, SourceMetadata, with_history
@@ -153,7 +155,11 @@ def _options(header: Mapping[str, Any]) -> list[str]:
 
 
 MAX_LISTED = 512
-"""Steps whose figures stand in the header; an array of its own takes some 400 bytes."""
+"""Figures that stand in the header; an array of its own takes some 400 bytes."""
+SMALL = 1 << 12
+"""Vertices of a figure, at least: one of fewer takes much beside the bytes of their values."""
+LEAST_FIGURES = 64
+"""Figures of a series, if it has as many steps."""
 HUNDREDTHS = 2000
 """Hundredths of a dB of a factor of ten."""
 EXACT = -1
@@ -164,32 +170,59 @@ DIGITS_OF_A_STEP = 5
 """Significant digits of a figure that comes back from decibels."""
 
 
+def steps_together(shape: Sequence[int]) -> int:
+    """The number of neighbouring steps of a series (t, z, y, x) that have one figure together."""
+    return max(1, min(SMALL // prod(shape[1:]), shape[0] // LEAST_FIGURES))
+
+
 def write_steps(
-    writer: ContainerWriter, figures: Mapping[str, Sequence[float | None]], data_range: float
-) -> dict[str, list[int]]:
+    writer: ContainerWriter,
+    figures: Mapping[str, Sequence[float | None]],
+    data_range: float,
+    together: int,
+) -> dict[str, Any]:
     """Write the figures of all steps, or return what the header's `quality.steps` is.
 
     Args:
         writer: of the container; it gets an array for more than MAX_LISTED steps.
         figures: one for each step, by the names STEP_FIGURES.
         data_range: width of the header's value range.
+        together: see `steps_together`.
 
     Returns an empty object where there is an array.
     """
-    levels = {name: _levels(figures[name], data_range) for name in STEP_FIGURES}
+    merged = {name: _merged(name, figures[name], together) for name in STEP_FIGURES}
+    levels = {name: _levels(merged[name], data_range) for name in STEP_FIGURES}
+    told = {TOGETHER: together} if together > 1 else {}
     if len(levels[STEP_FIGURES[0]]) <= MAX_LISTED + 1:
-        return levels
+        return levels | told
     numbers = np.array([listed[1:] for listed in levels.values()]) - UNKNOWN
     planes = np.moveaxis(numbers.astype("<u4").view(np.uint8).reshape(*numbers.shape, 4), -1, 0)
     lowest = [listed[0] for listed in levels.values()]
-    writer.add_whole(STEPS, planes[:STEP_BYTES], attributes={LOWEST: lowest})
+    writer.add_whole(STEPS, planes[:STEP_BYTES], attributes={LOWEST: lowest} | told)
     return {}
 
 
-def read_steps(
-    header: Mapping[str, Any], arrays: Mapping[str, Any]
-) -> list[dict[str, float | None]]:
-    """The figures of each step by name, rounded to the worse side; none where the file has none.
+def _merged(name: str, figures: Sequence[float | None], together: int) -> Sequence[float | None]:
+    """One figure for some neighbouring steps each: their root mean square, or the largest."""
+    if together == 1:
+        return figures
+    values = np.array(figures, dtype=np.float64)  # NaN for None
+    merged = []
+    for first in range(0, len(values), together):
+        some = values[first : first + together]
+        some = some[np.isfinite(some)]
+        largest = float(some.max(initial=0.0))
+        scaled = some / (largest or 1.0)
+        root = largest * math.sqrt(float(np.square(scaled).mean())) if some.size else None
+        merged.append(root if name == STEP_FIGURES[0] or root is None else largest)
+    return merged
+
+
+def read_steps(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The figures of each step as of `Errors.per_step`, rounded to the worse side.
+
+    None where the file has none. Those of steps that have one together are the same.
 
     Args:
         header: of a variable.
@@ -198,12 +231,14 @@ def read_steps(
     quality = header["quality"]
     if "steps" in quality:
         lists = [quality["steps"][name] for name in STEP_FIGURES]
+        together = quality["steps"].get(TOGETHER, 1)
     elif STEPS in arrays:
         array = arrays[STEPS]
         weights = 256 ** np.arange(STEP_BYTES)
         numbers = np.tensordot(weights, array.read().astype(np.int64), 1) + UNKNOWN
         pairs = zip(array.attributes[LOWEST], numbers.tolist(), strict=True)
         lists = [[lowest, *levels] for lowest, levels in pairs]
+        together = array.attributes.get(TOGETHER, 1)
     else:
         return []
     low, high = header["value_range"]
@@ -213,7 +248,12 @@ def read_steps(
         [_step_figure(first, level, high - low, limit) for level in levels]
         for (first, *levels), limit in zip(lists, limits, strict=True)
     ]
-    return [dict(zip(STEP_FIGURES, row, strict=True)) for row in zip(*columns, strict=True)]
+    rows = [
+        {"psnr": _psnr(row[0], high - low), **dict(zip(STEP_FIGURES, row, strict=True))}
+        for row in zip(*columns, strict=True)
+    ]
+    steps = range(header["domain"]["shape"][0])
+    return [{"step": step, **rows[step // together]} for step in steps]
 
 
 def _levels(figures: Sequence[float | None], data_range: float) -> list[int]:
@@ -414,7 +454,7 @@ def read_missing(container: Container, steps: range, region: Box) -> npt.NDArray
 
 
 def brief_quality(
-    writer: ContainerWriter, quality: Mapping[str, Any], data_range: float, steps_of_series: int
+    writer: ContainerWriter, quality: Mapping[str, Any], data_range: float, shape: Sequence[int]
 ) -> dict[str, Any]:
     """Figures as a file has them: rounded to the worse side, those of single steps in decibels.
 
@@ -425,7 +465,7 @@ def brief_quality(
         writer: of the container; it gets an array for the figures of many steps.
         quality: `metrics.Quality` as JSON values.
         data_range: width of the header's value range.
-        steps_of_series: number of its steps.
+        shape: of the series (t, z, y, x).
     """
     brief: dict[str, Any] = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
@@ -442,15 +482,17 @@ def brief_quality(
             name: _figure(name, value, STEP_DIGITS) for name, value in between.items()
         }
     figures = {name: [step[name] for step in quality["per_step"]] for name in STEP_FIGURES}
-    steps = write_steps(writer, figures, data_range)
+    steps = write_steps(writer, figures, data_range, steps_together(shape))
     if steps:
         brief["steps"] = steps
-    usual = {"data_range": data_range, "steps": list(range(steps_of_series))}
-    brief["ssim_window"] = {
-        name: value
-        for name, value in quality["ssim_window"].items()
-        if name not in usual or value != usual[name]
-    }
+    window = dict(quality["ssim_window"])
+    if window.get("data_range") == data_range:
+        del window["data_range"]
+    measured = window.get("steps")
+    if measured and measured == even_steps(shape[0], len(measured)):
+        del window["steps"]
+        window |= {"steps": len(measured)} if len(measured) < shape[0] else {}
+    brief["ssim_window"] = window
     return brief
 
 
@@ -496,13 +538,14 @@ def full_header(header: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[st
     quality = {name: value for name, value in header["quality"].items() if name != "steps"}
     steps = read_steps(header, arrays)
     if steps:
-        quality["per_step"] = [
-            {"step": step, "psnr": _psnr(figures["rmse"], high - low), **figures}
-            for step, figures in enumerate(steps)
-        ]
+        quality["per_step"] = steps
     if isinstance(quality.get("ssim_window"), Mapping):
-        usual = {"data_range": high - low, "steps": list(range(header["domain"]["shape"][0]))}
-        quality["ssim_window"] = {**usual, **quality["ssim_window"]}
+        steps_of_series = header["domain"]["shape"][0]
+        window = {"data_range": high - low, "steps": steps_of_series, **quality["ssim_window"]}
+        if isinstance(window["steps"], int):
+            count = min(max(window["steps"], 1), steps_of_series)
+            window["steps"] = even_steps(steps_of_series, count)
+        quality["ssim_window"] = window
     model = dict(header["model"])
     if isinstance(model.get("gains"), list):
         gains = [gain for gain in model["gains"] if isinstance(gain, list)]

@@ -19,7 +19,6 @@ from fhash_codec.boxes import (
     coarse_vertices,
     overlap,
     slice_of,
-    step_blocks,
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
@@ -31,7 +30,7 @@ from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import InputError, RegionError
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
 from fhash_formats.transform.values import about_origin
 

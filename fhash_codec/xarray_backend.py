@@ -16,7 +16,7 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from fhash_codec.boxes import Box, index_ranges, slice_of, step_blocks
+from fhash_codec.boxes import Box, index_ranges, slice_of
 from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Handle, absolute, acquire, release
 from fhash_codec.encoding import encode
@@ -26,7 +26,15 @@ from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError, UnsupportedFileError
 from fhash_formats.readers.common.cf import SCALING
-from fhash_formats.series import AXES, NO_AXIS, SourceVariable, meant, renamed, with_history
+from fhash_formats.series import (
+    AXES,
+    NO_AXIS,
+    SourceVariable,
+    meant,
+    renamed,
+    step_blocks,
+    with_history,
+)
 from fhash_formats.support.values import PACKING
 
 Key = tuple[Any, ...]

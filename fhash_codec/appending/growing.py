@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import TracebackType
@@ -98,21 +98,23 @@ class Figures:
             raise RuntimeError("a decoded frame has values that are not finite")
         return sums
 
-    def header(self, writer: ContainerWriter, data_range: float) -> dict[str, Any]:
+    def header(
+        self, writer: ContainerWriter, data_range: float, shape: Sequence[int]
+    ) -> dict[str, Any]:
         """The header's `quality`.
 
         Args:
             writer: of the container; it gets an array for the figures of many steps.
             data_range: width of the header's value range.
+            shape: of the series (t, z, y, x).
         """
         errors = Errors(data_range, scale=self.scale)
-        for number, step in enumerate(self.steps):
-            errors.take(number, step)
+        errors.take(np.array(self.steps, dtype=np.float64).reshape(-1, len(ErrorSums._fields)))
         whole = {name: getattr(errors, name) for name in ("psnr", "rmse", "max_abs_error")}
         everywhere = {f"{name}_domain": value for name, value in whole.items()}
-        per_step = [asdict(step) for step in errors.steps]
+        per_step = errors.per_step()
         quality: dict[str, Any] = {**whole, **everywhere, "ssim_window": {}, "per_step": per_step}
-        return brief_quality(writer, quality, data_range, len(self.steps))
+        return brief_quality(writer, quality, data_range, shape)
 
 
 DECODED_AGAIN = 8
@@ -394,7 +396,9 @@ class GrowingFile:
                 "levels": [shape],
                 "parameters": self._nonzero + weights,
             },
-            "quality": self.figures.header(self._container, self._range.high - self._range.low),
+            "quality": self.figures.header(
+                self._container, self._range.high - self._range.low, shape
+            ),
         }
 
 

@@ -32,7 +32,6 @@ from fhash_codec.header import (
     described_source,
     write_series,
 )
-from fhash_codec.measure.errors import ErrorSums
 from fhash_codec.measure.metrics import Comparer, Comparison
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -142,38 +141,27 @@ def _settings(config: EncodeConfig | None, plan: SeriesPlan | None) -> EncodeCon
     return plan.config
 
 
-def comparisons_of(errors: npt.NDArray[np.float64], first: int) -> list[Comparison]:
-    """The comparisons of the steps of a part, which begin at step `first` of the whole.
+def comparison_of(errors: npt.NDArray[np.float64], first: int) -> Comparison:
+    """The comparison of the steps of a part, which begin at step `first` of the whole.
 
     errors: (steps, COLUMNS), as a part has them.
     """
-    result = []
-    for step, row in enumerate(errors.tolist(), start=first):
-        number, squares, largest, bulk_count, bulk_squares, *rest = row
-        result.append(
-            Comparison(
-                step=step,
-                coreset=ErrorSums(int(number), squares, largest, int(bulk_count), bulk_squares),
-                domain=ErrorSums(int(rest[0]), rest[1], rest[2]),
-                similarity=(rest[3], int(rest[4])),
-                between=None,
-                seconds=0.0,
-                ssim_seconds=0.0,
-            )
-        )
-    return result
-
-
-def _row(comparison: Comparison) -> list[float]:
-    """The numbers of a step: sums over the coreset, the domain, and the similarity."""
-    coreset, domain = comparison.coreset, comparison.domain
-    numbers = (
-        *(coreset.number, coreset.squares, coreset.largest),
-        *(coreset.bulk_count, coreset.bulk_squares),
-        *(domain.number, domain.squares, domain.largest),
-        *comparison.similarity,
+    coreset, domain, similarity = np.split(errors, [DOMAIN, SIMILARITY], axis=1)
+    return Comparison(
+        stop=first + len(errors),
+        coreset=coreset,
+        domain=np.pad(domain, ((0, 0), (0, coreset.shape[1] - domain.shape[1]))),
+        similarity=similarity,
+        between=None,
+        seconds=0.0,
+        ssim_seconds=0.0,
     )
-    return [float(number) for number in numbers]
+
+
+def _rows(comparison: Comparison) -> npt.NDArray[np.float64]:
+    """The numbers of each step: sums over the coreset, the domain, and the similarity."""
+    domain = comparison.domain[:, : SIMILARITY - DOMAIN]
+    return np.hstack([comparison.coreset, domain, comparison.similarity])
 
 
 class _Job:
@@ -203,7 +191,9 @@ class _Job:
             quality, errors, whole = self._measured(writer, header, progress)
             writer.add_whole(ERRORS, errors)
             low, high = header["value_range"]
-            header["quality"] = brief_quality(writer, quality, high - low, len(self.steps))
+            header["quality"] = brief_quality(
+                writer, quality, high - low, (len(self.steps), *self.series.shape[1:])
+            )
             header[PART] |= {
                 "number": self.part.number,
                 "of": self.part.of,
@@ -285,7 +275,7 @@ class _Job:
         self, writer: ContainerWriter, header: Mapping[str, Any], progress: Progress
     ) -> tuple[dict[str, Any], npt.NDArray[np.float64], list[int]]:
         """The quality of what is written, the errors of each step, and the steps of the SSIM."""
-        rows: list[list[float]] = []
+        rows: list[npt.NDArray[np.float64]] = []
         whole = steps_of_ssim(self.series, ssim_budget(self.plan.config))
         with Volume(writer.preview(header)) as volume:
             quality = measure(
@@ -293,9 +283,9 @@ class _Job:
                 volume,
                 progress,
                 [step - self.steps.start for step in whole if step in self.steps],
-                lambda comparison: rows.append(_row(comparison)),
+                lambda comparison: rows.append(_rows(comparison)),
             )
-        return quality, np.array(rows, dtype=np.float64), whole
+        return quality, np.concatenate(rows), whole
 
     def _write_source(self, writer: ContainerWriter) -> dict[str, Any]:
         """Write what belongs to the whole series in its source, in the first part alone."""
@@ -308,6 +298,8 @@ class _Job:
         return {key: value for key, value in kept.items() if value is not None}
 
 
+DOMAIN = 5
+"""Number in a row of errors of the first that is of the whole domain."""
 SIMILARITY = 8
 """Number in a row of errors that is the sum of the SSIM; the next one is its count."""
 SIMILAR = 1.001
@@ -589,7 +581,7 @@ class _Whole:
         header["domain"] = {"shape": list(self.shape)}
         header["model"] = self._model(table)
         quality = self._quality(ValueRange(low, high), header["background"])
-        header["quality"] = brief_quality(writer, quality, high - low, self.shape[0])
+        header["quality"] = brief_quality(writer, quality, high - low, self.shape)
         return header, quality
 
     def _variable(self) -> dict[str, Any]:
@@ -643,6 +635,5 @@ class _Whole:
             None if bulk is None else ValueRange(*bulk),
         )
         for part in self._parts:
-            for comparison in comparisons_of(part.errors, part.first):
-                comparer.add(comparison)
+            comparer.add(comparison_of(part.errors, part.first))
         return comparer.quality(first.ssim_steps).to_dict()

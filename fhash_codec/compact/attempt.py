@@ -131,8 +131,9 @@ def _price(shape: Shape, tile: Shape, parts: list[int], tiles: int, steps: int) 
 
 
 def first_tile(shape: Shape) -> Shape:
-    """Return the tile for a first look at a series."""
-    return even_tile(shape, max(1, prod(shape) // TILE_VERTICES), min(shape[0], FIRST_STEPS))
+    """Return the tile for a first look at a series: of small frames it has many steps."""
+    steps = max(FIRST_STEPS, TILE_VERTICES // prod(shape[1:]))
+    return even_tile(shape, max(1, prod(shape) // TILE_VERTICES), min(shape[0], steps))
 
 
 MAX_WHOLE_VERTICES = 12 << 20

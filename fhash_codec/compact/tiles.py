@@ -17,7 +17,7 @@ import numpy as np
 from fhash_codec.features.features import Extent
 from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
-from fhash_formats.series import Series
+from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.arrays import Mask, Values
 from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
 from fhash_formats.transform import encoding
@@ -152,7 +152,9 @@ class Blocks:
         shape: of the part, at most that of the box.
         """
         first = (self.shape[0] - shape[0]) // 2
-        frame = self._step(first + shape[0] // 2)
+        middle = first + shape[0] // 2
+        values, counted = self._steps(range(middle, middle + 1))
+        frame = Tile(values[0], None if counted is None else counted[0])
         places = product(
             *(
                 sorted({0, (length - n) // 2, length - n})
@@ -174,16 +176,16 @@ class Blocks:
         for place in places:
             low = (min(at, m - n) for at, m, n in zip(place, self.shape, shape, strict=True))
             steps, *region = _region((*low,), shape)
-            for step in range(steps.start, steps.stop):
-                frame = self._step(step)
-                values.append(frame.values[tuple(region)])
-                if frame.counted is not None:
-                    masks.append(frame.counted[tuple(region)])
-        counted = np.stack(masks) if masks else None
+            for _, block in step_blocks(range(steps.start, steps.stop), self.shape[1:]):
+                frames = self._steps(block)
+                values.append(frames.values[:, *region])
+                if frames.counted is not None:
+                    masks.append(frames.counted[:, *region])
+        counted = np.concatenate(masks) if masks else None
         other = copy(self)
         other._box, other.shape, other.weights = _BoxInMemory(), shape, tuple(weights)
         other.complete = counted is None or bool(counted.all())
-        other._box.content = Tile(np.stack(values), None if other.complete else counted)
+        other._box.content = Tile(np.concatenate(values), None if other.complete else counted)
         other._cut(shape)
         return other
 
@@ -191,13 +193,13 @@ class Blocks:
         """Return the weight of the box that a tile is of."""
         return self.weights[index[0] * len(self.weights) // self.grid[0]]
 
-    def _step(self, step: int) -> Tile:
-        """Return values and mask (z, y, x) of one step."""
-        if self.in_memory:
-            values, counted = self._whole()
-            return Tile(values[step], None if counted is None else counted[step])
-        values, counted = self._load(range(step, step + 1))
-        return Tile(values[0], None if counted is None else counted[0])
+    def _steps(self, steps: range) -> Tile:
+        """Return values and mask (t, z, y, x) of neighbouring steps."""
+        if not self.in_memory:
+            return self._load(steps)
+        values, counted = self._whole()
+        span = slice(steps.start, steps.stop)
+        return Tile(values[span], None if counted is None else counted[span])
 
     @property
     def in_memory(self) -> bool:
@@ -226,13 +228,13 @@ class Blocks:
         return padded_tile(values, in_coreset, self.tile)
 
     def counted_values(self) -> Iterator[Values]:
-        """Yield the values that count of each step, less the origin.
+        """Yield the values that count of some steps after others, less the origin.
 
-        A series that does not stay in memory is read once, step by step.
+        A series that does not stay in memory is read once.
         """
-        for step in range(self.shape[0]):
-            frame, mask = self._step(step)
-            yield frame if mask is None else frame[mask]
+        for _, steps in step_blocks(range(self.shape[0]), self.shape[1:]):
+            frames, mask = self._steps(steps)
+            yield frames if mask is None else frames[mask]
 
     def _whole(self) -> Tile:
         """Return the box over all steps, which is read at the first call."""
@@ -247,9 +249,7 @@ class Blocks:
         first, last = number * self.tile[0], min((number + 1) * self.tile[0], self.shape[0])
         steps = range(box * self.shape[0] + first, box * self.shape[0] + last)
         if self.in_memory:
-            values, in_coreset = self._whole()
-            span = slice(steps[0], steps[-1] + 1)
-            return Tile(values[span], None if in_coreset is None else in_coreset[span])
+            return self._steps(steps)
         if self._last_layer is None or self._last_layer[0] != t:
             self._last_layer = None  # frees its memory before the next layer is read
             self._last_layer = (t, self._load(steps))
@@ -263,13 +263,14 @@ class Blocks:
             values.flags.writeable = False  # it is the caller's
             return Tile(values, self._masks(steps))
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
-        for number, step in enumerate(steps):
-            frame = self._series.read(step)[self._extent.box.slices()]
-            if frame.dtype.kind == "f" and self.dtype.kind != "f":
+        for place, block in step_blocks(steps, self._series.shape[1:]):
+            frames = self._series.block(block)[:, *self._extent.box.slices()]
+            if frames.dtype.kind == "f" and self.dtype.kind != "f":
                 # Missing values are outside the coreset; any integer may stand there.
-                frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
-                frame = cast(np.where(np.isfinite(frame), frame, 0.0), self.source_dtype)
-            values[number] = frame
+                least = np.fmin.reduce(frames, axis=(1, 2, 3), keepdims=True, initial=np.inf)
+                frames = np.where(np.isfinite(frames), frames, least)
+                frames = cast(np.where(np.isfinite(frames), frames, 0.0), self.source_dtype)
+            values[place] = frames
         values = about_origin(values, self.origin) if self.origin else values
         return Tile(values, self._masks(steps))
 
@@ -277,7 +278,7 @@ class Blocks:
         """Return which vertices of the box are in the coreset at some steps; None for all."""
         if self.complete:
             return None
-        return np.stack([self._extent.mask(step) for step in steps])
+        return self._extent.masks(steps)
 
 
 def _region(place: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:

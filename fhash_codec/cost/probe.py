@@ -48,7 +48,7 @@ from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import BUDGET, Comparer, measure_quality, ssim_steps
 from fhash_codec.progress import recording, silent
 from fhash_formats.errors import FhashWarning, QualityError
-from fhash_formats.series import Series
+from fhash_formats.series import ArraySeries, Series
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.tile_format import Shape, TileSettings
@@ -336,7 +336,8 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
     for measured in ([], ssim_steps(steps, plane, BUDGET)):
         begun = now()
         comparer = Comparer(look.task.goal.data_range, 0.0)
-        measure_quality(comparer, values.__getitem__, changed.__getitem__, steps, measured)
+        original, decoded = (ArraySeries(frames).read_steps for frames in (values, changed))
+        measure_quality(comparer, original, decoded, values.shape, measured)
         rates.append((now() - begun) / (steps * plane))
     return rates[0], max(rates[1] - rates[0], 0.0)
 

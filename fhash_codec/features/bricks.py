@@ -115,7 +115,7 @@ def build_coreset(
     for key, step in enumerate(key_frames):
         mask = of_key = extent.mask(key)
         grids.append(occupancy.pack(mask))
-        frame = series.read(step)[box.slices()]
+        frame = series.frame(step)[box.slices()]
         if fringe:
             mask = extent.with_fringe(key)
             frame = _finite_at(mask, frame, series, extent, key)
@@ -205,7 +205,7 @@ def _finite_at(
     for other in (key - 1, key + 1):
         if gaps.any() and 0 <= other < len(extent.key_frames):
             held = gaps & extent.mask(other)
-            values = series.read(extent.key_frames[other])[extent.box.slices()]
+            values = series.frame(extent.key_frames[other])[extent.box.slices()]
             frame = np.where(held, values, frame)
             gaps &= ~held
     return frame

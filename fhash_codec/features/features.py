@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box, Sizes, bounding_box, fuse
-from fhash_codec.features.scan import Scan, finite_mask, finite_values
+from fhash_codec.features.scan import Scan, finite_masks, finite_values
 from fhash_codec.measure.value_range import Mean, Ranks, ValueRange, pieces
 from fhash_codec.progress import Progress
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.series import Series
+from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.values import exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
@@ -54,9 +54,21 @@ class Feature(ABC):
     def select(self, frame: Frame, step: int) -> FrameMask:
         """Mask (z, y, x) of the vertices of the feature in a frame of data values."""
 
+    def select_steps(self, frames: Frame, steps: range) -> FrameMask:
+        """Masks (t, z, y, x) of `select` for neighbouring steps."""
+        pairs = zip(frames, steps, strict=True)
+        return np.stack([self.select(frame, step) for frame, step in pairs])
+
+
+class InSpace(Feature):
+    """A feature of the values of a frame alone: `select` takes those of several steps as well."""
+
+    def select_steps(self, frames: Frame, steps: range) -> FrameMask:
+        return self.select(frames, steps.start)
+
 
 @dataclass(frozen=True)
-class Everything(Feature):
+class Everything(InSpace):
     """Every finite vertex."""
 
     def select(self, frame: Frame, step: int) -> FrameMask:
@@ -67,7 +79,7 @@ class Everything(Feature):
 
 
 @dataclass(frozen=True)
-class Interval(Feature):
+class Interval(InSpace):
     """Vertices with low <= value <= high; both ends may be infinite."""
 
     low: float
@@ -88,7 +100,7 @@ class Interval(Feature):
 
 
 @dataclass(frozen=True)
-class Isosurface(Feature):
+class Isosurface(InSpace):
     """Vertices beside an isosurface.
 
     They are both ends of every grid edge (along z, y or x) whose ends lie strictly on either side
@@ -103,7 +115,7 @@ class Isosurface(Feature):
         selected &= finite
         above: FrameMask = (frame > value) & finite
         below: FrameMask = (frame < value) & finite
-        for axis in range(3):
+        for axis in (-3, -2, -1):
             high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
             crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
             ends[:-1] |= crossed
@@ -115,7 +127,7 @@ class Isosurface(Feature):
 
 
 @dataclass(frozen=True)
-class Segmentation(Feature):
+class Segmentation(InSpace):
     """The foreground: vertices strictly above a threshold.
 
     The threshold None stands for Otsu's threshold, which `resolve_features` fills in.
@@ -307,7 +319,7 @@ def _frames_around(series: Series, key_frames: Sequence[int]) -> FramesAround:
             place = list(key_frames).index(step)
             first = key_frames[place - 1] if place else 0
             end = key_frames[place + 1] if place + 1 < len(key_frames) else last
-        return (series.read(each) for each in range(max(first, 0), min(end, last) + 1))
+        return (series.frame(each) for each in range(max(first, 0), min(end, last) + 1))
 
     return around
 
@@ -331,12 +343,12 @@ def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
 
 
 def dilate(mask: FrameMask, vertices: int) -> FrameMask:
-    """A mask (z, y, x) grown by some vertices in the 26-neighbourhood (paper, Feature Dilation).
+    """A mask (..., z, y, x) grown by vertices in the 26-neighbourhood (paper, Feature Dilation).
 
     The growth does not wrap around the ends of an axis. It takes one axis after another. Along an
     axis the shifts double: a mask that has grown by r may be shifted by r + 1 without a gap.
     """
-    for axis in range(3):
+    for axis in (-3, -2, -1):
         reach = 0
         while reach < vertices:
             shift = min(reach + 1, vertices - reach)
@@ -365,7 +377,7 @@ def _histogram(
     """Counts (BINS,) of the finite values of all key frames, over the range of the series."""
     counts = np.zeros(BINS, dtype=np.int64)
     for done, step in enumerate(key_frames):
-        for piece in pieces(series.read(step)):
+        for piece in pieces(series.frame(step)):
             unit = value_range.to_unit(finite_values(piece))
             counts += np.bincount(
                 np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
@@ -434,6 +446,12 @@ class Extent:
         """
         return self._unpacked(self.packed[key])
 
+    def masks(self, keys: range) -> npt.NDArray[np.bool_]:
+        """Masks (keys, z, y, x) of `mask` of neighbouring key frames."""
+        rows = np.stack(self.packed[keys.start : keys.stop])
+        bits = np.unpackbits(rows, axis=1, count=prod(self.domain)).view(np.bool_)
+        return bits.reshape(-1, *self.domain)[:, *self.box.slices()]
+
     def mask_of(self, feature: int, key: int) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of the box that are in the coreset for one feature.
 
@@ -497,31 +515,33 @@ def find_extent(
     z, y, x = series.shape[1:]
     key_frames, features, dilation = choice
     everything = any(isinstance(feature, Everything) for feature in features)
-    if everything and not scan.missing and not apart:
-        return _everywhere(scan, key_frames, (z, y, x), progress)
+    if everything and not apart and (not scan.missing or len(key_frames) == series.shape[0]):
+        progress("selecting", 1, 1, "")
+        return _everywhere(scan, key_frames, (z, y, x))
     packed: list[npt.NDArray[np.uint8]] = []
     boxes, outside, samples = [], Mean(), 0
     packed_apart: tuple[list[npt.NDArray[np.uint8]], ...] = tuple(
         [] for _ in (features if apart else ())
     )
     without_vertices = set(features)
-    for done, step in enumerate(key_frames):
-        frame = series.read(step)
-        masks = [feature.select(frame, step) for feature in features]
+    for steps in _neighbours(key_frames, series):
+        frames = series.block(steps)
+        masks = [feature.select_steps(frames, steps) for feature in features]
         without_vertices -= {
             feature for feature, mask in zip(features, masks, strict=True) if mask.any()
         }
-        finite = scan.finite(step, (z, y, x))
+        finite = finite_masks(scan.missing, steps, (z, y, x))
         mask = _dilated(np.logical_or.reduce(masks), finite, dilation)
-        packed.append(np.packbits(mask))
+        packed += _packed(mask)
         for one, packed_one in zip(masks, packed_apart, strict=False):
-            packed_one.append(np.packbits(_dilated(one, finite, dilation)))
-        boxes.append(bounding_box(mask))
+            packed_one += _packed(_dilated(one, finite, dilation))
+        ever: FrameMask = np.any(mask, axis=0)
+        boxes.append(bounding_box(ever))
         samples += int(np.count_nonzero(mask))
-        _add_outside(outside, frame, mask, finite)
+        _add_outside(outside, frames, mask, finite)
         if ranks is not None:
-            ranks.add(frame[mask])
-        progress("selecting", done + 1, len(key_frames), "")
+            ranks.add(frames[mask])
+        progress("selecting", len(packed), len(key_frames), "")
     box = fuse(boxes)
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high
@@ -555,26 +575,45 @@ def packed_masks(
 
     missing: masks of the missing values of these steps, see `Scan`.
     """
-    result = {}
-    for step in steps:
-        frame = series.read(step)
-        mask = np.logical_or.reduce([feature.select(frame, step) for feature in features])
-        finite = finite_mask(missing, step, series.shape[1:])
-        result[step] = np.packbits(_dilated(mask, finite, dilation))
+    result: dict[int, npt.NDArray[np.uint8]] = {}
+    for block, frames in series.blocks(steps):
+        mask = np.logical_or.reduce([feature.select_steps(frames, block) for feature in features])
+        finite = finite_masks(missing, block, series.shape[1:])
+        result |= zip(block, _packed(_dilated(mask, finite, dilation)), strict=True)
     return result
 
 
-def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: Progress) -> Extent:
-    """The extent of a coreset that holds every vertex; no frame is read for it."""
-    all_ones = np.packbits(np.ones(domain, dtype=bool))
-    for done in range(len(key_frames)):
-        progress("selecting", done + 1, len(key_frames), "")
+def _neighbours(key_frames: Sequence[int], series: Series) -> Iterator[range]:
+    """The key frames in blocks of neighbours where all steps are, else one by one."""
+    if len(key_frames) < series.shape[0]:
+        return (range(step, step + 1) for step in key_frames)
+    return (block for _, block in step_blocks(range(series.shape[0]), series.shape[1:]))
+
+
+def _packed(masks: FrameMask) -> list[npt.NDArray[np.uint8]]:
+    """The bits of each step of masks (t, z, y, x)."""
+    return list(np.packbits(masks.reshape(len(masks), -1), axis=1))
+
+
+def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes) -> Extent:
+    """The extent of a coreset of all finite vertices; no frame is read for it.
+
+    key_frames: all steps where values are missing.
+    """
+    every = np.packbits(np.ones(domain, dtype=bool))
+    packed = [every] * len(key_frames)
+    some = every if len(scan.missing) < len(key_frames) else np.zeros_like(every)
+    for step, missing in scan.missing.items():
+        packed[step] = every & ~missing
+        some = some | packed[step]
+    box = bounding_box(np.unpackbits(some, count=prod(domain)).view(np.bool_).reshape(domain))
+    assert box is not None, "a scan has a finite value"
     return Extent(
-        box=Box.of_shape(domain),
+        box=box,
         key_frames=tuple(key_frames),
-        packed=[all_ones] * len(key_frames),
+        packed=packed,
         domain=domain,
-        samples=len(key_frames) * prod(domain),
+        samples=scan.finite_count if scan.missing else len(packed) * prod(domain),
         background=scan.mean,
     )
 
@@ -582,9 +621,9 @@ def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: 
 def _dilated(
     mask: npt.NDArray[np.bool_], finite: npt.NDArray[np.bool_] | None, dilation: int
 ) -> npt.NDArray[np.bool_]:
-    """Mask (z, y, x) of the finite vertices of the dilated mask.
+    """Masks (t, z, y, x) of the finite vertices of the dilated masks.
 
-    finite: mask of all finite vertices; None if every vertex is finite.
+    finite: masks of all finite vertices; None if every vertex is finite.
     """
     mask = dilate(mask, dilation)
     if finite is not None:
@@ -594,14 +633,12 @@ def _dilated(
 
 def _add_outside(
     mean: Mean,
-    frame: npt.NDArray[Any],
+    frames: npt.NDArray[Any],
     mask: npt.NDArray[np.bool_],
     finite: npt.NDArray[np.bool_] | None,
 ) -> None:
-    """Add the finite values outside the coreset to a mean.
-
-    Planes are added one by one, so that their float64 copies stay small.
-    """
-    for z, plane in enumerate(frame):
-        outside = ~mask[z] if finite is None else finite[z] & ~mask[z]
-        mean.add(plane[outside])
+    """Add the finite values outside the coreset to a mean."""
+    outside = ~mask if finite is None else finite & ~mask
+    # Planes of a single frame one by one, so that the float64 copies of a large one stay small.
+    for place in np.ndindex(outside.shape[:2]) if len(frames) == 1 else [()]:
+        mean.add(frames[place][outside[place]])

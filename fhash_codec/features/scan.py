@@ -1,10 +1,10 @@
-"""Scan of a series: its range, extremes and figures, frame by frame."""
+"""Scan of a series: its range, extremes and figures, block by block of frames."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.measure.errors import range_and_sum
-from fhash_codec.measure.value_range import Mean, Ranks, RanksSpan, ValueRange, pieces, power_of_two
+from fhash_codec.measure.errors import row_sums
+from fhash_codec.measure.value_range import PIECE, Mean, Ranks, RanksSpan, ValueRange, power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries, Series, warn_defaults
+from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
 from fhash_formats.support.arrays import Values
 from fhash_formats.support.threads import map_ahead, thread_pool
 from fhash_formats.support.values import exact_number
@@ -24,11 +24,8 @@ from fhash_formats.support.values import exact_number
 HELD_BYTES = 1 << 28
 """Bytes of a series whose frames stay in memory after the scan, at most."""
 
-LARGE = 1 << 16
-"""Values of a frame from which on another thread looks at it."""
-
-FRAMES_AHEAD = 2
-"""Frames that are looked at while the next one is read, at most."""
+BLOCKS_AHEAD = 2
+"""Blocks of frames that are looked at while the next one is read, at most."""
 
 MOST = 2.0
 """Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
@@ -250,22 +247,20 @@ class Scan:
     finite_count: int
     missing: Mapping[int, npt.NDArray[np.uint8]]
 
-    def finite(self, step: int, shape: tuple[int, int, int]) -> npt.NDArray[np.bool_] | None:
-        """Mask (z, y, x) of the finite vertices of a step; None if all are finite.
 
-        shape: of a frame.
-        """
-        return finite_mask(self.missing, step, shape)
-
-
-def finite_mask(
-    missing: Mapping[int, npt.NDArray[np.uint8]], step: int, shape: tuple[int, int, int]
+def finite_masks(
+    missing: Mapping[int, npt.NDArray[np.uint8]], steps: range, shape: tuple[int, int, int]
 ) -> npt.NDArray[np.bool_] | None:
-    """The mask of `Scan.finite`, from `Scan.missing`."""
-    if step not in missing:
+    """Masks (t, z, y, x) of the finite vertices of some steps; None if all are finite.
+
+    missing: see `Scan`. shape: of a frame.
+    """
+    if not any(step in missing for step in steps):
         return None
-    bits = np.unpackbits(missing[step], count=prod(shape)).view(np.bool_)
-    return ~bits.reshape(shape)
+    none = np.zeros(-(-prod(shape) // 8), np.uint8)
+    rows = np.stack([missing.get(step, none) for step in steps])
+    bits = np.unpackbits(rows, axis=1, count=prod(shape)).view(np.bool_)
+    return ~bits.reshape(-1, *shape)
 
 
 def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan:
@@ -278,31 +273,27 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
     """
     figures = _Figures(series)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
-    last_bits: npt.NDArray[np.uint8] | None = None
     steps, size = series.shape[0], prod(series.shape) * series.dtype.itemsize
     # the encoder and the measurement read all frames once more
     kept = series.held is None and size <= HELD_BYTES
     held = np.empty(series.shape, series.dtype) if kept else None
-    large = prod(series.shape[1:]) >= LARGE
 
-    def look(at: tuple[int, Values]) -> tuple[Values, _Figures, int]:
-        step, frame = at
+    def look(at: tuple[range, Values]) -> tuple[range, Values, _Figures, int]:
+        block, frames = at
         if held is not None:
-            held[step] = frame
-        own = _Figures(series) if large else figures
-        return frame, own, own.add(frame)
+            held[block.start : block.stop] = frames
+        own = _Figures(series)
+        return block, frames, own, own.add(frames)
 
     with thread_pool() as workers:
-        frames = enumerate(series.frames())
-        looks = map_ahead(workers, look, frames, FRAMES_AHEAD) if large else map(look, frames)
-        for step, (frame, own, finite) in enumerate(looks):
-            if large:
-                figures.join(own)
-            if finite < frame.size:
-                missing[step] = last_bits = _missing_bits(frame, last_bits)
+        looks = map_ahead(workers, look, series.blocks(range(steps)), BLOCKS_AHEAD)
+        for block, frames, own, finite in looks:
+            figures.join(own)
+            if finite < frames.size:
+                _add_missing(missing, block, frames)
             if ranks is not None:
-                ranks.add(frame)
-            progress("scanning", step + 1, steps, "")
+                ranks.add(frames)
+            progress("scanning", block.stop, steps, "")
     series.check()
     if held is not None:
         held.flags.writeable = False
@@ -318,18 +309,18 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
 
 
 class _Figures:
-    """Range, mean and extremes of the finite values of frames that are added one by one."""
+    """Range, mean and extremes of the finite values of blocks of frames that are added in turn."""
 
     def __init__(self, series: Series) -> None:
         self.low, self.high, self.mean = np.inf, -np.inf, Mean()
         self.extremes = Extremes(series.dtype, series.unlikely)
 
-    def add(self, frame: Values) -> int:
-        """Add a frame, and return the number of its finite values."""
+    def add(self, frames: Values) -> int:
+        """Add frames (t, z, y, x), and return the number of their finite values."""
         finite = 0
-        for piece in pieces(frame):
-            count, low, high = scan_piece(piece, self.mean)
-            self.extremes.add(piece, count, low, high)
+        for rows in _rows(frames):
+            count, low, high = scan_rows(rows, self.mean)
+            self.extremes.add(rows, count, low, high)
             self.low, self.high = min(self.low, low), max(self.high, high)
             finite += count
         return finite
@@ -364,12 +355,11 @@ class SpanScan:
         self._figures = _Figures(series)
         self.ranks = RanksSpan(steps.start * prod(series.shape[1:]))
         self.has_missing = False
-        for step in steps:
-            frame = series.read(step)
-            if self._figures.add(frame) < frame.size:
+        for _, frames in series.blocks(steps):
+            if self._figures.add(frames) < frames.size:
                 self.has_missing, self.ranks = True, RanksSpan(0)
                 return
-            self.ranks.add(frame)
+            self.ranks.add(frames)
 
     @staticmethod
     def joined(series: Series, spans: Iterable[SpanScan]) -> tuple[Scan, Ranks] | None:
@@ -397,50 +387,63 @@ def scan_steps(
     are not those that were scanned. Progress stage: "scanning".
     """
     missing: dict[int, npt.NDArray[np.uint8]] = {}
-    last_bits: npt.NDArray[np.uint8] | None = None
-    for number, step in enumerate(steps):
-        frame, count, mean = series.read(step), 0, Mean()
-        for piece in pieces(frame):
-            piece_count, low, high = scan_piece(piece, mean)
-            count += piece_count
-            if piece_count and not (known.low <= low and high <= known.high):
+    for block, frames in series.blocks(steps):
+        count, mean = 0, Mean()
+        which = spans_text([[block.start, block.stop]])
+        for rows in _rows(frames):
+            rows_count, low, high = scan_rows(rows, mean)
+            count += rows_count
+            if rows_count and not (known.low <= low and high <= known.high):
                 raise InputError(
-                    f"{series.source}: step {step} has values from {low:.9g} to {high:.9g}, and "
+                    f"{series.source}: in {which} are values from {low:.9g} to {high:.9g}, and "
                     f"the plan is of data from {known.low:.9g} to {known.high:.9g}; make it anew"
                 )
-        if count < frame.size:
+        if count < frames.size:
             if not may_miss:
                 raise InputError(
-                    f"{series.source}: step {step} has missing values, and the plan is of data "
+                    f"{series.source}: in {which} are missing values, and the plan is of data "
                     "without; make it anew"
                 )
-            missing[step] = last_bits = _missing_bits(frame, last_bits)
-        progress("scanning", number + 1, len(steps), "")
+            _add_missing(missing, block, frames)
+        progress("scanning", block.stop - steps.start, len(steps), "")
     return missing
 
 
-def _missing_bits(
-    frame: npt.NDArray[Any], last: npt.NDArray[np.uint8] | None
-) -> npt.NDArray[np.uint8]:
-    """The bits of the values of a frame that are not finite; the last ones where they are equal."""
-    bits = np.packbits(~np.isfinite(frame))
+def _rows(frames: Values) -> Iterator[Values]:
+    """Frames (t, z, y, x) as rows (t, values) of at most PIECE values each; blocks are small."""
+    rows = frames.reshape(len(frames), -1)
+    return (rows[:, start : start + PIECE] for start in range(0, rows.shape[1], PIECE))
+
+
+def _add_missing(
+    missing: dict[int, npt.NDArray[np.uint8]], steps: range, frames: npt.NDArray[Any]
+) -> None:
+    """Add the bits of the values that are not finite of each step that has some."""
     # A land mask is the same at every step: keep one copy of it.
-    return last if last is not None and np.array_equal(bits, last) else bits
+    last = next(reversed(missing.values()), None)
+    bits = np.packbits(~np.isfinite(frames).reshape(len(steps), -1), axis=1)
+    for place in np.flatnonzero(bits.any(axis=1)).tolist():
+        row = bits[place]
+        last = row if last is None or (row != last).any() else last
+        missing[steps[place]] = last
 
 
-def scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
-    """Number, minimum and maximum of the finite values of a piece; they are added to the mean."""
-    if piece.dtype.kind != "f":
-        mean.add(piece)
-        return piece.size, exact_number(piece.min().item()), exact_number(piece.max().item())
-    wide = piece.astype(np.float32 if piece.dtype.itemsize <= 4 else np.float64, copy=False)
+def scan_rows(rows: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
+    """Number, minimum and maximum of the finite values of rows (rows, values).
+
+    Each row is added to the mean, which so does not depend on the rows that come together.
+    """
+    if rows.dtype.kind != "f":
+        mean.add(rows)
+        return rows.size, exact_number(rows.min().item()), exact_number(rows.max().item())
+    wide = rows.astype(np.float32 if rows.dtype.itemsize <= 4 else np.float64, copy=False)
     # A sum of float32 values does not overflow; float64 values are scaled before they are summed.
-    count, low, high, total = range_and_sum(wide)
-    scale = 1.0
+    counts, lows, highs, totals = row_sums(wide).T
+    count, low, high, scale = int(counts.sum()), float(lows.min()), float(highs.max()), 1.0
     if count and wide.dtype == np.float64:
         scale = power_of_two(max(abs(low), abs(high)))
-        total = range_and_sum(wide, scale)[3]
-    mean.add_sum(count, total, scale)
+        totals = row_sums(wide, scale)[:, 3]
+    mean.add_sums(count, totals, scale)
     return count, low, high
 
 

@@ -285,13 +285,18 @@ class LabelledSeries(Series):
         self.require_step(step)
         if self.lazy is not None:
             return np.ascontiguousarray(self.lazy.read(step), dtype=self.dtype)
-        at = {
-            dim: step for dim, axis in zip(self._array.dims, self._axes, strict=True) if axis == "t"
-        }
-        values = np.asarray(self._array.isel(at).values)
-        space = [axis for axis in self._axes if axis != "t"]
-        ordered = values.transpose([space.index(axis) for axis in AXES if axis in space])
-        return np.ascontiguousarray(ordered.reshape(self.shape[1:]), dtype=self.dtype)
+        frame: npt.NDArray[Any] = self.read_steps(range(step, step + 1))[0]
+        return frame
+
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        if self.lazy is not None:
+            return super().read_steps(steps)
+        chosen = slice(steps.start, steps.stop)
+        known = dict(zip(self._axes, self._array.dims, strict=True))
+        values = np.asarray(self._array.isel({known["t"]: chosen} if "t" in known else {}).values)
+        ordered = values.transpose([self._axes.index(axis) for axis in AXES if axis in known])
+        shaped = ordered.reshape(len(steps), *self.shape[1:])
+        return np.ascontiguousarray(shaped, dtype=self.dtype)
 
     def _metadata_of(self, array: Any, beside: Any, request: Request) -> SourceMetadata:
         arrays = {str(key): each for key, each in beside.variables.items() if key != array.name}

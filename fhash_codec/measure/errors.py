@@ -42,17 +42,32 @@ class ErrorSums(NamedTuple):
     bulk_squares: float = 0.0
     """Sum of their squares."""
 
+    @classmethod
+    def of(cls, numbers: Double) -> ErrorSums:
+        """The sums of a row of `step_sums`."""
+        number, squares, largest, bulk_count, bulk_squares = numbers.tolist()
+        return cls(int(number), squares, largest, int(bulk_count), bulk_squares)
+
 
 def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, float, float]:
-    """Number, minimum, maximum and sum of the finite values of a float32 or float64 array.
+    """The figures of `row_sums` of a whole array of any shape."""
+    ((count, low, high, total),) = row_sums(values.reshape(1, -1), factor).tolist()
+    return int(count), low, high, total
+
+
+def row_sums(rows: Values, factor: float = 1.0) -> Double:
+    """Number, minimum, maximum and sum (rows, 4) of the finite values of each of some rows.
 
     Without a finite value, the minimum is inf and the maximum -inf. Zeros are returned without a
     sign, since no order decides between 0.0 and -0.0. Each value is multiplied by `factor` before
     it is added to the sum. A sum beyond float64 is infinite.
+
+    rows: float32 or float64 (rows, values).
     """
-    flat = np.ascontiguousarray(values).reshape(-1)
-    count, low, high, total = _call("scan", flat, ctypes.c_int64(flat.size), factor, results=3)
-    return count, low + 0.0, high + 0.0, total
+    result = np.empty((len(rows), 4))
+    _call("scan", np.ascontiguousarray(rows), *rows.shape, float(factor), pointer(result))
+    result[:, 1:3] += 0.0
+    return result
 
 
 def error_sums(
@@ -73,8 +88,9 @@ def error_sums(
     The number is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
     compared exactly; float64 would round their differences to 0.
     """
-    if original.dtype == decoded.dtype and original.dtype in (np.float32, np.float64):
-        return _native_sums(original, decoded, mask, scale, bulk)
+    if _is_native(original, decoded):
+        whole = None if mask is None else mask[None]
+        return ErrorSums.of(_native_sums(original[None], decoded[None], whole, scale, bulk)[0])
     exact = is_wide_integer(original.dtype)
     total = ErrorSums(0, 0.0, 0.0)
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
@@ -93,6 +109,30 @@ def error_sums(
             return sums
         total = _joined(total, sums)
     return total
+
+
+def step_sums(
+    original: Values,
+    decoded: Values,
+    mask: Mask | None,
+    scale: float,
+    bulk: tuple[float, float] | None = None,
+) -> Double:
+    """The `error_sums` of each step of arrays (t, z, y, x): float64 (t, 5)."""
+    if not is_wide_integer(original.dtype) and len(original) > 1:
+        # small frames: the copies take little
+        wide = np.result_type(original.dtype, decoded.dtype, np.float32)
+        original, decoded = (each.astype(wide, copy=False) for each in (original, decoded))
+    if _is_native(original, decoded):
+        return _native_sums(original, decoded, mask, scale, bulk)
+    masks = [None] * len(original) if mask is None else mask
+    steps = zip(original, decoded, masks, strict=True)
+    return np.array([error_sums(*step, scale, bulk) for step in steps], dtype=np.float64)
+
+
+def _is_native(original: Values, decoded: Values) -> bool:
+    """Whether native code compares arrays of these types."""
+    return original.dtype == decoded.dtype and original.dtype in (np.float32, np.float64)
 
 
 def histogram(
@@ -118,21 +158,16 @@ def _native_sums(
     mask: Mask | None,
     scale: float,
     bulk: tuple[float, float] | None,
-) -> ErrorSums:
-    """`error_sums` of arrays of one type, float32 or float64."""
+) -> Double:
+    """`step_sums` of arrays (t, ...) of one type, float32 or float64."""
     original, decoded = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
     mask = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
-    size = ctypes.c_int64(original.size)
-    arguments = (original, pointer(decoded), pointer(mask), size, float(scale))
-    if bulk is None:
-        return ErrorSums(*_call("errors", *arguments, results=2))
-    low, high = map(float, bulk)
-    count, squares, largest, bulk_squares, bulk_count = _call(
-        "bulk_errors", *arguments, low, high, results=4
-    )
-    if count < 0:
-        return ErrorSums(-1, 0.0, 0.0)
-    return ErrorSums(count, squares, largest, int(bulk_count), bulk_squares)
+    result = np.zeros((len(original), len(ErrorSums._fields)))
+    low, high = (1.0, 0.0) if bulk is None else bulk
+    size = original.size // max(len(original), 1)
+    arrays = (pointer(decoded), pointer(mask), len(original), size)
+    _call("errors", original, *arrays, float(scale), float(low), float(high), pointer(result))
+    return result
 
 
 def _joined(first: ErrorSums, second: ErrorSums) -> ErrorSums:
@@ -146,15 +181,10 @@ def _joined(first: ErrorSums, second: ErrorSums) -> ErrorSums:
     )
 
 
-def _call(name: str, values: Values, *arguments: Any, results: int) -> tuple[Any, ...]:
-    """The count that a native function returns, and the `results` numbers that it writes.
-
-    name: `scan`, `errors` or `bulk_errors`; the function of the type of the values is called.
-    """
+def _call(name: str, values: Values, *arguments: Any) -> None:
+    """Call the native function of a name for the type of the values, which it gets first."""
     function = getattr(native.library(), f"fhash_{name}_f{values.dtype.itemsize * 8}")
-    output = (ctypes.c_double * results)()
-    numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
-    return function(pointer(values), *numbers, output), *output
+    function(pointer(values), *arguments)
 
 
 def pointer(array: Values | None) -> ctypes.c_void_p:
@@ -231,19 +261,6 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
 
 
 @dataclass(frozen=True, kw_only=True)
-class StepQuality:
-    """Figures of one step: PSNR in dB, errors in data units.
-
-    None if no vertex is counted; the PSNR is None as well if the error or the range is 0.
-    """
-
-    step: int
-    psnr: float | None
-    rmse: float | None
-    max_abs_error: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class BulkQuality:
     """Figures over the counted vertices whose original value lies in the bulk of the series.
 
@@ -267,7 +284,7 @@ class Errors:
     Attributes:
         data_range: of the original series, in data units; inf is allowed and makes PSNR None.
         bulk: of the original series, in data units; None without one.
-        steps: a StepQuality per frame.
+        sums: `step_sums` of all steps, in the arrays in which they came.
     """
 
     def __init__(
@@ -281,48 +298,63 @@ class Errors:
             raise InputError(f"data range is {data_range}; 0 or more is needed")
         self.data_range = data_range
         self.bulk = bulk
-        self.steps: list[StepQuality] = []
+        self.sums: list[Double] = []
         self._scale = scale or power_of_two(min(data_range, sys.float_info.max))
         self._sums = ErrorSums(0, 0.0, 0.0)
 
-    def add(
-        self, step: int, original: Values, decoded: Values, mask: Mask | None = None
-    ) -> StepQuality:
-        """Compare a frame, and return the figures of its step.
+    def add(self, step: int, original: Values, decoded: Values, mask: Mask | None = None) -> None:
+        """Compare a frame.
 
         mask: vertices to be compared, all if None. The three arrays have one shape. Raises
         InputError for different shapes, and for a decoded value that is not finite at a vertex that
         is compared.
         """
-        return self.take(step, self.compare(step, original, decoded, mask))
-
-    def compare(
-        self, step: int, original: Values, decoded: Values, mask: Mask | None = None
-    ) -> ErrorSums:
-        """The scaled differences of a frame, for `take`; parameters and errors as in `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
             raise InputError(
                 f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; "
                 "they must be of one shape"
             )
+        whole = None if mask is None else mask[None]
+        self.take(self.compare(step, original[None], decoded[None], whole))
+
+    def compare(
+        self, first: int, original: Values, decoded: Values, mask: Mask | None = None
+    ) -> Double:
+        """The scaled differences of frames (t, z, y, x) of one shape, for `take`: (t, 5).
+
+        first: step of the first of them. Other parameters and errors as in `add`.
+        """
         bulk = None if self.bulk is None else (self.bulk.low, self.bulk.high)
-        errors = error_sums(original, decoded, mask, self._scale, bulk)
-        if errors.number < 0:
+        errors = step_sums(original, decoded, mask, self._scale, bulk)
+        for place in np.flatnonzero(errors[:, 0] < 0):
+            step = first + int(place)
             raise InputError(f"step {step}: decoded values are not finite where they are compared")
         return errors
 
-    def take(self, step: int, errors: ErrorSums) -> StepQuality:
-        """Add the differences of a step, and return its figures."""
-        count, squares, largest = errors[:3]
-        self._sums = _joined(self._sums, errors)
-        figures = StepQuality(
-            step=step,
-            psnr=self._psnr(squares, count),
-            rmse=self._rmse(squares, count),
-            max_abs_error=self._unscaled(largest, count),
-        )
-        self.steps.append(figures)
-        return figures
+    def take(self, errors: Double) -> None:
+        """Add the differences of the next steps."""
+        self.sums.append(errors)
+        both = np.vstack([self._sums, errors])
+        with np.errstate(over="ignore"):
+            # A running sum adds one step after the other, whatever steps come together.
+            sums = ErrorSums.of(np.add.accumulate(both)[-1])
+        self._sums = sums._replace(largest=float(both[:, 2].max()))
+
+    def per_step(self) -> list[dict[str, Any]]:
+        """Figures of each step: `step`, `psnr` in dB, `rmse` and `max_abs_error` in data units.
+
+        They are None if no vertex is counted, the PSNR as well if the error or the range is 0.
+        """
+        sums = (row for errors in self.sums for row in errors[:, :3].tolist())
+        return [
+            {
+                "step": step,
+                "psnr": self._psnr(squares, count),
+                "rmse": self._rmse(squares, count),
+                "max_abs_error": self._unscaled(largest, count),
+            }
+            for step, (count, squares, largest) in enumerate(sums)
+        ]
 
     @property
     def count(self) -> int:
@@ -356,14 +388,14 @@ class Errors:
             range=(self.bulk.low, self.bulk.high),
         )
 
-    def _psnr(self, squares: float, count: int) -> float | None:
+    def _psnr(self, squares: float, count: float) -> float | None:
         # In scaled units: in data units, a mean of denormals would be rounded to a denormal.
         return psnr(self.data_range * self._scale, math.sqrt(squares / count) if count else None)
 
-    def _rmse(self, squares: float, count: int) -> float | None:
+    def _rmse(self, squares: float, count: float) -> float | None:
         return self._unscaled(math.sqrt(squares / count) if count else 0.0, count)
 
-    def _unscaled(self, value: float, count: int) -> float | None:
+    def _unscaled(self, value: float, count: float) -> float | None:
         figure = float(value) / float(self._scale)
         return figure if count and math.isfinite(figure) else None
 

@@ -6,11 +6,12 @@ import ctypes
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise, product
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,14 +21,13 @@ from fhash_codec import native
 from fhash_codec.measure.errors import (
     BulkQuality,
     Errors,
-    ErrorSums,
-    StepQuality,
     pointer,
     range_and_sum,
 )
 from fhash_codec.measure.value_range import ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress, attribute, silent
 from fhash_formats.errors import InputError
+from fhash_formats.series import step_blocks
 from fhash_formats.support.arrays import Double, Mask, Values
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -51,6 +51,9 @@ TILE = (64, 32, 64)
 
 BUDGET = 2**25
 """Vertices of all steps that are measured together, by default."""
+
+LEAST_VERTICES = 1 << 15
+"""Vertices of a frame whose SSIM takes as long as all that is done once for a frame."""
 
 _NOT_FINITE = "SSIM: decoded values are not finite where they are compared"
 
@@ -114,9 +117,13 @@ def ssim(
 def ssim_steps(steps: int, vertices_per_step: int, budget: int = BUDGET) -> list[int]:
     """Evenly spaced steps, ends included, with at most `budget` vertices together.
 
-    At least one step is measured: the middle one.
+    At least one step is measured: the middle one. Small frames count as of LEAST_VERTICES.
     """
-    count = max(1, min(steps, budget // max(vertices_per_step, 1)))
+    return even_steps(steps, max(1, min(steps, budget // max(vertices_per_step, LEAST_VERTICES))))
+
+
+def even_steps(steps: int, count: int) -> list[int]:
+    """Some of all steps, evenly spaced, ends included; the middle one for a count of 1."""
     if count == 1:
         return [steps // 2]
     return [(2 * number * (steps - 1) + count - 1) // (2 * (count - 1)) for number in range(count)]
@@ -271,9 +278,9 @@ class BetweenSums(NamedTuple):
         fringe, fringe_linear: over the fringe, of decoded values and of the interpolated source.
     """
 
-    linear: ErrorSums
-    fringe: ErrorSums
-    fringe_linear: ErrorSums
+    linear: Double
+    fringe: Double
+    fringe_linear: Double
 
 
 class BetweenErrors:
@@ -289,9 +296,9 @@ class BetweenErrors:
     ) -> BetweenSums:
         """The differences of a step that is no key frame, for `add`; safe in any thread.
 
-        mask: vertices (z, y, x) of the coreset.
+        original, decoded, mask: values, and vertices of the coreset (1, z, y, x).
         """
-        linear = neighbours.interpolated()
+        linear = neighbours.interpolated()[None]
         # The source may have no finite value at a key frame where it has one at the step.
         known = mask & np.isfinite(linear)
         fringe = mask & neighbours.fringe
@@ -304,19 +311,19 @@ class BetweenErrors:
             ),
         )
 
-    def add(self, step: int, coreset: ErrorSums, between: BetweenSums | None) -> None:
-        """Add a step; `between` is None for a key frame."""
+    def add(self, coreset: Double, between: BetweenSums | None) -> None:
+        """Add a step, or several key frames, for which `between` is None."""
         if between is None:
-            self._key_frames.take(step, coreset)
+            self._key_frames.take(coreset)
             return
-        self._between.take(step, coreset)
-        self._linear.take(step, between.linear)
-        self._fringe.take(step, between.fringe)
-        self._fringe_linear.take(step, between.fringe_linear)
+        self._between.take(coreset)
+        self._linear.take(between.linear)
+        self._fringe.take(between.fringe)
+        self._fringe_linear.take(between.fringe_linear)
 
     def quality(self) -> BetweenQuality | None:
         """The figures of all steps added; None without a step between key frames."""
-        if not self._between.steps:
+        if not self._between.sums:
             return None
         return BetweenQuality(
             psnr_key_frames=self._key_frames.psnr,
@@ -346,7 +353,7 @@ class Quality:
         ssim_window: sigma and window of the SSIM in vertices, the data range and measured steps.
         psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, with the background as
             the decoded value outside the coreset.
-        per_step: figures over the coreset of each step.
+        per_step: figures over the coreset of each step, see `Errors.per_step`.
         between: at key frames and between them; None if every step is a key frame.
     """
 
@@ -359,14 +366,14 @@ class Quality:
     psnr_domain: float | None
     rmse_domain: float | None
     max_abs_error_domain: float | None
-    per_step: tuple[StepQuality, ...]
+    per_step: list[dict[str, Any]]
     between: BetweenQuality | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
-        values = asdict(replace(self, per_step=()))
-        # Not by `asdict`, which takes 0.1 ms for a step.
-        values["per_step"] = [dict(vars(step)) for step in self.per_step]
+        values = {**vars(self)}
+        for name in ("bulk", "between"):
+            values[name] = None if values[name] is None else asdict(values[name])
         if self.bulk is not None:
             values["bulk"]["range"] = list(self.bulk.range)
         return values
@@ -374,19 +381,21 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Comparison of one step.
+    """Comparison of neighbouring steps.
 
     Attributes:
-        coreset, domain: scaled differences over the coreset, and over all vertices.
-        similarity: what `ssim` returns; (0.0, 0) for a step whose SSIM is not measured.
+        stop: the step after the last one.
+        coreset, domain: scaled differences over the coreset, and over all vertices, of each step:
+            (t, 5), see `step_sums`.
+        similarity: what `ssim` returns for each step, (t, 2); 0 where it is not measured.
         seconds, ssim_seconds: of the comparison, and of the SSIM alone, in its thread.
-        between: differences of the interpolated source; None for a key frame.
+        between: differences of the interpolated source, of one step; None for key frames.
     """
 
-    step: int
-    coreset: ErrorSums
-    domain: ErrorSums
-    similarity: tuple[float, int]
+    stop: int
+    coreset: Double
+    domain: Double
+    similarity: Double
     between: BetweenSums | None
     seconds: float
     ssim_seconds: float
@@ -422,35 +431,44 @@ class Comparer:
 
     def compare(
         self,
-        step: int,
+        steps: range,
         original: Values,
         decoded: Values,
         neighbours: Neighbours | None,
         *,
-        with_ssim: bool,
+        measured: Collection[int],
         threads: int,
     ) -> Comparison:
-        """Compare one step; safe in any thread.
+        """Compare neighbouring steps (t, z, y, x); safe in any thread.
 
-        neighbours: the key frames around the step; None for a key frame. threads: of the SSIM.
+        neighbours: the key frames around the only step; None for key frames.
+        measured: steps whose SSIM is measured. threads: of the SSIM.
+
+        Raises InputError for frames of different shapes.
         """
-        begun = time.perf_counter()
+        begun, first = time.perf_counter(), steps.start
+        if original.shape != decoded.shape:
+            raise InputError(
+                f"step {first}: the original is {original.shape[1:]}, the decoded "
+                f"{decoded.shape[1:]}; they must be of one shape"
+            )
         in_coreset = np.isfinite(decoded)
         mask = None if in_coreset.all() else in_coreset
-        coreset = domain = self.coreset.compare(step, original, decoded, mask)
+        coreset = domain = self.coreset.compare(first, original, decoded, mask)
         if mask is not None:
             filled = np.where(mask, decoded, decoded.dtype.type(self._background))
-            domain = self.domain.compare(step, original, filled)
-        similarity, ssim_seconds = (0.0, 0), 0.0
-        if with_ssim:
-            data_range, ssim_begun = self.coreset.data_range, time.perf_counter()
-            similarity = ssim(original, decoded, data_range, mask, threads=threads)
-            ssim_seconds = time.perf_counter() - ssim_begun
+            domain = self.domain.compare(first, original, filled)
+        similarity, ssim_begun = np.zeros((len(steps), 2)), time.perf_counter()
+        for place in (step - first for step in steps if step in measured):
+            frames = original[place], decoded[place]
+            one = None if mask is None else mask[place]
+            similarity[place] = ssim(*frames, self.coreset.data_range, one, threads=threads)
+        ssim_seconds = time.perf_counter() - ssim_begun
         between = None
         if neighbours is not None:
-            between = self.between.compare(step, original, decoded, in_coreset, neighbours)
+            between = self.between.compare(first, original, decoded, in_coreset, neighbours)
         return Comparison(
-            step=step,
+            stop=steps.stop,
             coreset=coreset,
             domain=domain,
             similarity=similarity,
@@ -459,18 +477,17 @@ class Comparer:
             ssim_seconds=ssim_seconds,
         )
 
-    def add(self, comparison: Comparison) -> StepQuality:
-        """Add a step to the figures of the series; the steps come in order."""
-        figures = self.coreset.take(comparison.step, comparison.coreset)
-        self.domain.take(comparison.step, comparison.domain)
-        self.between.add(comparison.step, comparison.coreset, comparison.between)
-        total, vertices = comparison.similarity
-        self.similarity += total
-        self.similar_vertices += vertices
+    def add(self, comparison: Comparison) -> None:
+        """Add steps to the figures of the series; the steps come in order."""
+        self.coreset.take(comparison.coreset)
+        self.domain.take(comparison.domain)
+        self.between.add(comparison.coreset, comparison.between)
+        for total, vertices in comparison.similarity.tolist():
+            self.similarity += total
+            self.similar_vertices += int(vertices)
         self.seconds += comparison.seconds
         self.ssim_seconds += comparison.ssim_seconds
         self._observe(comparison)
-        return figures
 
     def tell_ssim(self, steps: int, elapsed: float) -> None:
         """Record the stage of the SSIM: its share of all work, in seconds of the clock.
@@ -501,16 +518,16 @@ class Comparer:
             psnr_domain=domain.psnr,
             rmse_domain=domain.rmse,
             max_abs_error_domain=domain.max_abs_error,
-            per_step=tuple(coreset.steps),
+            per_step=coreset.per_step(),
             between=self.between.quality(),
         )
 
 
 def measure_quality(
     comparer: Comparer,
-    original_frames: Callable[[int], Values],
-    decode: Callable[[int], Values],
-    steps: int,
+    original_frames: Callable[[range], Values],
+    decode: Callable[[range], Values],
+    shape: Sequence[int],
     measured: Sequence[int],
     progress: Progress = silent,
     neighbours: NeighboursOf | None = None,
@@ -518,45 +535,52 @@ def measure_quality(
     """Compare all steps of a decoded series with the original.
 
     comparer: new; what it observes are the comparisons of the steps, in their order.
-    original_frames, decode: step -> frame (z, y, x) of the original, and of the decoded series. A
-        vertex is in the coreset if its decoded value is finite.
+    original_frames, decode: neighbouring steps -> frames (t, z, y, x) of the original, and of the
+        decoded series. A vertex is in the coreset if its decoded value is finite.
+    shape: (t, z, y, x) of both.
     measured: steps whose SSIM over the coreset is measured (`ssim_steps`).
     neighbours: of the key frames, see `neighbours_of`; None if every step is a key frame.
 
-    At most FRAMES_HELD frames of each series are in memory. Raises InputError for frames of
-    different shapes. Progress stage: "measuring".
+    At most FRAMES_HELD frames or small blocks of frames of each series are in memory. Raises
+    InputError for frames of different shapes. Progress stage: "measuring".
     """
     begun = time.perf_counter()
-    threads, waiting = usable_threads(), deque[Future[Comparison]]()
-    with_ssim = frozenset(measured)
+    steps, *frame = shape
+    threads, waiting, with_ssim = usable_threads(), deque[Future[Comparison]](), set(measured)
+    blocks = [block for _, block in step_blocks(range(steps), frame)]
+    at_once = max(1, min(FRAMES_HELD, len(blocks), VERTICES_HELD // max(prod(frame), 1)))
 
     def collect() -> None:
-        """Wait for the first step under way, and add it."""
-        figures = comparer.add(waiting.popleft().result())
+        """Wait for the first steps under way, and add them."""
+        comparison = waiting.popleft().result()
+        comparer.add(comparison)
         # The figure of all steps so far: those of single steps would go up and down.
         psnr = comparer.coreset.psnr
         note = "" if psnr is None else f"{psnr:.1f} dB so far"
-        progress("measuring", figures.step + 1, steps, note)
+        progress("measuring", comparison.stop, steps, note)
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:
-        for step in range(steps):
-            reading = time.perf_counter()
-            original, decoded = original_frames(step), decode(step)
-            comparer.seconds += time.perf_counter() - reading
-            at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
+        for block in blocks:
+            # before more is read: large frames would be held once more
             while len(waiting) >= at_once:
                 collect()
-            waiting.append(
-                workers.submit(
-                    comparer.compare,
-                    step,
-                    original,
-                    decoded,
-                    None if neighbours is None else neighbours(step),
-                    with_ssim=step in with_ssim,
-                    threads=-(-threads // at_once),
+            reading = time.perf_counter()
+            original, decoded = original_frames(block), decode(block)
+            comparer.seconds += time.perf_counter() - reading
+            for part in [block] if neighbours is None else [range(n, n + 1) for n in block]:
+                inside = slice(part.start - block.start, part.stop - block.start)
+                waiting.append(
+                    workers.submit(
+                        comparer.compare,
+                        part,
+                        original[inside],
+                        decoded[inside],
+                        None if neighbours is None else neighbours(part.start),
+                        measured=with_ssim,
+                        threads=-(-threads // at_once),
+                    )
                 )
-            )
+            del original, decoded
         while waiting:
             collect()
     comparer.tell_ssim(len(measured), time.perf_counter() - begun)

@@ -55,21 +55,26 @@ class Mean:
         """Add finite values of any shape and number type; cut large arrays with `pieces` first."""
         if values.size == 0:
             return
-        origin = 0
-        if is_wide_integer(values.dtype):
-            low, high = int(values.min()), int(values.max())
-            origin = integer_origin(low, high, values.dtype)
-            values = about_origin(values, origin) if origin else values
-        wide = values.astype(np.float64)
-        scale = power_of_two(max(abs(float(wide.min())), abs(float(wide.max()))))
-        wide *= scale
-        self.add_sum(values.size, float(wide.sum()), scale)
-        self._total += origin * values.size
-        self._whole |= origin != 0
+        peak = max(abs(values.min().item()), abs(values.max().item()))
+        if values.dtype.kind != "f":
+            wide = values.astype(np.dtype(f"{values.dtype.kind}8"), copy=False)
+            # In halves, whose sums do not overflow.
+            self._total += (int((wide >> 32).sum()) << 32) + int((wide & 0xFFFFFFFF).sum())
+            self.count += values.size
+            self._whole |= peak > 1 << 53
+            return
+        scale = power_of_two(peak)
+        total = (values.astype(np.float64) * scale).sum()
+        self.add_sums(values.size, np.array([total]), scale)
 
-    def add_sum(self, count: int, total: float, scale: float) -> None:
-        """Add `count` values by their sum: `total` is their sum times `scale`."""
-        self._total += Fraction(total) / Fraction(scale)
+    def add_sums(self, count: int, totals: npt.NDArray[np.float64], scale: float) -> None:
+        """Add `count` values by sums of some each: `totals` are these sums times `scale`."""
+        mantissas, exponents = np.frexp(totals)
+        least = int(exponents.min())
+        numbers = np.ldexp(mantissas, 53).astype(np.int64).tolist()
+        shifts = (exponents - least).tolist()
+        total = sum(number << shift for number, shift in zip(numbers, shifts, strict=True))
+        self._total += total * Fraction(2) ** (least - 53) / Fraction(scale)
         self.count += count
 
     def join(self, other: Mean) -> None:

@@ -13,13 +13,12 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 6
+ABI_VERSION = 7
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
-_SCAN = (ARRAY, INTEGER, REAL, ARRAY)
-_ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, ARRAY)
-_BULK_ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, REAL, ARRAY)
+_SCAN = (ARRAY, INTEGER, INTEGER, REAL, ARRAY)
+_ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, INTEGER, REAL, REAL, REAL, ARRAY)
 _HISTOGRAM = (ARRAY, INTEGER, REAL, REAL, REAL, INTEGER, ARRAY)
 _SSIM = (ARRAY,) * 7
 
@@ -44,7 +43,6 @@ PROTOTYPES: Prototypes = {
     # quality.cpp
     **{f"fhash_scan_{kind}": _SCAN for kind in _KINDS},
     **{f"fhash_errors_{kind}": _ERRORS for kind in _KINDS},
-    **{f"fhash_bulk_errors_{kind}": _BULK_ERRORS for kind in _KINDS},
     **{f"fhash_histogram_{kind}": _HISTOGRAM for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),

@@ -24,6 +24,8 @@ const int64_t PIECE = 1 << 14;
 const int RADIUS = 5;  // of the window, in vertices
 const int TAPS = 2 * RADIUS + 1;
 const int FIELDS = 4;  // of a filtered plane
+const int FIGURES = 4;  // of a row that is scanned
+const int ERRORS = 5;  // figures of a row that is compared
 
 FHASH_INLINE double lane_sum(const double* lanes) {
     double sum = 0;
@@ -31,10 +33,10 @@ FHASH_INLINE double lane_sum(const double* lanes) {
     return sum;
 }
 
-// The number of the finite values. result: their least, their greatest, and the sum of
+// result: the number of the finite values, their least, their greatest, and the sum of
 // value * factor.
 template <class T>
-FHASH_INLINE int64_t scan(const T* values, int64_t n, double factor, double* result) {
+FHASH_INLINE void scan(const T* values, int64_t n, double factor, double* result) {
     const T largest = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
     int64_t count = 0;
     double total = 0;
@@ -64,19 +66,19 @@ FHASH_INLINE int64_t scan(const T* values, int64_t n, double factor, double* res
         }
         total += lane_sum(sums);
     }
-    result[0] = *std::min_element(lows, lows + LANES);
-    result[1] = *std::max_element(highs, highs + LANES);
-    result[2] = total;
-    return count;
+    result[0] = (double)count;
+    result[1] = *std::min_element(lows, lows + LANES);
+    result[2] = *std::max_element(highs, highs + LANES);
+    result[3] = total;
 }
 
-// The number of the values that count: those with a finite original where `mask`, if any, is set;
-// -1 where a difference is not finite. result: the sum of the squares of (original - decoded) *
-// scale, and its largest magnitude. With BULK also the sum and the number of those whose original
+// result: the number of the values that count, those with a finite original where `mask`, if any,
+// is set, or -1 where a difference is not finite; the sum of the squares of (original - decoded) *
+// scale, and its largest magnitude. With BULK also the number and the sum of those whose original
 // lies from `low` to `high`.
 template <class T, bool MASKED, bool BULK>
-FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* mask, int64_t n,
-                            double scale, double low, double high, double* result) {
+FHASH_INLINE void errors(const T* original, const T* decoded, const uint8_t* mask, int64_t n,
+                         double scale, double low, double high, double* result) {
     const T limit = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
     int64_t count = 0, bulk_count = 0;
     double total = 0, largest = 0, bulk_total = 0;
@@ -112,17 +114,33 @@ FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* 
         total += lane_sum(sums);
         if (BULK) bulk_total += lane_sum(bulk_sums);
         for (int lane = 0; lane < LANES; lane++) {
-            if (wrong[lane] != 0) return -1;
+            if (wrong[lane] != 0) {
+                result[0] = -1;
+                return;
+            }
             largest = std::max(largest, most[lane]);
         }
     }
-    result[0] = total;
-    result[1] = largest;
-    if (BULK) {
-        result[2] = bulk_total;
-        result[3] = (double)bulk_count;
+    result[0] = (double)count;
+    result[1] = total;
+    result[2] = largest;
+    result[3] = (double)bulk_count;
+    result[4] = bulk_total;
+}
+
+// The same of rows of n values each. Without a bulk, low is greater than high.
+template <class T>
+FHASH_INLINE void errors_of_rows(const T* one, const T* other, const uint8_t* mask, int64_t rows,
+                                 int64_t n, double scale, double low, double high,
+                                 double* result) {
+    const bool bulk = low <= high;
+    for (int64_t row = 0; row < rows; row++, one += n, other += n, result += ERRORS) {
+        const uint8_t* const set = mask ? mask + row * n : nullptr;
+        if (mask && bulk) errors<T, true, true>(one, other, set, n, scale, low, high, result);
+        else if (mask) errors<T, true, false>(one, other, set, n, scale, 0, 0, result);
+        else if (bulk) errors<T, false, true>(one, other, nullptr, n, scale, low, high, result);
+        else errors<T, false, false>(one, other, nullptr, n, scale, 0, 0, result);
     }
-    return count;
 }
 
 // Add n values to a histogram of equal bins, of which the first begins at `low`, after scaling;
@@ -337,40 +355,25 @@ FHASH_INLINE int64_t similarity(const T* original, const T* decoded, const Frame
     return count;
 }
 
-FHASH_CLONES int64_t scan_float(const float* values, int64_t n, double factor, double* result) {
-    return scan<float>(values, n, factor, result);
+FHASH_CLONES void scan_float(const float* values, int64_t rows, int64_t n, double factor,
+                             double* result) {
+    for (int64_t row = 0; row < rows; row++)
+        scan<float>(values + row * n, n, factor, result + row * FIGURES);
 }
-FHASH_CLONES int64_t scan_double(const double* values, int64_t n, double factor, double* result) {
-    return scan<double>(values, n, factor, result);
+FHASH_CLONES void scan_double(const double* values, int64_t rows, int64_t n, double factor,
+                              double* result) {
+    for (int64_t row = 0; row < rows; row++)
+        scan<double>(values + row * n, n, factor, result + row * FIGURES);
 }
-FHASH_CLONES int64_t errors_float(const float* one, const float* other, int64_t n, double scale,
-                                  double* result) {
-    return errors<float, false, false>(one, other, nullptr, n, scale, 0, 0, result);
+FHASH_CLONES void errors_float(const float* one, const float* other, const uint8_t* mask,
+                               int64_t rows, int64_t n, double scale, double low, double high,
+                               double* result) {
+    errors_of_rows<float>(one, other, mask, rows, n, scale, low, high, result);
 }
-FHASH_CLONES int64_t errors_double(const double* one, const double* other, int64_t n, double scale,
-                                   double* result) {
-    return errors<double, false, false>(one, other, nullptr, n, scale, 0, 0, result);
-}
-FHASH_CLONES int64_t masked_errors_float(const float* one, const float* other, const uint8_t* mask,
-                                         int64_t n, double scale, double* result) {
-    return errors<float, true, false>(one, other, mask, n, scale, 0, 0, result);
-}
-FHASH_CLONES int64_t masked_errors_double(const double* one, const double* other,
-                                          const uint8_t* mask, int64_t n, double scale,
-                                          double* result) {
-    return errors<double, true, false>(one, other, mask, n, scale, 0, 0, result);
-}
-FHASH_CLONES int64_t bulk_errors_float(const float* one, const float* other, const uint8_t* mask,
-                                       int64_t n, double scale, double low, double high,
-                                       double* result) {
-    return mask ? errors<float, true, true>(one, other, mask, n, scale, low, high, result)
-                : errors<float, false, true>(one, other, mask, n, scale, low, high, result);
-}
-FHASH_CLONES int64_t bulk_errors_double(const double* one, const double* other,
-                                        const uint8_t* mask, int64_t n, double scale, double low,
-                                        double high, double* result) {
-    return mask ? errors<double, true, true>(one, other, mask, n, scale, low, high, result)
-                : errors<double, false, true>(one, other, mask, n, scale, low, high, result);
+FHASH_CLONES void errors_double(const double* one, const double* other, const uint8_t* mask,
+                                int64_t rows, int64_t n, double scale, double low, double high,
+                                double* result) {
+    errors_of_rows<double>(one, other, mask, rows, n, scale, low, high, result);
 }
 FHASH_CLONES int64_t similarity_float(const float* one, const float* other, const Frame& frame,
                                       const int64_t* tile, double* result) {
@@ -385,43 +388,30 @@ FHASH_CLONES int64_t similarity_double(const double* one, const double* other, c
 
 }  // namespace
 
-// The number of the finite ones of n values. result gets the least, the greatest and the sum of
-// value * factor.
-FHASH_EXPORT int64_t fhash_scan_f32(const float* values, int64_t n, double factor, double* result) {
-    return scan_float(values, n, factor, result);
+// For each of the rows of n values: the number of the finite ones, the least, the greatest and the
+// sum of value * factor.
+FHASH_EXPORT void fhash_scan_f32(const float* values, int64_t rows, int64_t n, double factor,
+                                 double* result) {
+    scan_float(values, rows, n, factor, result);
 }
-FHASH_EXPORT int64_t fhash_scan_f64(const double* values, int64_t n, double factor,
-                                    double* result) {
-    return scan_double(values, n, factor, result);
-}
-
-// Errors of n decoded values, times scale: the number of the values that count, those with a finite
-// original where the mask (nullptr: everywhere) is not 0; -1 where one of them has no finite error.
-// result gets the sum of the squared errors and the largest.
-FHASH_EXPORT int64_t fhash_errors_f32(const float* original, const float* decoded,
-                                      const uint8_t* mask, int64_t n, double scale,
-                                      double* result) {
-    return mask ? masked_errors_float(original, decoded, mask, n, scale, result)
-                : errors_float(original, decoded, n, scale, result);
-}
-FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* decoded,
-                                      const uint8_t* mask, int64_t n, double scale,
-                                      double* result) {
-    return mask ? masked_errors_double(original, decoded, mask, n, scale, result)
-                : errors_double(original, decoded, n, scale, result);
+FHASH_EXPORT void fhash_scan_f64(const double* values, int64_t rows, int64_t n, double factor,
+                                 double* result) {
+    scan_double(values, rows, n, factor, result);
 }
 
-// The same, and in result also the sum of the squares and the number of the values that count whose
-// original lies from low to high.
-FHASH_EXPORT int64_t fhash_bulk_errors_f32(const float* original, const float* decoded,
-                                           const uint8_t* mask, int64_t n, double scale, double low,
-                                           double high, double* result) {
-    return bulk_errors_float(original, decoded, mask, n, scale, low, high, result);
+// Errors of the rows of n decoded values, times scale. For each row: the number of the values that
+// count, those with a finite original where the mask (nullptr: everywhere) is not 0, or -1 where
+// one of them has no finite error; the sum of the squared errors, and the largest; the number of
+// the values that count whose original lies from low to high, and the sum of their squares.
+FHASH_EXPORT void fhash_errors_f32(const float* original, const float* decoded,
+                                   const uint8_t* mask, int64_t rows, int64_t n, double scale,
+                                   double low, double high, double* result) {
+    errors_float(original, decoded, mask, rows, n, scale, low, high, result);
 }
-FHASH_EXPORT int64_t fhash_bulk_errors_f64(const double* original, const double* decoded,
-                                           const uint8_t* mask, int64_t n, double scale, double low,
-                                           double high, double* result) {
-    return bulk_errors_double(original, decoded, mask, n, scale, low, high, result);
+FHASH_EXPORT void fhash_errors_f64(const double* original, const double* decoded,
+                                   const uint8_t* mask, int64_t rows, int64_t n, double scale,
+                                   double low, double high, double* result) {
+    errors_double(original, decoded, mask, rows, n, scale, low, high, result);
 }
 
 // Add the finite ones of n values to `counts`, a histogram of `bins` equal bins: a value goes to

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from fhash_codec.comparison import bytes_on_disk
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encodable
-from fhash_codec.features.scan import Scan, scan_piece
+from fhash_codec.features.scan import Scan, scan_rows
 from fhash_codec.header import PACKED, check_name, describe_source, write_missing, write_series
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces
 from fhash_codec.progress import Progress, silent
@@ -245,7 +245,7 @@ class Tiles:
             kept = values
         low, high, mean = np.inf, -np.inf, Mean()
         for piece in pieces(kept) if kept.size else ():
-            _, least, most = scan_piece(piece, mean)
+            _, least, most = scan_rows(piece[None], mean)
             low, high = min(low, least), max(high, most)
         if missing is not None and occupied is not None:
             missing = missing & occupied

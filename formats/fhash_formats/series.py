@@ -345,6 +345,26 @@ class NotStored:
         return replace(self, shares=shares) if shares.any() else None
 
 
+BLOCK = 1 << 18
+"""Most vertices of several steps that are worked on together; they take a few MiB in all forms.
+
+What is done once for each block takes no time then beside what is done for each value.
+"""
+
+
+def step_blocks(steps: range, shape: Sequence[int]) -> Iterator[tuple[slice, range]]:
+    """Cut steps into neighbouring ones that are read together, so that a block stays small.
+
+    steps: of any stride. shape: (z, y, x) of one frame. Yields places in `steps`, and the steps
+    there, which follow one another.
+    """
+    many = max(1, BLOCK // math.prod(shape)) if steps.step == 1 else 1
+    for place in range(0, len(steps), many):
+        together = steps[place : place + many]
+        alone = together if len(together) > 1 else range(together[0], together[0] + 1)
+        yield slice(place, place + len(together)), alone
+
+
 class Series(ABC):
     """A time-varying volume (t, z, y, x), read frame by frame.
 
@@ -425,6 +445,22 @@ class Series(ABC):
         be read.
         """
 
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of neighbouring steps, as `read` gives and raises them."""
+        frames = [self.read(step) for step in steps]
+        return frames[0][None] if len(frames) == 1 else np.stack(frames)
+
+    def block(self, steps: range) -> npt.NDArray[Any]:
+        """The frames (t, z, y, x) of neighbouring steps, which are read unless they are held."""
+        if self.held is None:
+            return self.read_steps(steps)
+        return np.ascontiguousarray(self.held[steps.start : steps.stop])
+
+    def frame(self, step: int) -> npt.NDArray[Any]:
+        """The frame (z, y, x) of a step, which is read unless it is held."""
+        frame: npt.NDArray[Any] = self.block(range(step, step + 1))[0]
+        return frame
+
     def require_step(self, step: int) -> None:
         """Raise RegionError for a step outside the series; negative steps are outside, too."""
         if not 0 <= step < self.shape[0]:
@@ -450,8 +486,13 @@ class Series(ABC):
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
-        for step in range(self.shape[0]):
-            yield self.read(step)
+        for _, frames in self.blocks(range(self.shape[0])):
+            yield from frames
+
+    def blocks(self, steps: range) -> Iterator[tuple[range, npt.NDArray[Any]]]:
+        """Yield some neighbouring steps with their frames (t, z, y, x), cut by `step_blocks`."""
+        for _, block in step_blocks(steps, self.shape[1:]):
+            yield block, self.block(block)
 
     def __enter__(self) -> Self:
         return self
@@ -539,6 +580,13 @@ class StepsSeries(Series):
         self.require_step(step)
         return self.series.read(self.steps[step])
 
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        chosen = self.steps[steps.start : steps.stop]
+        together = range(chosen[0], chosen[0] + len(steps))
+        if chosen != tuple(together):
+            return super().read_steps(steps)
+        return self.series.read_steps(together)
+
     def check(self) -> None:
         self.series.check()
 
@@ -586,6 +634,9 @@ class ArraySeries(Series):
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
         return np.ascontiguousarray(self.values[step], dtype=self.dtype)
+
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        return np.ascontiguousarray(self.values[steps.start : steps.stop], dtype=self.dtype)
 
 
 def check_values(

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 import fhash_codec
 from fhash_codec import EncodeConfig, RegionError
 from fhash_codec.boxes import (
-    BLOCK,
     Box,
     Table,
     bounding_box,
@@ -24,7 +23,6 @@ from fhash_codec.boxes import (
     index_ranges,
     overlap,
     slice_of,
-    step_blocks,
 )
 from fhash_codec.compact.model import CompactModel
 from fhash_formats.series import ArraySeries
@@ -202,25 +200,6 @@ def test_coarse_vertices_are_those_of_the_box_in_the_region(
     else:
         with pytest.raises(RegionError, match="holds no vertex of level of detail"):
             coarse_vertices(box, region, lod, "run")
-
-
-@pytest.mark.parametrize(
-    ("steps", "frame", "blocks"),
-    [
-        (range(5), (1, 1, 1), [range(5)]),
-        (range(3, 8), (1, 1, BLOCK // 2), [range(3, 5), range(5, 7), range(7, 8)]),
-        (range(2, 4), (2, 1, BLOCK), [range(2, 3), range(3, 4)]),
-        (range(6, 0, -3), (1, 1, 1), [range(6, 7), range(3, 4)]),
-        (range(0, 5, 2), (1, 1, 1), [range(1), range(2, 3), range(4, 5)]),
-        (range(0), (1, 1, 1), []),
-    ],
-)
-def test_steps_are_cut_into_neighbours_that_are_read_together(
-    steps: range, frame: tuple[int, int, int], blocks: list[range]
-) -> None:
-    cut = list(step_blocks(steps, frame))
-    assert [together for _, together in cut] == blocks
-    assert [step for places, _ in cut for step in steps[places]] == list(steps)
 
 
 VALUES = np.arange(3 * 4 * 5 * 6 * 2, dtype=np.float32).reshape(3, 4, 5, 6, 2)

@@ -391,8 +391,8 @@ def test_layers_beyond_the_cache_are_decoded_together(
         volume.container._cache.limit = 1
         read = DecodedFrames(volume, exact=dtype == "i8").read
         for step in range(4):
-            np.testing.assert_array_equal(read(step), frames[step])
-        np.testing.assert_array_equal(read(1), frames[1])
+            np.testing.assert_array_equal(read(range(step, step + 1))[0], frames[step])
+        np.testing.assert_array_equal(read(range(1, 2))[0], frames[1])
     assert len(decoded) == 4
     if steps_held >= 3:
         assert max(decoded.values()) == 2  # the first layer comes again

@@ -15,7 +15,14 @@ from cf_files import KINDS, Kind, smooth
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec import header as step_figures
-from fhash_codec.header import brief_quality, check_name, full_header, read_steps, write_steps
+from fhash_codec.header import (
+    brief_quality,
+    check_name,
+    full_header,
+    read_steps,
+    steps_together,
+    write_steps,
+)
 from fhash_codec.times import number_text, time_of, time_range, time_text, times_of
 from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import RegionError
@@ -47,7 +54,7 @@ def header(quality: dict[str, Any], value_range: tuple[float, float] = (-1.0, 1.
 def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
     step = {"step": 0, "psnr": 39.9999999, "rmse": 0.0200000001, "max_abs_error": 0.25}
     window = {"window": 11, "sigma": 1.5, "data_range": 2.0, "steps": [0]}
-    brief = brief_quality(WRITER, {"per_step": [step], "ssim_window": window}, 2.0, 1)
+    brief = brief_quality(WRITER, {"per_step": [step], "ssim_window": window}, 2.0, (1, 2, 3, 4))
     assert brief["ssim_window"] == {"window": 11, "sigma": 1.5}
     assert brief.keys() == {"steps", "ssim_window"}
     full = full_header(header(brief), {})
@@ -61,7 +68,7 @@ def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
         {"what": "end", "bytes": 7},
     ]
     other = {**window, "steps": [3], "data_range": 1.9}
-    brief = brief_quality(WRITER, {"per_step": [], "ssim_window": other}, 2.0, 1)
+    brief = brief_quality(WRITER, {"per_step": [], "ssim_window": other}, 2.0, (1, 2, 3, 4))
     assert brief["ssim_window"] == other
 
 
@@ -155,15 +162,19 @@ class Arrays:
 
 
 def back(
-    rmse: list[float | None], largest: list[float | None], ends: tuple[float, float]
+    rmse: list[float | None],
+    largest: list[float | None],
+    ends: tuple[float, float],
+    together: int = 1,
 ) -> tuple[list[dict[str, float | None]], Arrays]:
     """The figures as they are read again, and the arrays that were written."""
     writer: Any = Arrays()
     figures = {"rmse": rmse, "max_abs_error": largest}
-    steps = write_steps(writer, figures, ends[1] - ends[0])
+    steps = write_steps(writer, figures, ends[1] - ends[0], together)
     known = [value for value in largest if value is not None]
     quality = {"max_abs_error": max(known), **({"steps": steps} if steps else {})}
-    return read_steps({"value_range": ends, "quality": quality}, writer.stored), writer
+    header = {"value_range": ends, "quality": quality, "domain": {"shape": [len(rmse), 1, 1, 1]}}
+    return read_steps(header, writer.stored), writer
 
 
 @pytest.mark.parametrize("most", [512, 2])
@@ -178,10 +189,53 @@ def test_figures_are_never_better_than_they_are(most: int, monkeypatch: Any) -> 
     assert steps[4]["max_abs_error"] == 1.9
 
 
+@pytest.mark.parametrize("most", [512, 2])
+def test_neighbouring_steps_have_one_figure_together(most: int, monkeypatch: Any) -> None:
+    monkeypatch.setattr(step_figures, "MAX_LISTED", most)
+    rmse = [3e-3, 4e-3, None, 0.0, 1e-3, None, None, None]
+    largest = [5e-3, 7e-3, None, 0.0, 2e-3, None, None, None]
+    steps, _ = back(rmse, largest, (0.0, 1.0), together=2)
+    assert [step["step"] for step in steps] == list(range(8))
+    assert [step["rmse"] for step in steps[::2]] == [step["rmse"] for step in steps[1::2]]
+    assert steps[0]["rmse"] == pytest.approx(12.5**0.5 * 1e-3, rel=2e-3)
+    assert steps[0]["max_abs_error"] == 7e-3
+    assert steps[2]["rmse"] == steps[2]["max_abs_error"] == 0.0
+    assert steps[4]["rmse"] == pytest.approx(1e-3, rel=2e-3)
+    assert steps[6]["rmse"] is None
+
+
+@pytest.mark.parametrize(
+    ("shape", "together"),
+    [
+        ((8, 1, 1, 1), 1),
+        ((127, 1, 1, 1), 1),
+        ((128, 1, 1, 1), 2),
+        ((23741, 2, 2, 2), 370),
+        ((9000, 16, 16, 16), 1),
+        ((9000, 8, 16, 16), 2),
+    ],
+)
+def test_small_frames_have_figures_together(shape: tuple[int, ...], together: int) -> None:
+    assert steps_together(shape) == together
+
+
+def test_measured_steps_that_are_even_are_counted() -> None:
+    window = {"window": 11, "sigma": 1.5, "data_range": 2.0, "steps": [0, 3, 5, 8]}
+    figures = dict.fromkeys(("psnr", "rmse", "max_abs_error"))
+    per_step = [{"step": step, **figures} for step in range(9)]
+    quality = {"per_step": per_step, "ssim_window": window}
+    brief = brief_quality(WRITER, quality, 2.0, (9, 2, 3, 4))
+    assert brief["ssim_window"]["steps"] == 4
+    whole = header(brief) | {"domain": {"shape": [9, 2, 3, 4]}}
+    assert full_header(whole, {})["quality"]["ssim_window"] == window
+
+
 def test_levels_beyond_float64_have_no_figure() -> None:
     steps = {"rmse": [-(10**6), 0, 10**6], "max_abs_error": [10**6, 0, 5]}
-    header = {"value_range": [0, 1], "quality": {"steps": steps}}
-    assert read_steps(header, {})[0] == {"rmse": None, "max_abs_error": None}
+    header = {"value_range": [0, 1], "quality": {"steps": steps}, "domain": {"shape": [2]}}
+    assert read_steps(header, {})[0] == dict.fromkeys(("psnr", "rmse", "max_abs_error")) | {
+        "step": 0
+    }
     assert read_steps({"value_range": [0, 1], "quality": {}}, {}) == []
 
 

@@ -14,6 +14,7 @@ from fhash_formats import errors
 from fhash_formats.errors import InputError, RegionError, suggestion
 from fhash_formats.readers.registry import open_mask, open_series
 from fhash_formats.series import (
+    BLOCK,
     ArraySeries,
     Coordinate,
     SourceMetadata,
@@ -22,6 +23,7 @@ from fhash_formats.series import (
     is_plain_name,
     references,
     renamed,
+    step_blocks,
     with_history,
     without_names,
 )
@@ -45,6 +47,34 @@ def test_some_steps() -> None:
     np.testing.assert_array_equal(some.coords["t"].values, [2, 0])
     with pytest.raises(InputError, match="empty"):
         StepsSeries(ArraySeries(VALUES), [])
+
+
+@pytest.mark.parametrize(
+    ("steps", "frame", "blocks"),
+    [
+        (range(5), (1, 1, 1), [range(5)]),
+        (range(3, 8), (1, 1, BLOCK // 2), [range(3, 5), range(5, 7), range(7, 8)]),
+        (range(2, 4), (2, 1, BLOCK), [range(2, 3), range(3, 4)]),
+        (range(6, 0, -3), (1, 1, 1), [range(6, 7), range(3, 4)]),
+        (range(0, 5, 2), (1, 1, 1), [range(1), range(2, 3), range(4, 5)]),
+        (range(0), (1, 1, 1), []),
+    ],
+)
+def test_steps_are_cut_into_neighbours_that_are_read_together(
+    steps: range, frame: tuple[int, int, int], blocks: list[range]
+) -> None:
+    cut = list(step_blocks(steps, frame))
+    assert [together for _, together in cut] == blocks
+    assert [step for places, _ in cut for step in steps[places]] == list(steps)
+
+
+@pytest.mark.parametrize("chosen", [None, [0, 1, 2, 3], [3, 1, 0]])
+def test_blocks_are_the_frames(chosen: list[int] | None) -> None:
+    array = ArraySeries(VALUES)
+    series = array if chosen is None else StepsSeries(array, chosen)
+    ((steps, frames),) = series.blocks(range(1, 3))
+    assert steps == range(1, 3)
+    np.testing.assert_array_equal(frames, [series.read(1), series.read(2)])
 
 
 def test_three_axes_are_one_step() -> None:

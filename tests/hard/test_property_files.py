@@ -344,7 +344,7 @@ def test_any_quality_is_stored_and_printed(figures: list[Any], largest: float) -
     quality = {"psnr": figures[2], "max_abs_error": largest, "per_step": [step], "ssim_window": {}}
     finite = plain_json(quality)
     strict_json.dumps(
-        plain_json(brief_quality(ContainerWriter("unused.fhz"), finite, 1.0, 1)), "it"
+        plain_json(brief_quality(ContainerWriter("unused.fhz"), finite, 1.0, (1, 1, 1, 1))), "it"
     )
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         emit({"quality": quality, "data_range": math.inf}, "", as_json=True)

@@ -141,12 +141,12 @@ class Statistics:
         """
         import numpy as np
 
-        from fhash_codec.features.scan import scan_piece
+        from fhash_codec.features.scan import scan_rows
         from fhash_codec.measure.value_range import pieces
 
         self.all, self.inside = self.all + frame.size, self.inside + inside
         for piece in pieces(frame if integers is None else integers[~np.isnan(frame)]):
-            _, low, high = scan_piece(piece, self.mean)
+            _, low, high = scan_rows(piece[None], self.mean)
             self.low, self.high = min(self.low, low), max(self.high, high)
 
     def result(self) -> dict[str, float | None]:
@@ -288,7 +288,7 @@ class Selection:
         """Some steps at a time, and their frames (t, z, y, x)."""
         import numpy as np
 
-        from fhash_codec.boxes import step_blocks
+        from fhash_formats.series import step_blocks
 
         first = int(self.steps[0])
         neighbours = range(first, first + len(self.steps))

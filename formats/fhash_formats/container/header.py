@@ -292,6 +292,8 @@ STEP_BYTES = 3
 """Bytes of a number in this array, the lowest first, each in a plane of its own."""
 LOWEST = "lowest"
 """Attribute of this array: the first number of each list."""
+TOGETHER = "together"
+"""Attribute of this array, or key beside the lists: neighbouring steps of which each number is."""
 POSITIONS = ("time", "z", "y", "x")
 """Names of the coordinates in a container, in the order of the axes."""
 QUALITY = (
@@ -421,8 +423,10 @@ def validate_header(header: Mapping[str, Any]) -> None:
         for key in BETWEEN:
             quality.record("between").number_or_null(key)
     if quality.has("steps"):
+        steps = quality.record("steps")
+        together = steps.integer(TOGETHER, 1, MAX_LENGTH) if steps.has(TOGETHER) else 1
         for key in STEP_FIGURES:
-            quality.record("steps").integers(key, shape[0] + 1, -MAX_LEVEL, MAX_LEVEL)
+            steps.integers(key, -(-shape[0] // together) + 1, -MAX_LEVEL, MAX_LEVEL)
     _check_history(top.record("history"))
 
 

@@ -34,6 +34,7 @@ from fhash_formats.container.header import (
     STEP_BYTES,
     STEP_FIGURES,
     STEPS,
+    TOGETHER,
     TRANSFORM_FEATURE,
     described_coordinate,
 )
@@ -43,7 +44,7 @@ from fhash_formats.container.hierarchy import (
     read_hierarchy,
     variable_named,
 )
-from fhash_formats.container.record import Record
+from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.container.source_entry import check_source
 from fhash_formats.container.stored import ChunkCache, StoredArray
 from fhash_formats.container.zip_file import (
@@ -93,6 +94,9 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     if STEPS in arrays:
         attributes = Record(arrays[STEPS].attributes, f"array {STEPS} attribute ")
         attributes.integers(LOWEST, len(STEP_FIGURES), -MAX_LEVEL, MAX_LEVEL)
+        together = attributes.integer(TOGETHER, 1, MAX_LENGTH) if attributes.has(TOGETHER) else 1
+        count = -(-header["domain"]["shape"][0] // together)
+        _check_array(STEPS, arrays[STEPS], (STEP_BYTES, len(STEP_FIGURES), count), ("uint8",))
     for axis in POSITIONS:
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
@@ -214,7 +218,6 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         yield "corrections", tuple(model["levels"][0]), PLAIN_TABLE_TYPES
     else:
         yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
-    yield STEPS, (STEP_BYTES, len(STEP_FIGURES), steps), ("uint8",)
     yield MISSING_ARRAY, (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 

@@ -289,6 +289,10 @@ class Watched(ArraySeries):
         self.steps.add(step)
         return super().read(step)
 
+    def read_steps(self, steps: range) -> np.ndarray:
+        self.steps |= set(steps)
+        return super().read_steps(steps)
+
 
 @pytest.mark.parametrize("missing", [False, True])
 @pytest.mark.parametrize("case", FEATURES)
@@ -313,7 +317,7 @@ def test_a_part_refuses_a_plan_of_others(tmp_path) -> None:
     plan, one = plan_parts(values_parts(), tmp_path / "run.plan", CONFIG), Part(number=2, of=3)
     for source, config, message in (
         (values_parts()[:, :3], None, "they differ in shape"),
-        (values_parts() + 9, None, "step 2 has values from"),
+        (values_parts() + 9, None, "in steps 2 to 3 are values from"),
         (
             np.where(values_parts() > 1, np.nan, values_parts()),
             None,

@@ -400,7 +400,7 @@ def measured(count: int = 3) -> tuple[Figures, np.ndarray]:
 
 def test_what_a_header_tells_is_taken_up_again() -> None:
     figures, _ = measured()
-    told = figures.header(WRITER, 5.0)
+    told = figures.header(WRITER, 5.0, (3, 2, 3, 4))
     header = {
         "domain": {"shape": [3, 2, 3, 4]},
         "value_range": [0.0, 5.0],
@@ -409,7 +409,7 @@ def test_what_a_header_tells_is_taken_up_again() -> None:
         "quality": told,
     }
     full = full_header(header, {})
-    again = Figures.of_header(full, figures.scale).header(WRITER, 5.0)
+    again = Figures.of_header(full, figures.scale).header(WRITER, 5.0, (3, 2, 3, 4))
     # Figures of steps are rounded to hundredths of a dB.
     assert again["rmse"] == pytest.approx(told["rmse"], rel=2e-3)
     assert again["rmse"] >= told["rmse"]

@@ -22,7 +22,16 @@ from fhash_codec.features.features import (
 )
 from fhash_codec.features.key_frames import KeyTimes, select_key_frames
 from fhash_codec.features.occupancy import morton_index, pack, packed_bytes, unpack
-from fhash_codec.features.scan import ABSURD, HUGE, MOST, SEVERAL, Extremes, SpanScan, scan
+from fhash_codec.features.scan import (
+    ABSURD,
+    HUGE,
+    MOST,
+    SEVERAL,
+    Extremes,
+    SpanScan,
+    finite_masks,
+    scan,
+)
 from fhash_codec.measure.value_range import Ranks, pieces
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning, InputError, RegionError
@@ -173,7 +182,7 @@ def test_range_and_mean_are_numpys(dtype) -> None:
     assert (seen.value_range.low, seen.value_range.high) == (array.min(), array.max())
     assert seen.mean == pytest.approx(array.mean(dtype=np.float64), rel=1e-14)
     assert (seen.finite_count, seen.missing) == (array.size, {})
-    assert seen.finite(0, (4, 5, 6)) is None
+    assert finite_masks(seen.missing, range(3), (4, 5, 6)) is None
 
 
 def test_missing_values_are_left_out_and_known_by_step() -> None:
@@ -188,14 +197,12 @@ def test_missing_values_are_left_out_and_known_by_step() -> None:
         array[finite].max(),
     )
     assert seen.mean == pytest.approx(array[finite].mean(dtype=np.float64))
-    for step in range(5):
-        mask = seen.finite(step, (3, 4, 5))
-        np.testing.assert_array_equal(finite[step], True if mask is None else mask)
+    np.testing.assert_array_equal(finite, finite_masks(seen.missing, range(5), (3, 4, 5)))
 
 
-@pytest.mark.parametrize("large", [0, 1 << 30])
-def test_a_small_series_of_a_file_stays_in_memory(tmp_path, monkeypatch, large) -> None:
-    monkeypatch.setattr(scanning, "LARGE", large)
+@pytest.mark.parametrize("block", [1, 150, 1 << 18])
+def test_a_small_series_of_a_file_stays_in_memory(tmp_path, monkeypatch, block) -> None:
+    monkeypatch.setattr("fhash_formats.series.BLOCK", block)
     values = np.random.default_rng(5).normal(size=(6, 3, 4, 5)).astype(np.float32)
     np.save(tmp_path / "a.npy", values)
     with open_series(tmp_path / "a.npy") as series:

@@ -317,9 +317,6 @@ of several frames of 128^3 float64 are decompressed once, and memory stays small
 encoder's own.
 """
 
-SMALL_BYTES = 1 << 20
-"""Bytes that are fetched at once where nothing is in chunks: a fetch costs more than few values."""
-
 Fetch = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
 
 
@@ -356,8 +353,8 @@ class StoredValues:
         dtype: type of the physical values, in any byte order.
         fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
         chunks: shape of a stored chunk, None without chunks. As many steps of one chunk as fit
-            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame,
-            or small ones of SMALL_BYTES together.
+            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame
+            at a time.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
         not_stored: what nobody wrote, with the number that stands there as it is stored.
         default_fill: value as it is read that stands for one that nobody wrote, see
@@ -415,8 +412,6 @@ class FileSeries(Series):
         )
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
         together = _steps_of_a_chunk(self._axes, values.shape, values.chunks)
-        if values.chunks is None:
-            together = max(together, SMALL_BYTES // frame_bytes)
         self._together = max(1, min(together, SLAB_BYTES // frame_bytes))
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
@@ -466,20 +461,37 @@ class FileSeries(Series):
         return self
 
     def read(self, step: int) -> npt.NDArray[Any]:
-        self.require_step(step)
-        start = step - step % self._together
+        frame: npt.NDArray[Any] = self.read_steps(range(step, step + 1))[0]
+        return frame
+
+    def read_steps(self, steps: range) -> npt.NDArray[Any]:
+        self.require_step(steps.start)
+        self.require_step(steps.stop - 1)
         if self._together == 1:
-            return np.ascontiguousarray(self._block(step, step + 1)[0], dtype=self.dtype)
+            return np.ascontiguousarray(self._block(steps.start, steps.stop), dtype=self.dtype)
+        result = np.empty((len(steps), *self.shape[1:]), self.dtype)
+        place = steps.start
+        while place < steps.stop:
+            inside = place % self._together
+            whole = (steps.stop - place) // self._together * self._together
+            if inside or not whole:
+                values = self._slab_from(place - inside)[inside:][: steps.stop - place]
+            else:  # whole chunks, of which nothing is read again
+                values = self._block(place, place + whole)
+            result[place - steps.start :][: len(values)] = values
+            place += len(values)
+        return result
+
+    def _slab_from(self, start: int) -> npt.NDArray[Any]:
+        """The steps of a chunk from `start` on, which are kept."""
         slab = self._slab
         if slab is None or slab[0] != start:
             self._slab = None  # before the fetch, so that two slabs are never held
-            slab = self._slab = (
-                start,
-                self._block(start, min(start + self._together, self.shape[0])),
-            )
+            stop = min(start + self._together, self.shape[0])
+            slab = self._slab = (start, self._block(start, stop))
         else:
             self._check_files()
-        return np.array(slab[1][step - start], dtype=self.dtype, order="C")
+        return slab[1]
 
     def check(self) -> None:
         for stamp in self.stamps:
