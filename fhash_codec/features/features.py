@@ -377,7 +377,7 @@ def _histogram(
     """Counts (BINS,) of the finite values of all key frames, over the range of the series."""
     counts = np.zeros(BINS, dtype=np.int64)
     for done, step in enumerate(key_frames):
-        for piece in pieces(series.frame(step)):
+        for piece in pieces(series.read(step)):  # also of a Volume
             unit = value_range.to_unit(finite_values(piece))
             counts += np.bincount(
                 np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
