@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
 from threading import Event
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fhash_codec.compact.attempt import Attempt, HeadHistory, PlanTask
 from fhash_codec.compact.goal import step_after_gain
@@ -17,6 +17,7 @@ from fhash_codec.compact.head_training import Budget, Pair, Shape, TrainedHead, 
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.step import EXACT, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
+from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Parts, skip, stage
 from fhash_formats.transform.tile_format import TileSettings
 
@@ -109,6 +110,8 @@ EFFORTS = {
 
 At 5 a cross is left out: it gains up to a fifth more, and takes six times as long.
 """
+OF_FEWEST_BYTES: dict[str, Any] = {"least": 0.003, "least_bytes": 900, "most_bits": math.inf}
+"""Limits of a trial where the fewest bytes are wished for, whatever they cost."""
 MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
@@ -119,6 +122,13 @@ HEAD_BYTES = 60
 """Bytes that a head adds to the file besides its weights: its history and description."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
+
+
+def effort_of(config: EncodeConfig) -> Effort:
+    """Return the effort that settings ask for, from 5 on."""
+    spent = EFFORTS[config.effort]
+    few = config.access == "small" and spent.least > 0
+    return replace(spent, **OF_FEWEST_BYTES) if few else spent
 
 
 def likely_heads(
@@ -200,7 +210,7 @@ def choose_head(
     look: codes the sample once, as that search does.
     """
     sample, settings, outcome = attempt.sample, attempt.settings, attempt.outcome
-    data_range, spent = task.goal.data_range, EFFORTS[task.config.effort]
+    data_range, spent = task.goal.data_range, effort_of(task.config)
     # Sizes are compared at a PSNR; under a bound, which all outcomes keep, as they are.
     aim = None if task.goal.psnr is None else task.goal.psnr + EXACT.aim
     if not spent.tries(outcome.size, prod(task.blocks.shape)):

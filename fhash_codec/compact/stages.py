@@ -352,7 +352,7 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
     """Code a few tiles for a first idea of the size."""
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
-    quick = task.config.effort <= MAX_PRICED_EFFORT
+    quick = task.config.effort <= MAX_PRICED_EFFORT and task.config.access != "small"
     quick = quick and plateau_center(sample, task.value_range) is None
     coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
@@ -627,11 +627,14 @@ def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
     if effort == 1 or not _asked(task, "predictor"):
         return attempt
     with stage("predictor", "trials beside the transform, for the bound on each error"):
+        # What a predictor codes is read slowly: no reason to give up the fast coder for little.
+        share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
+        least = round(attempt.outcome.size / share)
         settings, size = choose_predictor(
-            attempt.sample, attempt.settings, attempt.outcome.size, error=goal.error, effort=effort
+            attempt.sample, attempt.settings, least, error=goal.error, effort=effort
         )
-    outcome = replace(attempt.outcome, size=size)
     kept = settings.predictor is not None
+    outcome = replace(attempt.outcome, size=size) if kept else attempt.outcome
     if kept and settings.trellis:
         settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients now
     task.gains.note("prediction" if kept else "prediction (left out)", outcome)

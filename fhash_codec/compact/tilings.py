@@ -210,7 +210,7 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
     size: bytes of the series, roughly.
     """
     config, shape = task.config, task.blocks.shape
-    few = config.effort <= MAX_PRICED_EFFORT and config.access != "fast"
+    few = config.effort <= MAX_PRICED_EFFORT and config.access == "balanced"
     if few and is_small(shape):
         return Tiling(tile=shape, price=1.0)
     if config.effort > 1 and "tiles" not in config.without:

@@ -17,10 +17,10 @@ import numpy as np
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
 from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
-    EFFORTS,
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
+    effort_of,
     likely_heads,
 )
 from fhash_codec.compact.head_training import Budget
@@ -273,7 +273,7 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     limit = MAX_SEARCHED_VERTICES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     searched = work.tiles(tile, limit)
     size = work.bytes_of_tiles
-    spent = EFFORTS[config.effort]
+    spent = effort_of(config)
     if not spent.tries(size, work.vertices):
         return {}
     strict = bool(look.task.goal.error)
@@ -345,9 +345,6 @@ def _measuring(work: _Work, head: HeadProbe | None) -> float:
         + rates.compare * work.vertices
         + rates.ssim * measured * plane
     )
-
-
-assert MIN_HEAD_EFFORT in EFFORTS
 
 
 LOOKED_AT = 32 << 20

@@ -389,29 +389,34 @@ FHASH_CLONES int64_t similarity_double(const double* one, const double* other, c
 }  // namespace
 
 // For each of the rows of n values: the number of the finite ones, the least, the greatest and the
-// sum of value * factor.
-FHASH_EXPORT void fhash_scan_f32(const float* values, int64_t rows, int64_t n, double factor,
-                                 double* result) {
+// sum of value * factor. Returns 0.
+FHASH_EXPORT int64_t fhash_scan_f32(const float* values, int64_t rows, int64_t n, double factor,
+                                    double* result) {
     scan_float(values, rows, n, factor, result);
+    return 0;
 }
-FHASH_EXPORT void fhash_scan_f64(const double* values, int64_t rows, int64_t n, double factor,
-                                 double* result) {
+FHASH_EXPORT int64_t fhash_scan_f64(const double* values, int64_t rows, int64_t n, double factor,
+                                    double* result) {
     scan_double(values, rows, n, factor, result);
+    return 0;
 }
 
 // Errors of the rows of n decoded values, times scale. For each row: the number of the values that
 // count, those with a finite original where the mask (nullptr: everywhere) is not 0, or -1 where
 // one of them has no finite error; the sum of the squared errors, and the largest; the number of
 // the values that count whose original lies from low to high, and the sum of their squares.
-FHASH_EXPORT void fhash_errors_f32(const float* original, const float* decoded,
-                                   const uint8_t* mask, int64_t rows, int64_t n, double scale,
-                                   double low, double high, double* result) {
+// Returns 0.
+FHASH_EXPORT int64_t fhash_errors_f32(const float* original, const float* decoded,
+                                      const uint8_t* mask, int64_t rows, int64_t n, double scale,
+                                      double low, double high, double* result) {
     errors_float(original, decoded, mask, rows, n, scale, low, high, result);
+    return 0;
 }
-FHASH_EXPORT void fhash_errors_f64(const double* original, const double* decoded,
-                                   const uint8_t* mask, int64_t rows, int64_t n, double scale,
-                                   double low, double high, double* result) {
+FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* decoded,
+                                      const uint8_t* mask, int64_t rows, int64_t n, double scale,
+                                      double low, double high, double* result) {
     errors_double(original, decoded, mask, rows, n, scale, low, high, result);
+    return 0;
 }
 
 // Add the finite ones of n values to `counts`, a histogram of `bins` equal bins: a value goes to

@@ -14,19 +14,18 @@ using std::int64_t;
 namespace {
 
 template <class T> struct Functions {
-    int64_t (*scan)(const T*, int64_t, double, double*);
-    int64_t (*errors)(const T*, const T*, const std::uint8_t*, int64_t, double, double*);
-    int64_t (*bulk_errors)(const T*, const T*, const std::uint8_t*, int64_t, double, double, double,
-                           double*);
+    int64_t (*scan)(const T*, int64_t, int64_t, double, double*);
+    int64_t (*errors)(const T*, const T*, const std::uint8_t*, int64_t, int64_t, double, double,
+                      double, double*);
     int64_t (*histogram)(const T*, int64_t, double, double, double, int64_t, int64_t*);
     int64_t (*ssim)(const T*, const T*, const std::uint8_t*, const int64_t*, const int64_t*,
                     const double*, double*);
 };
 
-const Functions<float> SINGLE{fhash_scan_f32, fhash_errors_f32, fhash_bulk_errors_f32,
-                              fhash_histogram_f32, fhash_ssim_f32};
-const Functions<double> DOUBLE{fhash_scan_f64, fhash_errors_f64, fhash_bulk_errors_f64,
-                               fhash_histogram_f64, fhash_ssim_f64};
+const Functions<float> SINGLE{fhash_scan_f32, fhash_errors_f32, fhash_histogram_f32,
+                              fhash_ssim_f32};
+const Functions<double> DOUBLE{fhash_scan_f64, fhash_errors_f64, fhash_histogram_f64,
+                               fhash_ssim_f64};
 
 // Count values in bins between their least and their greatest. The counts add up to their number.
 template <class T>
@@ -44,26 +43,29 @@ void count_values(Reader& in, const Functions<T>& functions, const std::vector<T
     require(counted == finite && sum == finite, "a histogram of another number of values");
 }
 
-// The number of the values that count is the same for all figures.
+// The number of the values that count in a row is the same for all figures.
 template <class T> void compare_values(Reader& in, const Functions<T>& functions) {
-    const int64_t n = in.word() % 3000;
-    const std::vector<T> one = repeated<T>(in, n), other = repeated<T>(in, n);
-    const std::vector<std::uint8_t> mask = repeated<std::uint8_t>(in, n);
+    const int64_t rows = in.within(1, 3), n = in.word() % 1000, all = rows * n;
+    const std::vector<T> one = repeated<T>(in, all), other = repeated<T>(in, all);
+    const std::vector<std::uint8_t> mask = repeated<std::uint8_t>(in, all);
     const std::uint8_t* const chosen = in.byte() & 1 ? mask.data() : nullptr;
     const double factor = in.finite<double>(), scale = std::ldexp(1.0, -1 - in.byte());
-    double found[4] = {};
-    const int64_t finite = functions.scan(one.data(), n, factor, found);
-    const double low = found[0], high = found[1];
-    const int64_t all =
-        functions.errors(one.data(), other.data(), chosen, n, scale, found);
     const double first = in.finite<double>(), second = in.finite<double>();
-    double bulk[4] = {};
-    const int64_t same = functions.bulk_errors(one.data(), other.data(), chosen, n, scale,
-                                               std::min(first, second), std::max(first, second),
-                                               bulk);
-    require(all == same && all <= finite, "another number of values");
-    if (all >= 0) require(bulk[0] == found[0] && bulk[3] <= static_cast<double>(all), "other sums");
-    if (finite > 0) count_values(in, functions, one, low, high, finite);
+    std::vector<double> found(4 * static_cast<std::size_t>(rows));
+    std::vector<double> errors(5 * static_cast<std::size_t>(rows)), bulk(errors);
+    functions.scan(one.data(), rows, n, factor, found.data());
+    functions.errors(one.data(), other.data(), chosen, rows, n, scale, 1, 0, errors.data());
+    functions.errors(one.data(), other.data(), chosen, rows, n, scale, std::min(first, second),
+                     std::max(first, second), bulk.data());
+    for (std::size_t row = 0; row < static_cast<std::size_t>(rows); row++) {
+        const double* const whole = &errors[5 * row];
+        const double* const part = &bulk[5 * row];
+        require(whole[0] == part[0] && whole[0] <= found[4 * row], "another number of values");
+        if (whole[0] >= 0) require(part[1] == whole[1] && part[3] <= whole[0], "other sums");
+    }
+    const int64_t finite = static_cast<int64_t>(found[0]);
+    const std::vector<T> row(one.begin(), one.begin() + static_cast<std::ptrdiff_t>(n));
+    if (finite > 0) count_values(in, functions, row, found[1], found[2], finite);
 }
 
 template <class T> void compare_frames(Reader& in, const Functions<T>& functions) {
