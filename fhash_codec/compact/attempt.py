@@ -11,9 +11,8 @@ from itertools import product
 from math import prod
 from typing import Any
 
-from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.goal import Goal, Slope
 from fhash_codec.compact.sample import Sample
-from fhash_codec.compact.step import Slope
 from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import Feature

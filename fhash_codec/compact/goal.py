@@ -38,24 +38,51 @@ MIN_LOSS = 0.02
 """Smallest difference in dB of two outcomes from which their exchange rate is taken."""
 
 
+APART = 0.01
+"""The same where the slope is kept for other tiles and transforms."""
+
+
+@dataclass
+class Slope:
+    """Fall of the PSNR of a series with the step, as the last trials have found it.
+
+    Attributes:
+        slope: dB per factor of e.
+        apart: difference of log steps from which on two trials tell it.
+    """
+
+    slope: float = SLOPE
+    apart: float = APART
+    _before: tuple[float, float] | None = None
+
+    def restart(self) -> None:
+        """Forget the last trial: the next one has another transform or other tiles."""
+        self._before = None
+
+    def note(self, step: float, psnr: float) -> None:
+        """Take up a trial, the PSNR in dB of a step."""
+        log_step = math.log(step)
+        if self._before is not None and abs(self._before[0] - log_step) > self.apart:
+            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
+            if math.isfinite(fall):
+                self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
+        self._before = log_step, psnr
+
+
 class PsnrSearch:
     """Search for the quantiser step at which a PSNR is reached, by secants of the log step."""
 
     def __init__(self, min_step: float, max_step: float, slope: float = SLOPE) -> None:
         """Begin a search between two steps. slope: dB per factor of e that is assumed at first."""
         self._ends = min_step, max_step
-        self.slope = slope
-        self._before: tuple[float, float] | None = None
+        self._slope = Slope(slope, MIN_APART)
 
     def after(self, step: float, psnr: float, target: float) -> float:
         """Take up a trial, the PSNR in dB of a step; return the step that should reach `target`."""
-        log_step = math.log(step)
-        if self._before is not None and abs(self._before[0] - log_step) > MIN_APART:
-            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
-            self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
-        self._before = log_step, psnr
+        self._slope.note(step, psnr)
         low, high = map(math.log, self._ends)  # 0 where nothing but a first trial is made
-        return math.exp(min(max(log_step + (psnr - target) / self.slope, low), high))
+        wanted = math.log(step) + (psnr - target) / self._slope.slope
+        return math.exp(min(max(wanted, low), high))
 
 
 def step_after_gain(step: float, gain: float) -> float:

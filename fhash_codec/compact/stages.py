@@ -45,7 +45,7 @@ from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import skip, stage, tell
 from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
 from fhash_formats.transform.encoding import OFFSETS
-from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.tile_format import Shape, TileSettings
 
 BINS = 4096
 """Intervals of the value range among which the fullest is looked for."""
@@ -397,6 +397,16 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         return replace(attempt, sample=attempt.sample.wider(searched))
 
 
+def vertices_of_trials(quick: bool) -> int:
+    """Return the vertices on which each transform is tried. quick: see `Attempt`."""
+    return PRICED_VERTICES if quick else TRIAL_VERTICES
+
+
+def is_tried_in_parts(tile: Shape, quick: bool) -> bool:
+    """Whether transforms of a tile are tried on parts of it. quick: see `Attempt`."""
+    return prod(tile) > (2 if quick else LARGE) * vertices_of_trials(quick)
+
+
 def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     """Return settings with a transform that is chosen on parts of a large tile.
 
@@ -405,7 +415,7 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    vertices = PRICED_VERTICES if attempt.quick else TRIAL_VERTICES
+    vertices = vertices_of_trials(attempt.quick)
     parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, vertices)
@@ -678,9 +688,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif sample.is_single or prod(sample.blocks.tile) > (
-        2 * PRICED_VERTICES if attempt.quick else LARGE * TRIAL_VERTICES
-    ):
+    elif sample.is_single or is_tried_in_parts(sample.blocks.tile, attempt.quick):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)

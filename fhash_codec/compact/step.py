@@ -10,13 +10,12 @@ import numpy as np
 
 from fhash_codec.compact.goal import (
     EXCHANGE,
-    MAX_SLOPE,
-    MIN_SLOPE,
     RATIO_SLACK,
     SLOPE,
     Goal,
     PsnrSearch,
     SizeSearch,
+    Slope,
     cheapest,
     exchange,
     search,
@@ -122,35 +121,6 @@ def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal:
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
-
-
-APART = 0.01
-"""Difference of log steps from which on two trials tell a slope."""
-
-
-@dataclass
-class Slope:
-    """Fall of the PSNR of a series with the step, as the last trials have found it.
-
-    Attributes:
-        slope: dB per factor of e.
-    """
-
-    slope: float = SLOPE
-    _before: tuple[float, float] | None = None
-
-    def restart(self) -> None:
-        """Forget the last trial: the next one has another transform or other tiles."""
-        self._before = None
-
-    def note(self, step: float, psnr: float) -> None:
-        """Take up a trial, the PSNR in dB of a step."""
-        log_step = math.log(step)
-        if self._before is not None and abs(self._before[0] - log_step) > APART:
-            fall = -(psnr - self._before[1]) / (log_step - self._before[0])
-            if math.isfinite(fall):
-                self.slope = min(max(fall, MIN_SLOPE), MAX_SLOPE)
-        self._before = log_step, psnr
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from fhash_codec.compact.attempt import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
 from fhash_codec.compact.goal import EXCHANGE
 from fhash_codec.compact.head import (
+    EFFORTS,
     MIN_GAIN,
     NEAR_GAIN,
     TRAINING_VERTICES,
@@ -27,13 +28,13 @@ from fhash_codec.compact.head_training import Budget
 from fhash_codec.compact.plan import ends_trials
 from fhash_codec.compact.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.stages import (
-    LARGE,
     LEAST,
     MAX_SEARCHED_VERTICES,
     MIN_HEAD_EFFORT,
-    PRICED_VERTICES,
     SAMPLE_VERTICES,
     TRIAL_VERTICES,
+    is_tried_in_parts,
+    vertices_of_trials,
 )
 from fhash_codec.compact.step import allows_trellis
 from fhash_codec.compact.tilings import PICKED_VERTICES, largest_tile
@@ -211,9 +212,9 @@ def _choices(work: _Work) -> dict[str, float]:
         coded = trials if rates.price is None else min(trials, CODED)
         coding = TRIAL_SHARE * work.wall(rates.trial, tile, coded * tried)
         pricing = work.wall(rates.price or 0.0, tile, trials * tried)
-        if prod(tile) > (2 * PRICED_VERTICES if quick else LARGE * TRIAL_VERTICES):
+        if is_tried_in_parts(tile, quick):
             # A part stands for the tile in all trials but two.
-            part = (PRICED_VERTICES if quick else TRIAL_VERTICES) / usable_threads()
+            part = vertices_of_trials(quick) / usable_threads()
             coding = TRIAL_SHARE * rates.trial * (coded * part + 2 * prod(tile))
             pricing = (rates.price or 0.0) * trials * part
         coding += pricing
@@ -346,6 +347,8 @@ def _measuring(work: _Work, head: HeadProbe | None) -> float:
         + rates.ssim * measured * plane
     )
 
+
+assert MIN_HEAD_EFFORT in EFFORTS
 
 LOOKED_AT = 32 << 20
 """Vertices of a series up to which all of it is looked at."""

@@ -163,8 +163,20 @@ struct Task {
     std::vector<Band> bands;
 };
 
+// Stands for an Encoder where only the bits count, in 1/2048.
+struct Counter {
+    int64_t bits = 0;
+
+    FHASH_INLINE int code(int bit, uint32_t p) {
+        bits += tables.cost[bit ? p : 65536 - p];
+        return bit;
+    }
+};
+
 template <Mode MODE>
-using FlagCoder = typename std::conditional<MODE == DECODE, Decoder, Encoder>::type;
+using FlagWriter = typename std::conditional<MODE == PRICE, Counter, Encoder>::type;
+template <Mode MODE>
+using FlagCoder = typename std::conditional<MODE == DECODE, Decoder, FlagWriter<MODE>>::type;
 
 template <Mode MODE> struct Coder {
     static const bool CHOOSES = MODE == PRICE || MODE == CHOOSE;
@@ -218,18 +230,7 @@ template <Mode MODE> struct Coder {
         for (Simple& flag : flags) flag = {32768, 0};
     }
 
-    FHASH_INLINE int flag(int bit, int number) {
-        if constexpr (MODE == PRICE) {
-            // As an estimate that knows all that was seen so far.
-            Simple& seen = flags[number];
-            raw_flags += tables.cost[bit ? seen.p : 65536 - seen.p];
-            const int change = (((bit ? 65535 : 0) - (int)seen.p) * tables.rate[seen.count]) >> 16;
-            seen.p = (uint16_t)min(max(seen.p + change, 32), 65504);
-            if (seen.count < SIMPLE_LIMIT) seen.count++;
-            return bit;
-        } else return code_simple(range, flags[number], bit);
-    }
-    int64_t raw_flags = 0;  // in 1/2048 bit
+    FHASH_INLINE int flag(int bit, int number) { return code_simple(range, flags[number], bit); }
 
     // Bits of the tokens by the defaults of the prior, so that magnitudes can be chosen.
     void weigh() {
@@ -810,15 +811,18 @@ template <Mode MODE>
 FHASH_INLINE int64_t encode_into(Task& task, std::vector<uint8_t>& bytes, double* results) {
     std::vector<uint8_t> flag_bytes;
     const BitsIn none(nullptr, 0);
-    const auto coder = std::make_unique<Coder<MODE>>(task, Encoder{&flag_bytes}, none);
+    FlagCoder<MODE> flag_coder;
+    if constexpr (MODE != PRICE) flag_coder.out = &flag_bytes;
+    const auto coder = std::make_unique<Coder<MODE>>(task, flag_coder, none);
     if (Coder<MODE>::CHOOSES) coder->weigh();
     coder->run();
     uint8_t chosen[CONTEXTS];
-    const double bits = choose_distributions(coder->counts, task.prior, chosen);
-    results[0] = (bits + (double)coder->raw + (double)coder->raw_flags / 2048) / 8;
+    results[0] = choose_distributions(coder->counts, task.prior, chosen) + (double)coder->raw;
     results[1] = coder->squares;
-    if (MODE == PRICE) return 0;
-    coder->range.finish();
+    if constexpr (MODE == PRICE) results[0] += (double)coder->range.bits / 2048;
+    results[0] /= 8;
+    if constexpr (MODE == PRICE) return 0;
+    else coder->range.finish();
     BitsOut choices;
     for (int context = 0; context < CONTEXTS; context++) {
         const bool other = chosen[context] != task.prior.defaults[context];

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -19,6 +19,8 @@ from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.arrays import Integers, Mask
 
+Buffer = npt.NDArray[np.uint8]
+"""Room for the bytes of an encoder."""
 Table = npt.NDArray[np.int32]
 """Bands in the order in which they are coded, int32 of shape (bands, COLUMNS)."""
 
@@ -242,12 +244,15 @@ def encode_integers(
         raise InputError("integers of a trellis are chosen before they are coded")
     given = np.ascontiguousarray(integers, dtype=np.int32)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
-    capacity = max(4096, given.size // 2)
-    while True:
-        buffer = np.empty(capacity, dtype=np.uint8)
-        # The native coder writes to its integers only where it chooses them.
-        integers = given if chosen is None else given.copy()
-        size = native.library().fhash_encode(
+    # The native coder writes to its integers only where it chooses them.
+    integers = given if chosen is None else np.empty_like(given)
+
+    def encode(buffer: Buffer) -> int:
+        # Each time the original integers. Coding the chosen ones would give other bytes, because
+        # rows that became empty are signalled differently.
+        if chosen is not None:
+            np.copyto(integers, given)
+        code: int = native.library().fhash_encode(
             _pointer(integers),
             _pointer(chosen),
             weight,
@@ -258,12 +263,25 @@ def encode_integers(
             False,  # the state is not kept
             *array_arguments(buffer),
         )
-        if size == NO_TRELLIS:
+        if code == NO_TRELLIS:
             raise InputError("an integer is not one of the quantiser whose turn it is")
-        if checked(size) <= capacity:
-            return Encoded(data=buffer[:size].tobytes(), integers=integers)
-        # Retry with the original integers. Coding the chosen ones would give other bytes, because
-        # rows that became empty are signalled differently.
+        return code
+
+    return Encoded(data=with_room(given.size // 2, encode), integers=integers)
+
+
+def with_room(room: int, encode: Callable[[Buffer], int]) -> bytes:
+    """The bytes of a native encoder, which is called again where they do not fit.
+
+    room: bytes that are likely to be enough. encode: fills a buffer, and returns the size, or an
+    error code. Raises MemoryError.
+    """
+    capacity = max(4096, room)
+    while True:
+        buffer = np.empty(capacity, dtype=np.uint8)
+        size = checked(encode(buffer))
+        if size <= capacity:
+            return buffer[:size].tobytes()
         capacity = size
 
 
@@ -364,14 +382,14 @@ def _encode_fast(
     """Code integers by the fast coder; the arguments are those of `encode_integers`."""
     given = np.ascontiguousarray(integers, dtype=np.int32)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
-    capacity = max(4096, given.size // 2)
-    while True:
-        buffer = np.empty(capacity, dtype=np.uint8)
-        result = given if chosen is None else np.zeros_like(given)
-        size = _fast(result, chosen, 1.0, weight, given.shape, table, buffer)[0]
-        if size <= capacity:
-            return Encoded(data=buffer[:size].tobytes(), integers=result)
-        capacity = size
+    result = given if chosen is None else np.empty_like(given)
+
+    def encode(buffer: Buffer) -> int:
+        if chosen is not None:
+            result.fill(0)
+        return _fast(result, chosen, 1.0, weight, given.shape, table, buffer)[0]
+
+    return Encoded(data=with_room(given.size // 2, encode), integers=result)
 
 
 def foretell(
@@ -468,18 +486,15 @@ def encode_labels(labels: npt.NDArray[Any], count: int) -> bytes:
     """Code labels (t, z, y, x), each below `count`, of which there are 1 to MAX_LABELS."""
     # The coder writes to its labels, also in encoding, but does not change them.
     work = np.array(labels, dtype=np.uint16, order="C")
-    capacity = max(4096, work.size // 8)
-    while True:
-        buffer = np.empty(capacity, dtype=np.uint8)
-        size = native.library().fhash_encode_labels(
-            work.ctypes.data,
-            count,
-            (ctypes.c_int64 * 4)(*work.shape),
-            *array_arguments(buffer),
+    shape = (ctypes.c_int64 * 4)(*work.shape)
+
+    def encode(buffer: Buffer) -> int:
+        code: int = native.library().fhash_encode_labels(
+            work.ctypes.data, count, shape, *array_arguments(buffer)
         )
-        if checked(size) <= capacity:
-            return buffer[:size].tobytes()
-        capacity = size
+        return code
+
+    return with_room(work.size // 8, encode)
 
 
 def decode_labels(data: bytes | memoryview, count: int, shape: tuple[int, ...]) -> Labels:
@@ -619,19 +634,18 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels]) -> bytes:
         levels: two levels of each vertex, 0 to 31 and 0 to 15, uint8, from `MaskLevels.levels`.
     """
     bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
-    capacity = max(4096, mask.size // 8)
-    while True:
-        buffer = np.empty(capacity, dtype=np.uint8)
-        size = native.library().fhash_encode_mask(
+
+    def encode(buffer: Buffer) -> int:
+        code: int = native.library().fhash_encode_mask(
             *(array.ctypes.data for array in (bits, first, second)),
             (ctypes.c_int64 * 4)(*mask.shape),
             *state_arguments(mask_prior_state()),
             False,  # the state is not kept
             *array_arguments(buffer),
         )
-        if checked(size) <= capacity:
-            return buffer[:size].tobytes()
-        capacity = size
+        return code
+
+    return with_room(mask.size // 8, encode)
 
 
 def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:

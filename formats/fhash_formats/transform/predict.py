@@ -15,7 +15,14 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.arrays import Integers, Mask, Values
-from fhash_formats.transform.coder import State, array_arguments, checked, state_arguments
+from fhash_formats.transform.coder import (
+    Buffer,
+    State,
+    array_arguments,
+    checked,
+    state_arguments,
+    with_room,
+)
 from fhash_formats.transform.values import pieces
 
 CLASSES = 16
@@ -279,20 +286,20 @@ def encode_predicted(
         predictor: the passes and their weights.
     """
     marks = None if counted is None else np.ascontiguousarray(counted, dtype=np.uint8)
-    capacity = max(4096, integers.size)
-    while True:
-        buffer = np.empty(capacity, dtype=np.uint8)
-        result = np.array(integers, dtype=np.int32, order="C")
-        size = native.library().fhash_encode_predicted(
+    result = np.empty(integers.shape, dtype=np.int32)
+
+    def encode(buffer: Buffer) -> int:
+        np.copyto(result, integers)
+        code: int = native.library().fhash_encode_predicted(
             result.ctypes.data,
             None if marks is None else marks.ctypes.data,
             *_geometry(integers.shape, predictor),
             *state_arguments(blank_state()),
             *array_arguments(buffer),
         )
-        if checked(size) <= capacity:
-            return buffer[:size].tobytes(), result
-        capacity = size
+        return code
+
+    return with_room(integers.size, encode), result
 
 
 def decode_predicted(
