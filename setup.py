@@ -40,6 +40,7 @@ GNU_FLAGS = [
     "-fno-trapping-math",
     "-fopenmp-simd",
     "-fvisibility=hidden",
+    "-Wno-psabi",  # functions that take vectors are inlined: no call depends on how one passes them
     "-g0",
 ]
 GNU_LINK_FLAGS = ["-Wl,-s", "-pthread"] if TARGET or sys.platform == "linux" else []

@@ -28,16 +28,14 @@ __asm__(".symver log,log@GLIBC_2.2.5");
 __asm__(".symver log2,log2@GLIBC_2.2.5");
 #endif
 
-namespace {
+// Made once for the whole library, when it is loaded.
+namespace fhash {
 
 using std::int16_t;
 using std::int32_t;
-using std::int64_t;
 using std::max;
 using std::min;
 using std::uint16_t;
-using std::uint32_t;
-using std::uint64_t;
 using std::uint8_t;
 
 const int STRETCH_MAX = 2816;  // largest logit, in 1/256: 11
@@ -83,7 +81,33 @@ struct Tables {
         }
     }
 };
-const Tables tables;
+inline const Tables tables;
+
+}  // namespace fhash
+
+namespace {
+
+using std::int16_t;
+using std::int32_t;
+using std::int64_t;
+using std::max;
+using std::min;
+using std::uint16_t;
+using std::uint32_t;
+using std::uint64_t;
+using std::uint8_t;
+
+using namespace fhash;
+
+// Stands for an Encoder where only the bits count, in 1/2048.
+struct Counter {
+    int64_t bits = 0;
+
+    FHASH_INLINE int code(int bit, uint32_t p) {
+        bits += tables.cost[bit ? p : 65536 - p];
+        return bit;
+    }
+};
 
 // An estimate that is mixed: the probability of a 1 by the slow and by the fast rate, and the
 // number of observations, at most SLOW_LIMIT.

@@ -42,7 +42,7 @@ TARGETS = tuple(
     )
 )
 SOURCES = (
-    *("coder", "fast", "trellis", "mask", "mask_levels", "predict", "labels"),
+    *("coder", "fast", "fast_v3", "trellis", "mask", "mask_levels", "predict", "labels"),
     *("lifting", "head", "quantise", "values", "crc32c"),
 )
 """Files of NATIVE that are always fuzzed."""
