@@ -200,6 +200,9 @@ class Tiling:
     """Bytes of the tilings that were tried, at the quality of the first."""
     parts: list[Shape] = field(default_factory=list)
     """Shapes of the parts that the tilings were tried on; none for the whole series."""
+    found: tuple[TileSettings, Outcome] | None = None
+    """Settings of these tiles, with a good transform and step, and what was foretold of them; None
+    where the whole series was not tried with them."""
 
     @property
     def best(self) -> Shape | None:

@@ -36,6 +36,7 @@ from fhash_codec.compact.transform import (
     adapted_transform,
     basis_bytes,
     choose_transform,
+    moved_transform,
     refit,
     tile_costs,
     usual_transform,
@@ -301,6 +302,10 @@ TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
 COMPARED_VERTICES = 1 << 20
 """Vertices of the tiles on which the two coders are compared; one tile may have more."""
+COMPARED_QUICKLY = 1 << 18
+"""The same of parts of tiles, where seconds count."""
+SMALL_PARTS = 0.07
+"""Share of the bytes by which the fast coder may seem worse on such small parts: it is not."""
 PRICED_VERTICES = 1 << 20
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
@@ -371,8 +376,11 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     else:
         skip("tiles", f"--tile {task.config.tile}")
     settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
+    if attempt.quick and tiling is not None and tiling.found is not None:
+        settings, outcome = tiling.found
+        attempt = replace(attempt, outcome=outcome)
     with stage("sample", SAMPLE_WHY):
-        sample = _sample(task, tiled, settings, TRIAL_VERTICES)
+        sample = _sample(task, tiled, settings, vertices_of_trials(attempt.quick))
     # Tiles were chosen about the mean: about the plateau of a shock wave their trials misled.
     plateau = plateau_center(sample, task.value_range)
     settings = settings if plateau is None else replace(settings, center=plateau)
@@ -419,7 +427,9 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, vertices)
-    found, _ = choose_transform(priced(small, usual, task.config.effort), usual, coding)
+    trials = priced(small, usual, task.config.effort)
+    first = usual if not attempt.quick else moved_transform(trials, attempt.settings)
+    found, _ = choose_transform(trials, first, coding, coded=_is_coded(task, attempt))
     trials = priced(sample, attempt.settings, task.config.effort)
     return adapted_transform(trials, attempt.settings, found.transform.axes, coding)
 
@@ -467,13 +477,20 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         fast, tried = _has_fast_coder(task, attempt), attempt.coding.fast
         attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
-        if fast and attempt.quick:
-            slope = task.slope.slope
-            step = step_after(attempt.settings, attempt.outcome, task.goal, slope)
-            attempt = replace(attempt, settings=replace(attempt.settings, step=step))
-        if not fast and allows_trellis(attempt.settings, task.goal, task.config.effort):
+        on = allows_trellis(attempt.settings, task.goal, task.config.effort)
+        if fast and attempt.quick and task.goal.psnr is not None:
+            step = step_after(attempt.settings, attempt.outcome, task.goal, task.slope.slope)
+            settings, coding = replace(attempt.settings, step=step), attempt.coding
+            if on:
+                settings, coding = on_trellis(settings, coding)
+            attempt = replace(attempt, settings=settings, coding=coding)
+        elif on:
             settings, coding, outcome = choose_quantiser(
-                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
+                _searched_sample(task, attempt),
+                attempt.settings,
+                attempt.coding,
+                task.goal,
+                fast=tried,
             )
             attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
         return _searched_step(task, attempt)
@@ -486,18 +503,31 @@ def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
         return False
     if task.config.effort == 1:
         return True
-    part = attempt.sample.narrowed(COMPARED_VERTICES)
-    fast = part.run(settings, goal.bounded(replace(attempt.coding, fast=True)))
-    coding = replace(attempt.coding, fast=False)
+    part, coding = attempt.sample.narrowed(COMPARED_VERTICES), attempt.coding
+    if attempt.quick:
+        parts = task.blocks.retile(sub_tile(part.blocks.tile, COMPARED_QUICKLY))
+        usual = replace(settings, transform=usual_transform(parts.tile))
+        part = _sample(task, parts, usual, COMPARED_QUICKLY)
+        settings = moved_transform(part, settings)
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
+    fast = part.run(settings, goal.bounded(replace(coding, fast=True)))
+    coding = replace(coding, fast=False)
     mixed = part.run(settings, goal.bounded(coding))
     size = float(mixed.size)
     if goal.error is None and goal.data_range > 0 and mixed.squares and fast.squares:
         better = fast.psnr(goal.data_range) - mixed.psnr(goal.data_range)
         size *= 2 ** (better / EXCHANGE)
     tell("step", f"the fast coder takes {fast.size / max(size, 1.0):.3f} times the bytes")
-    return fast.size <= FAST_BYTES[access] * size
+    most = FAST_BYTES[access] + (SMALL_PARTS if attempt.quick else 0.0)
+    return fast.size <= most * size
+
+
+def _searched_sample(task: PlanTask, attempt: Attempt) -> Sample:
+    """Return the tiles on which a step is searched: few under a bound, where each keeps it."""
+    if attempt.quick and task.goal.error is not None:
+        return attempt.sample.narrowed(COMPARED_VERTICES)
+    return attempt.sample
 
 
 def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -508,31 +538,36 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     precision = _precision(task, attempt)
     if not attempt.quick and not _without_head(task, attempt):
         precision = NEAR
+    settings, fitted = attempt.settings, None
+    if attempt.quick:
+        settings, fitted = refit(sample, settings), settings.step
     settings, outcome = find_step(
-        sample,
-        attempt.settings,
+        _searched_sample(task, attempt),
+        settings,
         coding,
         goal,
         tries=tries,
         tried=tried,
         precision=precision,
     )
+    if attempt.quick and goal.error is not None:
+        outcome = sample.run(settings, goal.bounded(coding))
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)
         settings = _with_mask(task, sample, settings, error)
     for _ in range(REFITS):
         # A basis is as precise as the step that it was made for needs: a finer step needs another.
+        if fitted is not None and abs(math.log(settings.step / fitted)) < SAME_STEP:
+            break
         refitted = refit(sample, settings)
         if refitted is settings:
             break
-        step_before, before = settings.step, (settings, outcome)
+        fitted, before = settings.step, (settings, outcome)
         settings, outcome = find_step(
             sample, refitted, coding, goal, tried=tried, precision=precision
         )
         if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
             settings, outcome = before
-            break
-        if abs(math.log(settings.step / step_before)) < SAME_STEP:
             break
     if task.config.effort > 1:
         task.gains.note("transform by trial", outcome)
@@ -682,6 +717,12 @@ def _with_mask(
     return replace(settings, mask=levels)
 
 
+def _is_coded(task: PlanTask, attempt: Attempt) -> bool:
+    """Whether the best transforms by price are coded by the mixing coder, which may be used."""
+    slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
+    return not (attempt.quick and slow)
+
+
 def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose the transform by trial, and the step that keeps the promise with it."""
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
@@ -692,7 +733,12 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)
-        settings, _ = choose_transform(trials, attempt.settings, goal.bounded(coding))
+        settings, _ = choose_transform(
+            trials, attempt.settings, goal.bounded(coding), coded=_is_coded(task, attempt)
+        )
+    tiling = attempt.tiling
+    if attempt.quick and goal.psnr is not None and tiling is not None and tiling.found is not None:
+        return replace(attempt, settings=settings)  # the step is that of all tiles already
     tries, slope = (2, task.slope) if attempt.quick else (4, None)
     near = replace(NEAR, slope=slope)
     settings, outcome = find_step(sample, settings, coding, goal, tries=tries, precision=near)

@@ -23,10 +23,12 @@ from fhash_codec.compact.attempt import (
 )
 from fhash_codec.compact.goal import EXCHANGE, exchange, step_after_gain
 from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced, strata
-from fhash_codec.compact.step import find_step
+from fhash_codec.compact.step import find_step, step_after
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
+    FITTED_LINES,
     MAX_BASIS_LENGTH,
+    MIN_LINES,
     basis_bytes,
     refit,
     rough_transform,
@@ -40,10 +42,6 @@ from fhash_formats.transform.tile_format import Shape, TileSettings
 
 PICKED_VERTICES = 1 << 19
 """Vertices coded for each trial of a transform."""
-FITTED_LINES = 1 << 15
-"""Lines of a series that the data's own bases are fitted on, for trials."""
-MIN_LINES = 256
-"""The least of them in each tile."""
 ENTRY_BYTES = 16
 """Bytes of the directory of a file for each tile."""
 MIN_EXCHANGE = 2.0
@@ -59,9 +57,12 @@ MOST_MISSING = 6.0
 class Trials:
     """Tilings of a series, or of parts of it, coded at one step.
 
+    Where the fast coder is used for trials, they are priced by it instead.
+
     Attributes:
         shape: of the series, or of each part.
         sizes: bytes of the series at equal quality by tiling, in the order of the trials.
+        found: settings of each of them, and their outcome.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class Trials:
         self._psnr: float | None = None
         self._settled: list[Outcome] = []
         self.sizes: dict[Shape, float] = {}
+        self.found: dict[Shape, tuple[TileSettings, Outcome]] = {}
 
     def size(self, tile: Shape) -> float:
         """Return the bytes of the series with a tile, which is coded if it was not before."""
@@ -80,7 +82,7 @@ class Trials:
             settings, tried = self._settings, None
             if not settings.labels:
                 settings, tried = self._picked(tile)
-            sample = self._sample(tile, 1 << 62)
+            sample = self._whole(tile)
             outcome = tried or sample.run(settings, self._coding)
             missing = self._missing(outcome)
             if abs(missing) > FAR and self._coding.error is None and not settings.labels:
@@ -104,18 +106,29 @@ class Trials:
             return settings
         if in_space is not None:
             self._picked(in_space)
-        found, _ = self._picked(self.shape)
+        found, tried = self._picked(self.shape)
         coding = self._coding
         if self.shape != self._task.blocks.shape:
             # A part coded without its bound seems cheap, and wins. With it columns of many steps
             # win under loose bounds, where they took 1.7 times the bytes (a shock within 5 %).
             coding = replace(coding, error=None)
-        sample = self._sample(self.shape, 1 << 62)
-        found, outcome = find_step(sample, found, coding, goal, tries=2, tried=self._settled)
-        # Bases made for the finer step of the first guess would take too many bytes beside others.
-        refitted = refit(sample, found)
-        if refitted is not found:
-            found, outcome = refitted, sample.run(refitted, coding)
+        sample = self._whole(self.shape)
+        if coding.fast and goal.psnr is not None:
+            outcome = tried or sample.run(found, coding)
+            slope = self._task.slope
+            slope.restart()
+            slope.note(found.step, outcome.psnr(goal.data_range))
+            self._settled.append(outcome)
+            found = refit(sample, replace(found, step=step_after(found, outcome, goal)))
+            outcome = sample.run(found, coding)
+            slope.note(found.step, outcome.psnr(goal.data_range))
+            self._settled.append(outcome)
+        else:
+            found, outcome = find_step(sample, found, coding, goal, tries=2, tried=self._settled)
+            # Bases made for the finer step of the first guess would take too many bytes.
+            refitted = refit(sample, found)
+            if refitted is not found:
+                found, outcome = refitted, sample.run(refitted, coding)
         self._settings = replace(found, transform=settings.transform)
         self._note(sample, outcome, found)
         return self._settings
@@ -133,8 +146,15 @@ class Trials:
         )
         for axis in (0, 1):
             self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
-        # Prices of tilings are too far apart from their bytes, where tiles are few or small.
-        return settings, tried if sample.complete and trials is sample else None
+        same = trials is sample or (self._coding.fast and self._task.goal.error is None)
+        return settings, tried if sample.complete and same else None
+
+    def _whole(self, tile: Shape) -> Sample:
+        """Return all tiles, priced where the fast coder is used and residuals are not."""
+        sample = self._sample(tile, 1 << 62)
+        if not self._coding.fast or self._task.goal.error is not None:
+            return sample
+        return priced(sample, self._settings, self._task.config.effort)
 
     def _sample(self, tile: Shape, vertices: int) -> Sample:
         blocks = self._blocks.retile(tile)
@@ -158,6 +178,7 @@ class Trials:
             size *= 2 ** (self._missing(outcome) / self._exchange())
         size += ENTRY_BYTES * sum(sample.weights) + basis_bytes(settings.transform)
         self.sizes[sample.blocks.tile] = size
+        self.found[sample.blocks.tile] = settings, outcome
 
     def _missing(self, outcome: Outcome) -> float:
         """Return the dB that an outcome is worse by than the first one."""
@@ -233,7 +254,13 @@ def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access
         return Tiling(tile=shape, price=1.0)
     prices = _Prices(task, settings, coding, candidates)
     tile = _search(prices, access, shape)
-    return Tiling(tile=tile, price=prices.price(tile), trials=prices.sizes, parts=prices.parts)
+    return Tiling(
+        tile=tile,
+        price=prices.price(tile),
+        trials=prices.sizes,
+        parts=prices.parts,
+        found=None if prices.parts else prices.base.found.get(tile),
+    )
 
 
 class _Prices:
@@ -243,6 +270,7 @@ class _Prices:
     steps and as much space, which fits both.
 
     Attributes:
+        base: trials on the series, or on its parts with all of space.
         sizes: bytes of the series by tiling that was tried, in the order of the trials.
         parts: shapes of the parts; none where the whole series is tried.
     """
@@ -265,8 +293,8 @@ class _Prices:
         slab = None if longest is None else _slab(self.candidates, blocks.shape)
         if longest is not None:
             in_time = in_space = _few_steps(longest, blocks.shape)
-        self._base = Trials(task, blocks, self._settings, coding)
-        self._settings = self._base.settle(in_space)
+        self.base = Trials(task, blocks, self._settings, coding)
+        self._settings = self.base.settle(in_space)
         # The error of the first one is what the others are compared at.
         for tile in (blocks.shape, in_space, slab, in_time, longest):
             if tile is not None:
@@ -286,10 +314,10 @@ class _Prices:
     def size(self, tile: Shape) -> float:
         """Return the bytes of the series with a tile, which is tried if it was not before."""
         if tile not in self.sizes:
-            if _fits(tile, self._base.shape):
-                self.sizes[tile] = self._base.size(tile)
+            if _fits(tile, self.base.shape):
+                self.sizes[tile] = self.base.size(tile)
             else:
-                few, column = _few_steps(tile, self._base.shape), self._column(tile)
+                few, column = _few_steps(tile, self.base.shape), self._column(tile)
                 self.sizes[tile] = self.size(few) * column.size(tile) / column.size(few)
         return self.sizes[tile]
 

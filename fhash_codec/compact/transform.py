@@ -46,6 +46,10 @@ def gram_of(planes: npt.NDArray[Any], center: float) -> Gram:
 
 
 Result = TypeVar("Result")
+FITTED_LINES = 1 << 15
+"""Lines of a series that the data's own bases are fitted on, where they are only priced."""
+MIN_LINES = 256
+"""The least of them in each tile."""
 MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 
@@ -138,6 +142,16 @@ def _some_lines(
     return planes
 
 
+def lines_of_trials(sample: TileSample) -> int | None:
+    """Return the lines of each tile that bases are fitted on for trials; None for all.
+
+    Those of a priced sample are made anew when they are chosen (`refit`).
+    """
+    if not isinstance(sample, PricedSample):
+        return None
+    return max(FITTED_LINES // math.prod(sample.blocks.grid), MIN_LINES)
+
+
 class CountedBases(Bases):
     """Bases that are counted and not fitted.
 
@@ -198,7 +212,12 @@ def usual_transform(shape: Shape) -> TransformSpec:
 
 
 def choose_transform(
-    sample: TileSample, settings: TileSettings, coding: Coding, *, quick: bool = False
+    sample: TileSample,
+    settings: TileSettings,
+    coding: Coding,
+    *,
+    quick: bool = False,
+    coded: bool = True,
 ) -> tuple[TileSettings, float]:
     """Return settings with the transform of the lowest J on the sample, and that J.
 
@@ -206,9 +225,10 @@ def choose_transform(
 
     quick: tries only the kinds of the settings, the usual ones, and the data's own bases in the
         plane and along z.
+    coded: whether the best ones by price are coded.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = Bases(sample, settings)
+    bases = Bases(sample, settings, lines_of_trials(sample))
     if quick:
         trials = _quick_trials(shape, settings.transform.axes, bases)
         lowest, axes = _cheapest(sample, settings, trials, coding)
@@ -235,7 +255,7 @@ def choose_transform(
         all_tried += [(cost, axes) for cost, axes, _ in tried]
         # min takes the first of several that are alike
         lowest, axes = min([(lowest, axes), *all_tried], key=itemgetter(0))
-    if isinstance(sample, PricedSample):
+    if coded and isinstance(sample, PricedSample):
         best = [axes for _, axes in sorted(all_tried, key=itemgetter(0))[:CODED]]
         # Prices are those of the fast coder; the other one finds much more in some transforms.
         slow = replace(coding, fast=False)
@@ -305,18 +325,8 @@ def adapted_transform(
     found: the transforms along (t, z, y, x); bases among them are made anew for the sample.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = Bases(sample, settings)
-    axes = _changed(
-        found,
-        {
-            axis: (
-                bases.along(axis)
-                if transform.basis is not None and bases.possible(shape[axis])
-                else _fitted(transform, shape[axis])
-            )
-            for axis, transform in enumerate(found)
-        },
-    )
+    bases = Bases(sample, settings, lines_of_trials(sample))
+    axes = _of_shape(found, shape, bases)
     usual = usual_transform(shape).axes
     trials = [axes]
     if axes[3].basis is not None:
@@ -326,6 +336,28 @@ def adapted_transform(
     if len(trials) > 1:
         axes = _cheapest(sample, settings, trials, coding)[1]
     return _along(settings, axes)
+
+
+def moved_transform(sample: TileSample, settings: TileSettings) -> TileSettings:
+    """Return settings with the same kinds of transforms for the tiles of a sample."""
+    bases = Bases(sample, settings, lines_of_trials(sample))
+    axes = _of_shape(settings.transform.axes, sample.tiles[0].values.shape, bases)
+    return _along(settings, axes)
+
+
+def _of_shape(axes: Axes, shape: Shape, bases: Bases) -> Axes:
+    """Return transforms of the same kinds for a shape, with bases that are made anew."""
+    return _changed(
+        axes,
+        {
+            axis: (
+                bases.along(axis)
+                if transform.basis is not None and bases.possible(shape[axis])
+                else _fitted(transform, shape[axis])
+            )
+            for axis, transform in enumerate(axes)
+        },
+    )
 
 
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:

@@ -20,9 +20,11 @@ from reference.bands import Band
 from reference.labels import number_in
 
 LANES, BLOCK, LEVELS = 8, 16, 24
+MAGNITUDES = 8 * LEVELS
+"""Contexts of magnitudes of the plain quantiser, and of each of the two of a trellis after them."""
 FIRST = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 15, 23, 39, 71, 135)
 """Smallest magnitude of each token."""
-OF_SIGNS, NOTHING = 8 * LEVELS, 8 * LEVELS + 16
+OF_SIGNS, NOTHING = 3 * MAGNITUDES, 3 * MAGNITUDES + 16
 """First context of signs, and that of a place where there is nothing to code."""
 FLAG_CLASSES = 14
 BANDS, ROWS, SHIFTS, BLOCKS = 0, 1, 3, 8
@@ -39,6 +41,8 @@ REFERENCES = ((4, 1), (12, 2), (4, 0), (3, 1))
 """Weight of the vertex of each reference, and of those on both sides."""
 SIDE = 16
 """Weight of the vertices to the left and right of an odd place."""
+NEXT = ((0, 5, 1, 6, 2, 4, 3, 7), (2, 7, 3, 4, 0, 6, 1, 5))
+"""State of a lane after an even and an odd index, by the state before."""
 PAD = 2
 """Zeros around a band along t, z and y; along x there is a block."""
 
@@ -69,7 +73,8 @@ class BandNumbers:
 class FastDecoder:
     """The integers in some bytes."""
 
-    def __init__(self, data: bytes | memoryview) -> None:
+    def __init__(self, data: bytes | memoryview, trellis: bool) -> None:
+        self.trellis, self.lane_states = trellis, [0] * LANES
         size, data = number_in(memoryview(data))
         self.flags = Adaptive(data[:size], 0, [], BLOCKS + 4 * FLAG_CLASSES)
         size, data = number_in(data[size:])
@@ -78,7 +83,15 @@ class FastDecoder:
         self.states = np.frombuffer(self.words.ljust(4 * LANES, b"\0"), "<u4", LANES).tolist()
         prior = fast_prior()
         # One in 64 distributions of tokens, or of signs, unless it is the usual one.
-        chosen = [self.take(6) if self.take(1) else int(usual) for usual in prior.defaults]
+        chosen = prior.defaults.tolist()
+        any_chosen = 0
+        for context in range(NOTHING):
+            if context < OF_SIGNS and (context >= MAGNITUDES) != trellis:
+                continue
+            if context % LEVELS == 0:
+                any_chosen = self.take(1)
+            if any_chosen and self.take(1):
+                chosen[context] = self.take(6)
         self.at = -(-self.at // 8) * 8
         numbers = [n + 64 * (context >= OF_SIGNS) for context, n in enumerate(chosen)] + [128]
         self.slots = [prior.slots[number].tolist() for number in numbers]
@@ -201,7 +214,7 @@ class FastDecoder:
         number = 0
         if near and sums.sum():
             octaves = half_octaves(np.float32(sums.sum()) * scale) - 2 * (127 - 3) + 1
-            number = clamp(octaves, 1, FLAG_CLASSES)
+            number = clamp(octaves, 1, FLAG_CLASSES - self.trellis)
         if number < FLAG_CLASSES:
             flag = BLOCKS + (group > 0) * 2 * FLAG_CLASSES + 2 * number + before
             if not self.flags.simple(flag):
@@ -226,9 +239,12 @@ class FastDecoder:
                 clamp(half_octaves(np.float32(s) * scale) - 2 * (127 - 5) + 1, 0, LEVELS - 1)
                 for s in total.tolist()
             ]
+            quantisers = [self.trellis and state & 1 for state in self.lane_states]
             contexts = [
-                (2 * group + parity) * LEVELS + level if i < inside else NOTHING
-                for i, level in zip(x, levels, strict=True)
+                (2 * group + parity) * LEVELS + level + (self.trellis + quantiser) * MAGNITUDES
+                if i < inside
+                else NOTHING
+                for i, level, quantiser in zip(x, levels, quantisers, strict=True)
             ]
             tokens = self.symbols(contexts)
             low = [band.shift + max(level - 13 >> 1, 0) for level in levels]
@@ -238,6 +254,10 @@ class FastDecoder:
             ]
             sign = self.signs(band.band.kind, parity, found, around, odds[parity])
             values[x] = np.array(found) * sign
+            if self.trellis:
+                values[x] = (2 * np.abs(values[x]) - quantisers) * sign
+                for lane in np.flatnonzero(x < inside):
+                    self.lane_states[lane] = NEXT[found[lane] & 1][self.lane_states[lane]]
             magnitudes[x] = np.minimum(np.array(found) >> band.shift, 255)
             signs[x] = sign
         band.row(band.filled, *place)[block + 1] = bool(values.any())
@@ -248,7 +268,7 @@ class FastDecoder:
         high = token
         if token == 15:
             bits = 7
-            while not self.take(1):
+            while bits < 37 and not self.take(1):
                 bits += 1
             high = FIRST[15] + (1 << bits) + self.take(bits) - 128
         elif token > 8:
@@ -285,7 +305,7 @@ class FastDecoder:
 
 
 def decode_fast(
-    data: bytes | memoryview, shape: Sequence[int], bands: Sequence[Band]
+    data: bytes | memoryview, shape: Sequence[int], bands: Sequence[Band], trellis: bool = False
 ) -> npt.NDArray[np.int32]:
-    """Integers (t, z, y, x) of a shape, coded by the fast coder."""
-    return FastDecoder(data).decode(shape, bands)
+    """Integers (t, z, y, x) of a shape, coded by the fast coder; those of a trellis or not."""
+    return FastDecoder(data, trellis).decode(shape, bands)

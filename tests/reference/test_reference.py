@@ -168,7 +168,7 @@ def tiles(draw: Draw) -> tuple[Any, TileSettings, Coding, Any]:
         weight=draw(st.sampled_from([0.0, 0.09])),
         error=error,
         own_settings=draw(st.booleans()),
-        fast=not trellis and draw(st.booleans()),
+        fast=draw(st.booleans()),
     )
     return values, settings, coding, mask
 

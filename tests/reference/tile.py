@@ -188,7 +188,7 @@ def transformed(stream: Stream) -> tuple[Values, Values]:
     bands = bands_of(settings["axes"], shape)
     body = stream.sections["body"]
     integers = (
-        decode_fast(body, shape, bands)
+        decode_fast(body, shape, bands, settings["trellis"])
         if stream.fast
         else decode_integers(body, shape, bands, settings["trellis"])
     )

@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 14
+ABI_VERSION = 15
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -82,8 +82,20 @@ PROTOTYPES: Prototypes = {
     ),
     "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
     # fast.cpp
-    "fhash_fast_encode": (ARRAY, ARRAY, REAL, REAL, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED, ARRAY),
-    "fhash_fast_decode": (ARRAY, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED),
+    "fhash_fast_encode": (
+        ARRAY,
+        ARRAY,
+        INTEGER,
+        REAL,
+        REAL,
+        ARRAY,
+        *_SIZED,
+        ARRAY,
+        ARRAY,
+        *_SIZED,
+        ARRAY,
+    ),
+    "fhash_fast_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, ARRAY, ARRAY, *_SIZED),
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),

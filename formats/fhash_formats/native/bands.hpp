@@ -23,6 +23,11 @@ struct BandPlace {
     Reference references[REFERENCE_COUNT];
 };
 
+// State of a trellis of two quantisers that follows, by the lowest bit of the index; the quantiser
+// of a state is its lowest bit. Index k is 2 k steps in the first one, and 2 k - 1 in the other.
+constexpr std::uint8_t TRELLIS_NEXT[8][2] = {{0, 2}, {5, 7}, {1, 3}, {6, 4},
+                                             {2, 0}, {4, 6}, {3, 1}, {7, 5}};
+
 // Read the table of as many bands as there are. False for a band that does not lie within the
 // shape.
 template <class Band>

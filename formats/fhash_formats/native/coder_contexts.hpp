@@ -84,9 +84,6 @@ struct Classes {
 const Classes classes;
 FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
 
-// State of the trellis that follows, by the lowest bit of the index; the class of a state is its
-// lowest bit.
-const uint8_t TRELLIS_NEXT[8][2] = {{0, 2}, {5, 7}, {1, 3}, {6, 4}, {2, 0}, {4, 6}, {3, 1}, {7, 5}};
 const int NO_TRELLIS = -3;  // an integer that the quantiser of its state does not have
 
 // The state after n zeros, which repeat after at most four.

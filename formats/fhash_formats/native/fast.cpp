@@ -26,25 +26,28 @@ Decode* decoder() { return fhash_fast_decode_baseline; }
 // values, scale, weight: null, or what integers are chosen of: values times scale, in steps, where
 // a bit is worth so many squared steps. q receives them, and must be zeros; without q they are
 // priced.
+// trellis: whether integers are chosen on a trellis of two quantisers.
 // table: (count, COLUMNS). slots, defaults: the prior (transform/coder.py).
 // data: receives the bytes if they fit the capacity. If they do not, call again with more room.
 // results: receives the bytes that are foretold, and where integers are chosen the sum of the
 // squared errors, in squared steps.
 //
 // Returns the number of bytes (0 for a price), -1 for a band beyond the shape, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_fast_encode(int32_t* q, const float* values, double scale, double weight,
-                                       const int64_t* shape, const int32_t* table, int64_t count,
-                                       const uint16_t* slots, const uint8_t* defaults,
-                                       uint8_t* data, int64_t capacity, double* results) {
-    return encoder()(q, values, scale, weight, shape, table, count, slots, defaults, data, capacity,
-                     results);
+FHASH_EXPORT int64_t fhash_fast_encode(int32_t* q, const float* values, int64_t trellis,
+                                       double scale, double weight, const int64_t* shape,
+                                       const int32_t* table, int64_t count, const uint16_t* slots,
+                                       const uint8_t* defaults, uint8_t* data, int64_t capacity,
+                                       double* results) {
+    return encoder()(q, values, trellis, scale, weight, shape, table, count, slots, defaults, data,
+                     capacity, results);
 }
 
-// Decode integers into q, which must be zeros. lookup: (CERTAIN + 1, SLOTS) of the prior.
+// Decode integers into q, which must be zeros. trellis: whether they are those of one. lookup:
+// (CERTAIN + 1, SLOTS) of the prior.
 //
 // Returns 0, or -1 for bytes that no encoder writes and for a band beyond q, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_fast_decode(int32_t* q, const int64_t* shape, const int32_t* table,
-                                       int64_t count, const uint8_t* defaults,
+FHASH_EXPORT int64_t fhash_fast_decode(int32_t* q, int64_t trellis, const int64_t* shape,
+                                       const int32_t* table, int64_t count, const uint8_t* defaults,
                                        const uint32_t* lookup, const uint8_t* data, int64_t size) {
-    return decoder()(q, shape, table, count, defaults, lookup, data, size);
+    return decoder()(q, trellis, shape, table, count, defaults, lookup, data, size);
 }

@@ -80,9 +80,14 @@ const int SIGNS = 5;         // signs that predict one: above, below, before, to
 const int SIGN_LEVELS = 16;  // half octaves of the odds of a sign
 const int SIGN_SHIFT = 3;    // from 16ths of octaves
 
-// Contexts: of magnitudes by group, parity and level, then of signs; the last one is of nothing.
-const int OF_SIGNS = GROUPS * 2 * LEVELS, CONTEXTS = OF_SIGNS + SIGN_LEVELS;
-const int NOTHING = CONTEXTS;
+// Contexts: of magnitudes by group, parity and level, once for the plain quantiser and once for
+// each of the two of a trellis; then of signs; the last one is of nothing.
+const int MAGNITUDES = GROUPS * 2 * LEVELS, OF_SIGNS = 3 * MAGNITUDES;
+const int CONTEXTS = OF_SIGNS + SIGN_LEVELS, NOTHING = CONTEXTS;
+// Whether a context is one of the plain quantiser, or of a trellis; those of signs are of both.
+FHASH_INLINE bool is_used(int context, bool trellis) {
+    return context >= OF_SIGNS || (context >= MAGNITUDES) == trellis;
+}
 // Distributions of the prior: of tokens, and then of signs; the last one is that of nothing.
 const int CHOICES = 64, CERTAIN = 2 * CHOICES;
 const int CHOICE_BITS = 6;
@@ -174,6 +179,17 @@ template <class Vector> FHASH_INLINE Vector odds(Vector a, Vector b) {
     return Vector{a[1], a[3], a[5], a[7], b[1], b[3], b[5], b[7]};
 }
 
+// States of a trellis after some indices (bands.hpp): eight of three bits, four bits apart.
+FHASH_INLINE Ints states_after(Ints states, Ints indices) {
+    uint32_t next[2] = {};
+    for (int state = 0; state < 8; state++)
+        for (int odd = 0; odd < 2; odd++)
+            next[odd] |= (uint32_t)TRELLIS_NEXT[state][odd] << (4 * state);
+    const Ints even = (Ints)((Words{} + next[0]) >> (Words)(4 * states));
+    const Ints odd = (Ints)((Words{} + next[1]) >> (Words)(4 * states));
+    return ((indices & 1) ? odd : even) & 7;
+}
+
 // Half octaves of numbers that are not negative, from an origin far below.
 FHASH_INLINE Ints half_octaves(Floats numbers) { return (Ints)numbers >> 22; }
 FHASH_INLINE Ints levels_of(Floats means) {
@@ -194,13 +210,17 @@ struct Half {
     Ints levels, contexts, low;  // low: bits of a magnitude that are left raw
     Ints foretold, odds;         // of signs: 1 for a negative one, and its context
     Ints magnitudes, signs;      // what is coded; 0 is the sign of 0
+    Ints quantisers;             // of a trellis: 0 or 1
 };
 
 // The way through the bands. Self codes: it has `look_at` a band before its flag, `some_in_row` and
-// `some_in_block` that say what flags are to be, `begin_block`, `code_half` and `end_block`.
+// `some_in_block` that say what flags are to be, `begin_block`, `code_half` and `end_block`. If it
+// GUESSES, it stays in the first state of a trellis.
 template <class Self, class Range> struct Lattice {
     const int64_t* shape;
     const Prior& prior;
+    const bool trellis;
+    Ints states = {};  // of the trellis: each lane has its own
     std::vector<Band> bands;
     Range range;
     Simple flags[FLAGS];
@@ -230,8 +250,8 @@ template <class Self, class Range> struct Lattice {
     // Of signs of the row, by parity: how often one was that around it, and 2^16 for each other.
     Ints same[2][SIGNS];
 
-    Lattice(const int64_t* of, const Prior& with, size_t count, Range flag_coder)
-        : shape(of), prior(with), bands(count), range(flag_coder) {
+    Lattice(const int64_t* of, const Prior& with, bool on_trellis, size_t count, Range flag_coder)
+        : shape(of), prior(with), trellis(on_trellis), bands(count), range(flag_coder) {
         for (Simple& flag : flags) flag = {32768, 0};
     }
 
@@ -449,7 +469,8 @@ template <class Self, class Range> struct Lattice {
             const int total = sum(places(sums, 0) + places(sums, 1));
             const Floats mean = Floats{} + (float)total * row.scale[0];  // of 16 vertices
             const int octaves = half_octaves(mean)[0] - 2 * (127 - LOWEST_FLAG) + 1;
-            if (total) flags_of = min(max(octaves, 1), FLAG_CLASSES);
+            // A path through a trellis goes through the blocks that have a flag.
+            if (total) flags_of = min(max(octaves, 1), FLAG_CLASSES - trellis);
         }
         if (flags_of < FLAG_CLASSES) {
             const int context = (row.group > 0) * 2 * FLAG_CLASSES + flags_of * 2 + before;
@@ -467,12 +488,14 @@ template <class Self, class Range> struct Lattice {
         find_contexts(even, places(sums, 0), 0, room);
         foretell_signs<3>(even, signs[0], 0);
         self().code_half(even, 0);
+        step_on(even, 0, room);
         const Ints seen = least(even.magnitudes >> row.shift, all(LARGEST));
         find_contexts(odd, places(sums, 1) + SIDE * (seen + next(seen)), 1, room);
         signs[1][3] = even.signs;
         signs[1][4] = next(even.signs);
         foretell_signs<5>(odd, signs[1], 1);
         self().code_half(odd, 1);
+        step_on(odd, 1, room);
         self().end_block(even, odd, number, room);
         for (int n = 0; n < 3; n++) count_signs(signs[0][n], even.signs, same[0][n]);
         for (int n = 0; n < SIGNS; n++) count_signs(signs[1][n], odd.signs, same[1][n]);
@@ -488,11 +511,22 @@ template <class Self, class Range> struct Lattice {
     FHASH_INLINE void find_contexts(Half& half, Ints sums, int parity, int room) const {
         half.levels = levels_of(floats(sums) * row.scale[parity]);
         half.contexts = half.levels + (row.group * 2 + parity) * LEVELS;
+        if (trellis) {
+            half.quantisers = states & 1;
+            half.contexts += (half.quantisers + 1) * MAGNITUDES;
+        }
         half.low = most((half.levels - SHIFTED) >> 1, Ints{}) + row.shift;
         if (room == BLOCK) return;
         const Ints beyond = PLACES + parity >= room;
         half.contexts = beyond ? all(NOTHING) : half.contexts;
         half.low &= ~beyond;
+    }
+
+    // Go on through the trellis, but for places beyond a row.
+    FHASH_INLINE void step_on(const Half& half, int parity, int room) {
+        if (!trellis || Self::GUESSES) return;
+        const Ints after = states_after(states, half.magnitudes);
+        states = PLACES + parity < room ? after : states;
     }
 
     // What the signs around foretell. NEAR: how many are looked at.
@@ -520,10 +554,16 @@ template <class Self, class Range> struct Lattice {
             }
     }
 
+    FHASH_INLINE Ints integers_of(const Half& half) const {
+        Ints units = half.magnitudes;
+        if (trellis) units = (2 * units - half.quantisers) & (units != 0);
+        return units * half.signs;
+    }
+
     // Write the integers of a block.
     FHASH_INLINE void keep_integers(int32_t* q, const Half& even, const Half& odd, int number,
                                     int room) const {
-        const Ints a = even.magnitudes * even.signs, b = odd.magnitudes * odd.signs;
+        const Ints a = integers_of(even), b = integers_of(odd);
         const Ints low = {a[0], b[0], a[1], b[1], a[2], b[2], a[3], b[3]};
         const Ints high = {a[4], b[4], a[5], b[5], a[6], b[6], a[7], b[7]};
         int32_t* const to = q + row.place + (int64_t)BLOCK * number;

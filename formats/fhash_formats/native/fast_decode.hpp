@@ -28,7 +28,7 @@ struct BitsIn {
     }
 };
 
-#if defined(__AVX2__)
+#if defined(FHASH_FAST_V3)
 // By a mask of lanes: how many of them come before each.
 struct Order {
     uint8_t of[1 << LANES][LANES] = {};
@@ -43,6 +43,7 @@ constexpr Order order;  // nothing of this file may run when the library is load
 #endif
 
 struct Reader : Lattice<Reader, Decoder> {
+    static const bool GUESSES = false;
     int32_t* const q;
     BitsIn in;
     Ints state = {};
@@ -50,9 +51,9 @@ struct Reader : Lattice<Reader, Decoder> {
     const uint8_t *word = nullptr, *end = nullptr;
     int32_t lookups[CONTEXTS + 1];  // where the distribution of each context begins
 
-    Reader(int32_t* to, const int64_t* of, const Prior& with, size_t count, Decoder flag_coder,
-           BitsIn bits)
-        : Lattice(of, with, count, flag_coder), q(to), in(bits) {}
+    Reader(int32_t* to, const int64_t* of, const Prior& with, bool on_trellis, size_t count,
+           Decoder flag_coder, BitsIn bits)
+        : Lattice(of, with, on_trellis, count, flag_coder), q(to), in(bits) {}
 
     // What only an encoder knows.
     FHASH_INLINE void look_at(Band&) {}
@@ -61,9 +62,12 @@ struct Reader : Lattice<Reader, Decoder> {
 
     // Begin to read the lanes.
     void begin(const uint8_t* data, int64_t size) {
+        bool any_chosen = false;  // in the group of contexts
         for (int context = 0; context < CONTEXTS; context++) {
             uint32_t choice = prior.defaults[context];
-            if (in.take(1)) choice = in.take(CHOICE_BITS);
+            const bool used = is_used(context, trellis);
+            if (used && context % LEVELS == 0) any_chosen = in.take(1) != 0;
+            if (used && any_chosen && in.take(1)) choice = in.take(CHOICE_BITS);
             const uint32_t first = context < OF_SIGNS ? 0 : CHOICES;
             lookups[context] = (int32_t)((choice + first) << PRECISION);
         }
@@ -113,7 +117,7 @@ struct Reader : Lattice<Reader, Decoder> {
     // Each lane that is low reads a word, in their order.
     FHASH_INLINE void read_words() {
         const Ints needs = (Words)state < LEAST_STATE;
-#if defined(__AVX2__)
+#if defined(FHASH_FAST_V3)
         const int mask = _mm256_movemask_ps((__m256)needs);
         const __m128i places_of = _mm_loadl_epi64((const __m128i*)order.of[mask]);
         const __m256i places = _mm256_cvtepu8_epi32(places_of);
@@ -144,8 +148,9 @@ struct Reader : Lattice<Reader, Decoder> {
         } else if (token >= DIRECT) high = (uint64_t)FIRST[token] + in.take(token - DIRECT + 1);
         low = min(low, MAX_LOW);
         const uint64_t magnitude = high << low | in.take(low);
-        if (magnitude > MAX_INTEGER) in.damaged = true;
-        return (int)min<uint64_t>(magnitude, MAX_INTEGER);
+        const uint64_t largest = trellis ? MAX_INTEGER / 2 : MAX_INTEGER;
+        if (magnitude > largest) in.damaged = true;
+        return (int)min(magnitude, largest);
     }
 };
 
@@ -167,15 +172,15 @@ bool take_section(const uint8_t*& data, int64_t& size, const uint8_t*& section, 
     return true;
 }
 
-FHASH_INLINE int64_t read(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count,
-                          const Prior& prior, const uint8_t* data, int64_t size) {
+FHASH_INLINE int64_t read(int32_t* q, bool trellis, const int64_t* shape, const int32_t* table,
+                          int64_t count, const Prior& prior, const uint8_t* data, int64_t size) {
     const uint8_t *flags, *raw;
     int64_t flag_count, raw_count;
     if (!take_section(data, size, flags, flag_count) || !take_section(data, size, raw, raw_count))
         return -1;
     const Decoder flag_coder(flags, flag_count);
-    const auto reader = std::make_unique<Reader>(q, shape, prior, (size_t)count, flag_coder,
-                                                 BitsIn(raw, raw_count));
+    const auto reader = std::make_unique<Reader>(q, shape, prior, trellis, (size_t)count,
+                                                 flag_coder, BitsIn(raw, raw_count));
     if (!read_bands(table, shape, reader->bands)) return -1;
     reader->begin(data, size);
     reader->run();
@@ -185,11 +190,11 @@ FHASH_INLINE int64_t read(int32_t* q, const int64_t* shape, const int32_t* table
 }  // namespace
 
 // See fast.cpp.
-int64_t FHASH_FAST(decode)(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count,
-                           const uint8_t* defaults, const uint32_t* lookup, const uint8_t* data,
-                           int64_t size) {
+int64_t FHASH_FAST(decode)(int32_t* q, int64_t trellis, const int64_t* shape, const int32_t* table,
+                           int64_t count, const uint8_t* defaults, const uint32_t* lookup,
+                           const uint8_t* data, int64_t size) {
     return guarded([&]() {
         const Prior prior = {nullptr, defaults, lookup};
-        return read(q, shape, table, count, prior, data, size);
+        return read(q, trellis != 0, shape, table, count, prior, data, size);
     });
 }

@@ -1,19 +1,24 @@
 // Encoder of the fast coder (fast.hpp), and its prices.
 //
 // With PRICE nothing is written: the bytes are those that it would take, and by these transforms
-// are compared.
+// are compared. On a trellis of two quantisers, GUESS finds the path through it for each lane, by
+// the contexts that guessed integers have, and FOLLOW writes it.
 #pragma once
+
+#include <tuple>
 
 #include "fast.hpp"
 
 namespace {
 
-enum Mode { PRICE, CHOOSE, ENCODE };  // CHOOSE encodes magnitudes chosen by rate and error
+enum Mode { PRICE, CHOOSE, ENCODE, GUESS, FOLLOW };  // CHOOSE: by rate and error
 
 // A symbol by its context and itself.
 FHASH_INLINE int in_context(int context, int symbol) { return context * TOKENS + symbol; }
 const int SYMBOLS = (CONTEXTS + 1) * TOKENS;
 const float SMALLEST = 0.5F;  // value that may become an integer other than 0
+// The index of a value on a trellis: 0 up to the first one, else half of it and the other.
+const float GUESSED_ZERO = 1.05F, GUESSED_MORE = 0.7F;
 
 // Bits in the order in which they are read, the lowest of a byte first.
 struct BitsOut {
@@ -41,17 +46,159 @@ struct Task {
     const int32_t* table;
     size_t bands;
     const Prior& prior;
+    bool trellis;
+};
+
+// Bits of an index in a context, by the defaults of the prior, with those of its sign.
+float bits_of(const Prior& prior, int context, int index) {
+    const uint16_t* const slots = prior.slots[prior.defaults[context]];
+    const int token = index < DIRECT ? index : min(significant((uint32_t)index - 7) + 7, LAST);
+    const int beside = max(token - DIRECT + 1, 0);
+    const float sign = index > 0;
+    return (float)(PRECISION + beside) - std::log2((float)max<int>(slots[token], 1)) + sign;
+}
+
+// The paths of the lanes through a trellis (Viterbi 1967): those of least squared error and bits to
+// each of its states, and of each place that a path goes through what the way back needs.
+struct Paths {
+    static const int STATES = 8, RATES = 16;  // indices from the last one on have its bits
+    static const int RENEWED = 256;           // places after which the least cost is subtracted
+    struct Places {
+        float sizes[LANES];         // in steps
+        int32_t indices[LANES];     // of the path
+        uint16_t contexts[LANES];   // those of the first quantiser
+        uint8_t odd[STATES];  // lanes whose best path to a state comes by an odd index
+        uint8_t zero[2];      // lanes where 0 is better than 2, by quantiser
+    };
+    std::vector<Places> places;
+    std::vector<uint8_t> marks;  // by block of each band: whether the paths go through it
+    std::vector<std::pair<bool, int>> bands;  // whether a band has any, and its shift
+    float rates[2 * MAGNITUDES][RATES];
+    Floats cost[STATES];
+    size_t taken = 0;  // places that were written
+
+    Paths(const Prior& prior, size_t count, float weight) : bands(count) {
+        for (int context = 0; context < 2 * MAGNITUDES; context++)
+            for (int index = 0; index < RATES; index++) {
+                const bool raw = low_bits(context % LEVELS) > 0;
+                const float bits = raw ? 0.0F : bits_of(prior, MAGNITUDES + context, index);
+                rates[context][index] = weight * bits;
+            }
+        for (Floats& of : cost) of = Floats{} + 1e9F;
+        cost[0] = Floats{};
+    }
+
+    // Go on through places. has_rates: whether bits differ there, since none are left raw.
+    FHASH_INLINE void extend(Floats sizes, Ints contexts, bool has_rates) {
+        Places here;
+        stored(here.sizes, sizes);
+        stored(here.contexts, __builtin_convertvector(contexts, Shorts));
+        const Ints inside = contexts != NOTHING;
+        Floats costs[2][2];  // by quantiser, of the best even and of the best odd index
+        for (int quantiser = 0; quantiser < 2; quantiser++) {
+            const Floats moved = sizes + (float)quantiser;
+            const Ints low = __builtin_convertvector(moved * 0.5F, Ints);
+            const Floats above = moved - 2 * floats(low), below = 2.0F - above;
+            const Floats error = low == 0 ? sizes : above;
+            Floats at_low = error * error, at_high = below * below, at_zero = sizes * sizes;
+            if (has_rates) {
+                const Ints of = inside & (contexts - MAGNITUDES + quantiser * MAGNITUDES);
+                const Ints first = of * RATES, index = first + least(low, all(RATES - 1));
+                const Ints next_index = first + least(low + 1, all(RATES - 1));
+                Floats rate_low, rate_high, rate_zero;
+                for (int i = 0; i < LANES; i++) {
+                    rate_low[i] = rates[0][index[i]];
+                    rate_high[i] = rates[0][next_index[i]];
+                    rate_zero[i] = rates[0][first[i]];
+                }
+                at_low += rate_low;
+                at_high += rate_high;
+                at_zero += rate_zero;
+            }
+            const Ints zero = (low == 1) & (at_zero <= at_high);
+            here.zero[quantiser] = lanes_of(zero);
+            const Ints low_odd = -(low & 1);
+            costs[quantiser][0] = low_odd ? (zero ? at_zero : at_high) : at_low;
+            costs[quantiser][1] = low_odd ? at_low : at_high;
+        }
+        Floats next[STATES];
+        Ints odd[STATES];
+        for (int state = 0; state < STATES; state++) {
+            const int q = state & 1;
+            next[TRELLIS_NEXT[state][0]] = cost[state] + costs[q][0];
+        }
+        for (int state = 0; state < STATES; state++) {
+            const int q = state & 1, to = TRELLIS_NEXT[state][1];
+            const Floats by_odd = cost[state] + costs[q][1];
+            odd[to] = by_odd < next[to];
+            next[to] = odd[to] ? by_odd : next[to];
+        }
+        for (int state = 0; state < STATES; state++) {
+            cost[state] = inside ? next[state] : cost[state];
+            here.odd[state] = lanes_of(odd[state]);
+        }
+        places.push_back(here);
+        if (places.size() % RENEWED == 0) renew();
+    }
+
+    FHASH_INLINE void renew() {
+        Floats lowest = cost[0];
+        for (const Floats& of : cost) lowest = of < lowest ? of : lowest;
+        for (Floats& of : cost) of -= lowest;
+    }
+
+    FHASH_INLINE static uint8_t lanes_of(Ints mask) {
+#if defined(FHASH_FAST_V3)
+        return (uint8_t)_mm256_movemask_ps((__m256)mask);
+#else
+        int lanes = 0;
+        for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
+        return (uint8_t)lanes;
+#endif
+    }
+
+    // Go back along the best paths.
+    FHASH_INLINE void trace() {
+        uint8_t before[STATES][2];
+        for (int state = 0; state < STATES; state++)
+            for (int odd = 0; odd < 2; odd++)
+                before[TRELLIS_NEXT[state][odd]][odd] = (uint8_t)state;
+        int state[LANES];
+        for (int i = 0; i < LANES; i++) {
+            state[i] = 0;
+            for (int other = 1; other < STATES; other++)
+                if (cost[other][i] < cost[state[i]][i]) state[i] = other;
+        }
+        for (size_t n = places.size(); n-- > 0;) {
+            Places& at = places[n];
+            for (int i = 0; i < LANES; i++) {
+                at.indices[i] = 0;
+                if (at.contexts[i] == NOTHING) continue;
+                const int odd = at.odd[state[i]] >> i & 1;
+                state[i] = before[state[i]][odd];
+                const int quantiser = state[i] & 1;
+                const int low = (int)((at.sizes[i] + (float)quantiser) * 0.5F);
+                int index = low + ((low ^ odd) & 1);
+                if (low == 1 && !odd && (at.zero[quantiser] >> i & 1)) index = 0;
+                at.indices[i] = index;
+            }
+        }
+    }
 };
 
 template <Mode MODE>
-using FlagWriter = typename std::conditional<MODE == PRICE, Counter, Encoder>::type;
+using FlagWriter =
+    typename std::conditional<MODE == PRICE || MODE == GUESS, Counter, Encoder>::type;
 
 template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     using Base = Lattice<Writer<MODE>, FlagWriter<MODE>>;
     using Base::row, Base::all_rows, Base::place_of;
 
-    static const bool CHOOSES = MODE == PRICE || MODE == CHOOSE;
+    static const bool CHOOSES = MODE != ENCODE;  // whether there are values
+    static const bool GUESSES = MODE == GUESS;
+    static const bool WRITES = MODE != PRICE && MODE != GUESS;
     const Task& task;
+    Paths* const paths;
     uint32_t counts[SYMBOLS][LANES] = {};  // by lane, so that none waits for the one before
     int64_t raw = 0;                       // bits beside
     double squares = 0;
@@ -60,36 +207,47 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     float lower[CONTEXTS + 1][TOKENS] = {};  // of a magnitude: below it, one less is cheaper
     float zero_of_two[CONTEXTS + 1] = {};    // below it a 2 is worth less than its bits
     std::vector<float> largest;  // value in each block of the band
-    float least_far;             // value that is worth a symbol where all around is 0
+    float least_near, least_far;  // values that are worth a symbol; far: where all around is 0
+    size_t marks = 0, marks_behind = 0;  // of the paths: those before the band, and with it
     Floats rests = {};           // sums of the squared errors of a row
     Ints given[2];               // of the block, by parity: values, as bits of floats, or integers
 
-    Writer(const Task& of, FlagWriter<MODE> flag_coder)
-        : Base(of.shape, of.prior, of.bands, flag_coder), task(of) {}
+    Writer(const Task& of, FlagWriter<MODE> flag_coder, Paths* through)
+        : Base(of.shape, of.prior, of.trellis, of.bands, flag_coder), task(of), paths(through) {}
 
     FHASH_INLINE void run_all() {
-        if (CHOOSES) weigh();
+        if (MODE == PRICE || MODE == CHOOSE) weigh();
         Base::run();
         end_row();
     }
 
     // Bits of the tokens by the defaults of the prior, so that magnitudes can be chosen.
     void weigh() {
-        for (int context = 0; context <= NOTHING; context++) {
-            const int choice = context < OF_SIGNS ? task.prior.defaults[context] : 0;
-            const uint16_t* const slots = task.prior.slots[choice];
-            const int level = context % LEVELS;
+        for (int context = 0; context < MAGNITUDES; context++) {
+            const bool raw_too = low_bits(context % LEVELS) > 0;
             float bits[DIRECT];
             for (int token = 0; token < DIRECT; token++)
-                bits[token] = PRECISION - std::log2((float)max<int>(slots[token], 1)) + (token > 0);
+                bits[token] = bits_of(task.prior, context, token);
             for (int token = 0; token < TOKENS; token++) {
-                const bool raw_too = token == 0 || token >= DIRECT || low_bits(level) > 0;
-                const float more = raw_too ? 0.0F : bits[token] - bits[token - 1];
+                const bool direct = token > 0 && token < DIRECT && !raw_too;
+                const float more = direct ? bits[token] - bits[token - 1] : 0.0F;
                 lower[context][token] = (float)(task.weight / 2) * max(more, 0.0F) - 0.5F;
             }
-            const bool raw_too = low_bits(level) > 0;
-            const float more = bits[2] - bits[0];
-            zero_of_two[context] = raw_too ? 0.0F : 1 + (float)(task.weight / 4) * more;
+            zero_of_two[context] =
+                raw_too ? 0.0F : 1 + (float)(task.weight / 4) * (bits[2] - bits[0]);
+        }
+        for (float& of : lower[NOTHING]) of = -0.5F;
+    }
+
+    // The least values that are worth a symbol in a band.
+    FHASH_INLINE void weigh_band(int kind) {
+        const int context = Base::group_of(kind) * 2 * LEVELS;
+        least_near = MODE == GUESS ? GUESSED_ZERO : SMALLEST;
+        least_far = least_near;
+        if (MODE == PRICE || MODE == CHOOSE) least_far = 1 + lower[context][1];
+        if (MODE == GUESS) {
+            const float more = paths->rates[context][1] - paths->rates[context][0];
+            least_far = max(1 + more / 4, least_near);
         }
     }
 
@@ -115,7 +273,13 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     // Find out whether a band has integers, and how large they are.
     FHASH_INLINE void look_at(Band& band) {
         const int blocks = band.blocks;
-        least_far = CHOOSES ? 1 + lower[Base::group_of(band.kind) * 2 * LEVELS][1] : SMALLEST;
+        if constexpr (MODE == FOLLOW) {
+            std::tie(band.any, band.shift) = paths->bands[(size_t)(&band - Base::bands.data())];
+            marks = marks_behind;
+            marks_behind += (size_t)band.size[0] * band.size[1] * band.size[2] * blocks;
+            return;
+        }
+        weigh_band(band.kind);
         const int64_t rows = (int64_t)band.size[0] * band.size[1] * band.size[2];
         largest.resize((size_t)(rows * blocks));
         float* at = largest.data();
@@ -135,9 +299,9 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
                     for (int i = 0; i < LANES; i++) bits = max(bits, larger[i]);
                     std::memcpy(at++, &bits, sizeof bits);
                     squared += first * first + second * second;
-                    large -= (first >= SMALLEST) + (second >= SMALLEST);
-                    totals += (Floats)((Ints)first & (first >= SMALLEST));
-                    totals += (Floats)((Ints)second & (second >= SMALLEST));
+                    large -= (first >= least_near) + (second >= least_near);
+                    totals += (Floats)((Ints)first & (first >= least_near));
+                    totals += (Floats)((Ints)second & (second >= least_near));
                 });
             }
             count += sum(large);
@@ -148,23 +312,36 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         });
         band.any = count > 0;
         if (!band.any) squares += error;
-        const double many = (double)MANY * (double)count;
+        // On a trellis an index is two steps.
+        const double many = (double)MANY * (double)count * (MODE == GUESS ? 2 : 1);
         while (total > many * (1 << band.shift) && band.shift < MAX_SHIFT) band.shift++;
+        if constexpr (MODE == GUESS) {
+            paths->bands[(size_t)(&band - Base::bands.data())] = {band.any, band.shift};
+            marks = paths->marks.size();
+            paths->marks.resize(marks + (size_t)(rows * blocks));
+        }
     }
 
     // Whether some values of the row are worth a symbol. Else they are zeros.
     FHASH_INLINE int some_in_row() {
-        const float* const of = largest.data() + row.number * row.blocks;
-        for (int k = 0; k < row.blocks; k++)
-            if (of[k] >= least_far) return 1;
+        const int64_t first = row.number * row.blocks;
+        for (int k = 0; k < row.blocks; k++) {
+            if (MODE == FOLLOW ? paths->marks[marks + (size_t)(first + k)] != 0
+                               : largest[(size_t)(first + k)] >= least_far)
+                return 1;
+        }
+        if (MODE == FOLLOW || MODE == GUESS) return 0;
         for (int k = 0; k < row.blocks; k++) leave_out(k);
         end_row();
         return 0;
     }
     // The same of a block. is_near: whether there are others than zeros around it.
     FHASH_INLINE int some_in_block(int number, bool is_near) {
-        const float of = largest[(size_t)(row.number * row.blocks + number)];
-        if (of >= (is_near ? SMALLEST : least_far)) return 1;
+        const size_t at = (size_t)(row.number * row.blocks + number);
+        if (MODE == FOLLOW) return paths->marks[marks + at];
+        const int some = largest[at] >= (is_near ? least_near : least_far);
+        if (MODE == GUESS) paths->marks[marks + at] = (uint8_t)some;
+        if (some || MODE == GUESS) return some;
         leave_out(number);
         return 0;
     }
@@ -194,7 +371,8 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         });
     }
     FHASH_INLINE void end_block(const Half& even, const Half& odd, int number, int room) {
-        if constexpr (MODE == CHOOSE) Base::keep_integers(task.q, even, odd, number, room);
+        if constexpr (MODE == CHOOSE || MODE == FOLLOW)
+            Base::keep_integers(task.q, even, odd, number, room);
     }
 
     // The magnitudes next to some sizes, or one less, or zero: what costs least.
@@ -220,7 +398,14 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
 
     FHASH_INLINE void code_half(Half& half, int parity) {
         const Ints values = given[parity];
-        if (CHOOSES) half.magnitudes = choose(sizes_of(values), half.contexts);
+        if constexpr (MODE == GUESS) {
+            half.magnitudes = guess(half, sizes_of(values));
+            half.signs = Ints{};
+            return;
+        }
+        if constexpr (MODE == FOLLOW)
+            half.magnitudes = loaded<Ints>(paths->places[paths->taken++].indices);
+        else if (CHOOSES) half.magnitudes = choose(sizes_of(values), half.contexts);
         else half.magnitudes = values < 0 ? -values : values;
         const Ints tokens = tokens_of(half.magnitudes >> half.low);
         write_step(half.contexts, tokens);
@@ -235,10 +420,18 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         write_step(there ? half.odds : all(NOTHING), (half.foretold ^ negative) & there);
     }
 
+    // The indices that some places are likely to have, whichever their quantisers are.
+    FHASH_INLINE Ints guess(const Half& half, Floats sizes) {
+        sizes = sizes < 1e9F ? sizes : Floats{} + 1e9F;
+        paths->extend(sizes, half.contexts, row.shift == 0);
+        const Ints indices = __builtin_convertvector(sizes * 0.5F + GUESSED_MORE, Ints);
+        return most(indices, all(1)) & (sizes >= GUESSED_ZERO) & (half.contexts != NOTHING);
+    }
+
     FHASH_INLINE void write_step(Ints contexts, Ints symbols) {
         const Shorts step = __builtin_convertvector(contexts * TOKENS + symbols, Shorts);
         for (int i = 0; i < LANES; i++) counts[step[i]][i]++;
-        if (MODE != PRICE) steps.push_back(step);
+        if (WRITES) steps.push_back(step);
     }
 
     FHASH_INLINE void write_magnitude(int magnitude, int token, int low) {
@@ -249,48 +442,60 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
             const uint32_t rest = (uint32_t)(high - FIRST[LAST]) + (1u << LAST_BITS);
             const int length = significant(rest) - 1;
             bits += 2 * (length - LAST_BITS) + 1;
-            if (MODE != PRICE) {
+            if (WRITES) {
                 out.put(1ull << (length - LAST_BITS), length - LAST_BITS + 1);
                 out.put(rest & ((1u << length) - 1), length);
             }
-        } else if (MODE != PRICE && token >= DIRECT) {
+        } else if (WRITES && token >= DIRECT) {
             out.put((uint64_t)(high - FIRST[token]), token - DIRECT + 1);
         }
-        if (MODE != PRICE) out.put((uint64_t)magnitude & ((1ull << low) - 1), low);
+        if (WRITES) out.put((uint64_t)magnitude & ((1ull << low) - 1), low);
         raw += bits;
     }
 };
 
 // The distribution of each context that takes the fewest bits for what was counted. Their bits.
-double choose_distributions(const uint32_t (*counts)[LANES], const Prior& prior, uint8_t* chosen) {
+double choose_distributions(const uint32_t (*counts)[LANES], const Prior& prior, bool trellis,
+                            uint8_t* chosen) {
     std::vector<float> bits((size_t)CERTAIN * TOKENS);
     for (int d = 0; d < CERTAIN; d++)
         for (int token = 0; token < TOKENS; token++) {
             const int slots = prior.slots[d][token];
             bits[(size_t)d * TOKENS + token] = slots ? PRECISION - std::log2((float)slots) : 1e6F;
         }
-    double total = 0;
+    double total = 0, saved = 0;
     for (int context = 0; context < CONTEXTS; context++) {
-        const int first = context < OF_SIGNS ? 0 : CHOICES;
-        double numbers[TOKENS], any = 0, least = 0;
+        chosen[context] = prior.defaults[context];
+        if (!is_used(context, trellis)) continue;
+        const int first = context < OF_SIGNS ? 0 : CHOICES, in_group = context % LEVELS;
+        double numbers[TOKENS], any_number = 0, usual = 0, least = 0;
         for (int token = 0; token < TOKENS; token++) {
             int64_t sum = 0;
             for (int i = 0; i < LANES; i++) sum += counts[in_context(context, token)][i];
             numbers[token] = (double)sum;
-            any += numbers[token];
+            any_number += numbers[token];
         }
-        chosen[context] = prior.defaults[context];
-        if (any == 0) continue;
-        for (int pass = -1; pass < CHOICES; pass++) {
+        for (int pass = -1; pass < CHOICES && any_number > 0; pass++) {
             const int choice = pass < 0 ? prior.defaults[context] : pass;
             double sum = pass < 0 ? 0 : CHOICE_BITS;
             const float* const of = &bits[(size_t)(first + choice) * TOKENS];
             for (int token = 0; token < TOKENS; token++) sum += numbers[token] * (double)of[token];
-            if (pass >= 0 && sum >= least) continue;
+            if (pass < 0) usual = least = sum;
+            if (sum >= least) continue;
             least = sum;
             chosen[context] = (uint8_t)choice;
         }
+        // A group of contexts without a choice has one bit for all.
+        saved = (in_group ? saved : 0) + usual - least;
         total += least;
+        if (in_group < LEVELS - 1 && context < CONTEXTS - 1) continue;
+        total += 1;
+        if (saved > in_group + 1) total += in_group + 1;
+        else {
+            total += saved;
+            std::memcpy(chosen + context - in_group, prior.defaults + context - in_group,
+                        (size_t)in_group + 1);
+        }
     }
     return total;
 }
@@ -346,25 +551,34 @@ void put_section(std::vector<uint8_t>& to, const std::vector<uint8_t>& section) 
 }
 
 template <Mode MODE>
-FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double* results) {
+FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double* results,
+                           Paths* paths = nullptr) {
     std::vector<uint8_t> flag_bytes;
     FlagWriter<MODE> flag_coder;
-    if constexpr (MODE != PRICE) flag_coder.out = &flag_bytes;
-    const auto writer = std::make_unique<Writer<MODE>>(task, flag_coder);
+    if constexpr (Writer<MODE>::WRITES) flag_coder.out = &flag_bytes;
+    const auto writer = std::make_unique<Writer<MODE>>(task, flag_coder, paths);
     if (!read_bands(task.table, task.shape, writer->bands)) return -1;
     writer->run_all();
+    if constexpr (MODE == GUESS) return 0;
     uint8_t chosen[CONTEXTS];
-    results[0] = choose_distributions(writer->counts, task.prior, chosen) + (double)writer->raw;
+    results[0] = choose_distributions(writer->counts, task.prior, task.trellis, chosen) +
+                 (double)writer->raw;
     results[1] = writer->squares;
     if constexpr (MODE == PRICE) results[0] += (double)writer->range.bits / 2048;
     results[0] /= 8;
-    if constexpr (MODE == PRICE) return 0;
+    if constexpr (!Writer<MODE>::WRITES) return 0;
     else writer->range.finish();
     BitsOut choices;
+    bool any_chosen = false;  // in the group
     for (int context = 0; context < CONTEXTS; context++) {
-        const bool other = chosen[context] != task.prior.defaults[context];
-        choices.put(other, 1);
-        if (other) choices.put(chosen[context], CHOICE_BITS);
+        if (!is_used(context, task.trellis)) continue;
+        const uint8_t *const of = chosen + context, *const usual = task.prior.defaults + context;
+        const int left = min(LEVELS, CONTEXTS - context);
+        if (context % LEVELS == 0) any_chosen = std::memcmp(of, usual, (size_t)left) != 0;
+        if (context % LEVELS == 0) choices.put(any_chosen, 1);
+        if (!any_chosen) continue;
+        choices.put(*of != *usual, 1);
+        if (*of != *usual) choices.put(*of, CHOICE_BITS);
     }
     choices.finish();
     writer->out.finish();
@@ -377,21 +591,31 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
     return 0;
 }
 
+// Write the integers of the best paths through the trellis.
+FHASH_INLINE int64_t write_paths(const Task& task, std::vector<uint8_t>& bytes, double* results) {
+    Paths paths(task.prior, task.bands, (float)task.weight);
+    const int64_t code = write<GUESS>(task, bytes, results, &paths);
+    if (code < 0) return code;
+    paths.trace();
+    return write<FOLLOW>(task, bytes, results, &paths);
+}
+
 }  // namespace
 
 // See fast.cpp.
-int64_t FHASH_FAST(encode)(int32_t* q, const float* values, double scale, double weight,
-                           const int64_t* shape, const int32_t* table, int64_t count,
+int64_t FHASH_FAST(encode)(int32_t* q, const float* values, int64_t trellis, double scale,
+                           double weight, const int64_t* shape, const int32_t* table, int64_t count,
                            const uint16_t* slots, const uint8_t* defaults, uint8_t* data,
                            int64_t capacity, double* results) {
     return guarded([&]() -> int64_t {
         const Prior prior = {reinterpret_cast<const uint16_t(*)[TOKENS]>(slots), defaults, nullptr};
-        const Task task = {q,     values, (float)scale,  weight,
-                           shape, table,  (size_t)count, prior};
+        const Task task = {q,     values, (float)scale,  weight, shape,
+                           table, (size_t)count, prior, trellis != 0};
         std::vector<uint8_t> bytes;
-        const int64_t code = !q ? write<PRICE>(task, bytes, results)
-                             : values ? write<CHOOSE>(task, bytes, results)
-                                      : write<ENCODE>(task, bytes, results);
+        const int64_t code = !q        ? write<PRICE>(task, bytes, results)
+                             : !values ? write<ENCODE>(task, bytes, results)
+                             : trellis ? write_paths(task, bytes, results)
+                                       : write<CHOOSE>(task, bytes, results);
         if (code < 0) return code;
         if ((int64_t)bytes.size() <= capacity && !bytes.empty())
             std::memcpy(data, bytes.data(), bytes.size());

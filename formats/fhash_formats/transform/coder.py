@@ -234,12 +234,12 @@ def encode_integers(
             steps, plus `weight` per bit.
         weight: squared steps that a bit is worth.
         trellis: whether the integers are those of two quantisers. Raises InputError
-            for integers that are not, and does not go with `scaled`.
-        fast: whether to code them by the fast coder (native/fast.cpp), which has no trellis.
+            for integers that are not, and does not go with `scaled`; with `fast` it goes with
+            `scaled` alone.
+        fast: whether to code them by the fast coder (native/fast.cpp).
     """
     if fast:
-        assert not trellis
-        return _encode_fast(integers, table, scaled, weight)
+        return _encode_fast(integers, table, scaled, weight, trellis=trellis)
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
     given = np.ascontiguousarray(integers, dtype=np.int32)
@@ -304,6 +304,7 @@ def decode_integers(
         prior = fast_prior()
         code = native.library().fhash_fast_decode(
             _pointer(integers),
+            trellis,
             *where,
             _pointer(prior.defaults),
             _pointer(prior.lookup),
@@ -326,7 +327,7 @@ CHOICES = 64
 """Distributions of the fast coder, of tokens and as many of signs, that a context may have."""
 TOKENS = 16
 """Symbols of a distribution."""
-FAST_CONTEXTS = 208
+FAST_CONTEXTS = 592
 """Contexts of the fast coder that have a distribution."""
 SLOTS = 2048
 """Slots of a distribution: the unit of its probabilities."""
@@ -377,9 +378,15 @@ def fast_prior() -> FastPrior:
 
 
 def _encode_fast(
-    integers: Integers, table: Table, scaled: npt.NDArray[np.float32] | None, weight: float
+    integers: Integers,
+    table: Table,
+    scaled: npt.NDArray[np.float32] | None,
+    weight: float,
+    *,
+    trellis: bool,
 ) -> Encoded:
     """Code integers by the fast coder; the arguments are those of `encode_integers`."""
+    assert scaled is not None or not trellis
     given = np.ascontiguousarray(integers, dtype=np.int32)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     result = given if chosen is None else np.empty_like(given)
@@ -387,7 +394,8 @@ def _encode_fast(
     def encode(buffer: Buffer) -> int:
         if chosen is not None:
             result.fill(0)
-        return _fast(result, chosen, 1.0, weight, given.shape, table, buffer)[0]
+        how = (trellis, 1.0, weight)
+        return _fast(result, chosen, how, given.shape, table, buffer)[0]
 
     return Encoded(data=with_room(given.size // 2, encode), integers=result)
 
@@ -406,25 +414,27 @@ def foretell(
     Returns bytes, and the error in squared steps.
     """
     nothing = np.empty(0, np.uint8)
-    return _fast(None, coefficients, scale, weight, coefficients.shape, table, nothing)[1:]
+    how = (False, scale, weight)
+    return _fast(None, coefficients, how, coefficients.shape, table, nothing)[1:]
 
 
 def _fast(
     integers: Integers | None,
     values: npt.NDArray[np.float32] | None,
-    scale: float,
-    weight: float,
+    how: tuple[bool, float, float],
     shape: Sequence[int],
     table: Table,
     buffer: npt.NDArray[np.uint8],
 ) -> tuple[int, float, float]:
-    """Call the fast coder; bytes, those that it foretold, and the error."""
+    """Call the fast coder; bytes, those that it foretold, and the error.
+
+    how: whether integers are chosen on a trellis, factor of the values, weight of a bit.
+    """
     prior, results = fast_prior(), (ctypes.c_double * 2)()
     size = native.library().fhash_fast_encode(
         _pointer(integers),
         _pointer(values),
-        scale,
-        weight,
+        *how,
         (ctypes.c_int64 * 4)(*shape),
         *array_arguments(table),
         _pointer(prior.slots),

@@ -274,8 +274,6 @@ def _linear_and_residual(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
-    if settings.trellis and stream.fast:
-        raise DamagedFileError("a coded tile is of the fast coder, which has no trellis")
     body, rest = stream.body, stream.residual
     assert body is not None, "a transformed stream has a body"
 

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
-from fhash_formats.errors import InputError
 from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.transform.coder import (
     HIGH,
@@ -209,15 +208,19 @@ def choose_integers(
     """
     table = band_table(settings.transform, coefficients.shape)
     if settings.trellis:
-        scaled = coefficients * settings.dtype.type(1.0 / settings.step)
-        # Written so that it holds for NaN as well.
-        if not max(-float(scaled.min()), float(scaled.max())) < LARGEST:
-            return None
-        return choose_levels(scaled, table, weight, passes)
+        scaled = _scaled(coefficients, settings)
+        return None if scaled is None else choose_levels(scaled, table, weight, passes)
     integers, scaled = quantise(coefficients, settings.step)
     if weight <= 0:
         return integers
     return encode_integers(integers, table, scaled=scaled, weight=weight).integers
+
+
+def _scaled(coefficients: Values, settings: TileSettings) -> Values | None:
+    """Coefficients in steps; None where one is too large for the trellis."""
+    scaled: Values = coefficients * settings.dtype.type(1.0 / settings.step)
+    # Written so that it holds for NaN as well.
+    return scaled if max(-float(scaled.min()), float(scaled.max())) < LARGEST else None
 
 
 def code_coefficients(
@@ -226,11 +229,18 @@ def code_coefficients(
     """The coded coefficients, and the integers that they decode to; None where one is too large.
 
     The arguments are those of `choose_integers`. Without a trellis, 2 passes code the integers that
-    were chosen once more. fast: whether to code them by the fast coder, which has no trellis.
+    were chosen once more. fast: whether to code them by the fast coder, which searches one path.
     """
     table = band_table(settings.transform, coefficients.shape)
     if settings.trellis and fast:
-        raise InputError("the fast coder has no trellis")
+        scaled = _scaled(coefficients, settings)
+        if scaled is None:
+            return None
+        nothing = np.zeros(scaled.shape, np.int32)
+        coded = encode_integers(
+            nothing, table, scaled=scaled, weight=weight, trellis=True, fast=True
+        )
+        return coded.data, coded.integers
     if settings.trellis:
         path = choose_integers(coefficients, settings, weight, passes)
         if path is None:

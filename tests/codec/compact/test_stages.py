@@ -378,9 +378,8 @@ def test_transforms_of_a_large_tile_are_tried_at_a_step_of_its_own(
     field: Field, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first guess has a step that is much too coarse for the tiles."""
-    monkeypatch.setattr(planning, "TRIAL_VERTICES", 1)
-    monkeypatch.setattr(planning, "SAMPLE_VERTICES", 1)
-    monkeypatch.setattr(planning, "MAX_SEARCHED_VERTICES", 1)
+    for name in ("TRIAL_VERTICES", "PRICED_VERTICES", "SAMPLE_VERTICES", "MAX_SEARCHED_VERTICES"):
+        monkeypatch.setattr(planning, name, 1)
     steps = []
     tried = planning._transform_of_large_tile
 

@@ -60,7 +60,7 @@ NAMES = (
 )
 """Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
 CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
-PLAIN, TRELLIS, FAST = range(3)
+PLAIN, TRELLIS, FAST, FAST_TRELLIS = range(4)
 """Ways to code integers, as inputs of the coder name them."""
 WITH_SEEDS = (CODER, PREDICTOR)
 """Targets that have seeds of their own only; those of all others are random bytes, too."""
@@ -170,6 +170,10 @@ def write_seeds(
                 trellis, fast = how == TRELLIS, how == FAST
                 data = encode_integers(coded, table, trellis=trellis, fast=fast).data
                 put(CODER, struct.pack("<HB", number, how), data)
+            chosen = encode_integers(
+                integers, table, scaled=scaled.astype(np.float32), trellis=True, fast=True
+            )
+            put(CODER, struct.pack("<HB", number, FAST_TRELLIS), chosen.data)
     for number, (shape, predictor) in enumerate(passes):
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
@@ -246,7 +250,7 @@ def coded_sections(
     plain = FAST if parts.fast else PLAIN
     if parts.kind == TRANSFORMED and parts.body is not None:
         table = band_table(settings.transform, shape)
-        yield bytes(parts.body), table, TRELLIS if settings.trellis else plain
+        yield bytes(parts.body), table, plain + TRELLIS if settings.trellis else plain
     if parts.residual is not None:
         yield bytes(parts.residual), single_band(shape), plain
 

@@ -161,12 +161,12 @@ std::vector<std::int32_t> path_of(Reader& in, const Bands& with, const std::vect
 }
 
 // What the fast coder makes of numbers: null for what is not given.
-int64_t fast(const Bands& with, std::int32_t* q, const float* values, double scale, double weight,
-             std::vector<std::uint8_t>& into) {
+int64_t fast(const Bands& with, std::int32_t* q, const float* values, bool trellis, double scale,
+             double weight, std::vector<std::uint8_t>& into) {
     double results[2];
     const FastPrior& prior = setups().fast;
     const int64_t size = fhash_fast_encode(
-        q, values, scale, weight, with.shape.data(), with.table.data(), bands_of(with),
+        q, values, trellis, scale, weight, with.shape.data(), with.table.data(), bands_of(with),
         prior.slots.data(), prior.defaults.data(), into.data(), length(into), results);
     require(results[0] >= 0 && !(results[1] < 0), "a price below 0");
     return size;
@@ -178,22 +178,24 @@ void of_fast(Reader& in) {
     const std::size_t number = in.word() % setups().bands.size();
     const Bands& with = setups().bands[number];
     const std::size_t room = 4U * in.byte();
-    const bool choose = in.byte() & 1;
+    const std::uint8_t how = in.byte();
+    const bool choose = how & 1, trellis = choose && how & 2;
     std::vector<std::int32_t> q = bounded(in, volume(with.shape), (1 << 30) - 1);
     const std::vector<float> values = repeated<float>(in, choose ? volume(with.shape) : 0);
     const double scale = std::ldexp(1.0, static_cast<int>(in.within(-60, 60)));
     const double weight = in.byte() / 64.0;
     std::vector<std::uint8_t> none;
     if (choose)
-        require(fast(with, nullptr, values.data(), scale, weight, none) == 0, "no price");
+        require(fast(with, nullptr, values.data(), false, scale, weight, none) == 0, "no price");
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
         if (choose) std::fill(q.begin(), q.end(), 0);
-        return fast(with, q.data(), choose ? values.data() : nullptr, scale, weight, into);
+        const float* const of = choose ? values.data() : nullptr;
+        return fast(with, q.data(), of, trellis, scale, weight, into);
     });
     std::vector<std::int32_t> decoded(q.size(), 0);
-    require(fhash_fast_decode(decoded.data(), with.shape.data(), with.table.data(), bands_of(with),
-                              setups().fast.defaults.data(), setups().fast.lookup.data(),
-                              data.data(), length(data)) == 0,
+    require(fhash_fast_decode(decoded.data(), trellis, with.shape.data(), with.table.data(),
+                              bands_of(with), setups().fast.defaults.data(),
+                              setups().fast.lookup.data(), data.data(), length(data)) == 0,
             "bytes of the fast coder are refused");
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers of the fast coder");

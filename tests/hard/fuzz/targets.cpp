@@ -36,7 +36,7 @@ void decode_integers(Reader& in) {
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
     if (how & 2) {
-        fhash_fast_decode(q.data(), with.shape.data(), with.table.data(),
+        fhash_fast_decode(q.data(), trellis, with.shape.data(), with.table.data(),
                           static_cast<int64_t>(with.table.size() / 29),
                           setups().fast.defaults.data(), setups().fast.lookup.data(), data.data(),
                           static_cast<int64_t>(data.size()));
