@@ -304,8 +304,8 @@ COMPARED_VERTICES = 1 << 20
 """Vertices of the tiles on which the two coders are compared; one tile may have more."""
 COMPARED_QUICKLY = 1 << 18
 """The same of parts of tiles, where seconds count."""
-SMALL_PARTS = 0.07
-"""Share of the bytes by which the fast coder may seem worse on such small parts: it is not."""
+UNDECIDED = 0.05
+"""Distance of the ratio on small parts from the one allowed from which on it decides."""
 PRICED_VERTICES = 1 << 20
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
@@ -498,29 +498,37 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
 
 def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
     """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it."""
-    access, goal, settings = task.config.access, task.goal, attempt.settings
+    access, settings = task.config.access, attempt.settings
     if not task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size):
         return False
     if task.config.effort == 1:
         return True
-    part, coding = attempt.sample.narrowed(COMPARED_VERTICES), attempt.coding
+    part = attempt.sample.narrowed(COMPARED_VERTICES)
     if attempt.quick:
         parts = task.blocks.retile(sub_tile(part.blocks.tile, COMPARED_QUICKLY))
         usual = replace(settings, transform=usual_transform(parts.tile))
-        part = _sample(task, parts, usual, COMPARED_QUICKLY)
-        settings = moved_transform(part, settings)
+        small = _sample(task, parts, usual, COMPARED_QUICKLY)
+        ratio = _bytes_of_fast(task, attempt, small, moved_transform(small, settings))
+        low, high = (FAST_BYTES[access] + away for away in (-UNDECIDED, UNDECIDED))
+        if not low < ratio < high:
+            return ratio <= low
+    return _bytes_of_fast(task, attempt, part, settings) <= FAST_BYTES[access]
+
+
+def _bytes_of_fast(task: PlanTask, attempt: Attempt, part: Sample, settings: TileSettings) -> float:
+    """Return the bytes of the fast coder as a multiple of those of the other, at equal quality."""
+    goal, coding = task.goal, attempt.coding
     if allows_trellis(settings, goal, task.config.effort):
         settings, coding = on_trellis(settings, coding)
     fast = part.run(settings, goal.bounded(replace(coding, fast=True)))
-    coding = replace(coding, fast=False)
-    mixed = part.run(settings, goal.bounded(coding))
+    mixed = part.run(settings, goal.bounded(replace(coding, fast=False)))
     size = float(mixed.size)
     if goal.error is None and goal.data_range > 0 and mixed.squares and fast.squares:
         better = fast.psnr(goal.data_range) - mixed.psnr(goal.data_range)
         size *= 2 ** (better / EXCHANGE)
-    tell("step", f"the fast coder takes {fast.size / max(size, 1.0):.3f} times the bytes")
-    most = FAST_BYTES[access] + (SMALL_PARTS if attempt.quick else 0.0)
-    return fast.size <= most * size
+    ratio = fast.size / max(size, 1.0)
+    tell("step", f"the fast coder takes {ratio:.3f} times the bytes")
+    return ratio
 
 
 def _searched_sample(task: PlanTask, attempt: Attempt) -> Sample:

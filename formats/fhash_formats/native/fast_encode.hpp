@@ -73,7 +73,7 @@ struct Paths {
     std::vector<Places> places;
     std::vector<uint8_t> marks;  // by block of each band: whether the paths go through it
     std::vector<std::pair<bool, int>> bands;  // whether a band has any, and its shift
-    float rates[2 * MAGNITUDES][RATES];
+    float rates[2 * MAGNITUDES * RATES];
     Floats cost[STATES];
     size_t taken = 0;  // places that were written
 
@@ -82,7 +82,7 @@ struct Paths {
             for (int index = 0; index < RATES; index++) {
                 const bool raw = low_bits(context % LEVELS) > 0;
                 const float bits = raw ? 0.0F : bits_of(prior, MAGNITUDES + context, index);
-                rates[context][index] = weight * bits;
+                rates[context * RATES + index] = weight * bits;
             }
         for (Floats& of : cost) of = Floats{} + 1e9F;
         cost[0] = Floats{};
@@ -107,9 +107,9 @@ struct Paths {
                 const Ints next_index = first + least(low + 1, all(RATES - 1));
                 Floats rate_low, rate_high, rate_zero;
                 for (int i = 0; i < LANES; i++) {
-                    rate_low[i] = rates[0][index[i]];
-                    rate_high[i] = rates[0][next_index[i]];
-                    rate_zero[i] = rates[0][first[i]];
+                    rate_low[i] = rates[index[i]];
+                    rate_high[i] = rates[next_index[i]];
+                    rate_zero[i] = rates[first[i]];
                 }
                 at_low += rate_low;
                 at_high += rate_high;
@@ -204,7 +204,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     double squares = 0;
     BitsOut out;
     std::vector<Shorts> steps;  // what the lanes code at one time: symbols in their contexts
-    float lower[CONTEXTS + 1][TOKENS] = {};  // of a magnitude: below it, one less is cheaper
+    float lower[SYMBOLS] = {};             // of a magnitude: below it, one less is cheaper
     float zero_of_two[CONTEXTS + 1] = {};    // below it a 2 is worth less than its bits
     std::vector<float> largest;  // value in each block of the band
     float least_near, least_far;  // values that are worth a symbol; far: where all around is 0
@@ -231,12 +231,13 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
             for (int token = 0; token < TOKENS; token++) {
                 const bool direct = token > 0 && token < DIRECT && !raw_too;
                 const float more = direct ? bits[token] - bits[token - 1] : 0.0F;
-                lower[context][token] = (float)(task.weight / 2) * max(more, 0.0F) - 0.5F;
+                lower[in_context(context, token)] =
+                    (float)(task.weight / 2) * max(more, 0.0F) - 0.5F;
             }
             zero_of_two[context] =
                 raw_too ? 0.0F : 1 + (float)(task.weight / 4) * (bits[2] - bits[0]);
         }
-        for (float& of : lower[NOTHING]) of = -0.5F;
+        for (int token = 0; token < TOKENS; token++) lower[in_context(NOTHING, token)] = -0.5F;
     }
 
     // The least values that are worth a symbol in a band.
@@ -244,10 +245,10 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         const int context = Base::group_of(kind) * 2 * LEVELS;
         least_near = MODE == GUESS ? GUESSED_ZERO : SMALLEST;
         least_far = least_near;
-        if (MODE == PRICE || MODE == CHOOSE) least_far = 1 + lower[context][1];
+        if (MODE == PRICE || MODE == CHOOSE) least_far = 1 + lower[in_context(context, 1)];
         if (MODE == GUESS) {
-            const float more = paths->rates[context][1] - paths->rates[context][0];
-            least_far = max(1 + more / 4, least_near);
+            const float* const rates = paths->rates + context * Paths::RATES;
+            least_far = max(1 + (rates[1] - rates[0]) / 4, least_near);
         }
     }
 
@@ -383,7 +384,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
         if (any(nearest)) {
             const Ints at = contexts * TOKENS + least(nearest, all(LAST));
             Floats edges;
-            for (int i = 0; i < LANES; i++) edges[i] = lower[0][at[i]];
+            for (int i = 0; i < LANES; i++) edges[i] = lower[at[i]];
             chosen += sizes < floats(nearest) + edges;
             const Ints twos = chosen == 2;
             if (any(twos)) {
@@ -566,6 +567,9 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
     results[1] = writer->squares;
     if constexpr (MODE == PRICE) results[0] += (double)writer->range.bits / 2048;
     results[0] /= 8;
+    bool some = false;  // then there are states of lanes
+    for (const Band& band : writer->bands) some |= band.any;
+    results[0] += some ? 4 * LANES : 0;
     if constexpr (!Writer<MODE>::WRITES) return 0;
     else writer->range.finish();
     BitsOut choices;
