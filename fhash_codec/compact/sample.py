@@ -216,9 +216,12 @@ class Sample:
     def narrowed(self, max_vertices: int) -> Sample:
         """Return a sample of those of its tiles in the middle, of at most so many vertices.
 
-        At least one is left. Only their bytes beside each other mean anything.
+        At least one is left. Only their bytes beside each other mean anything. A sample of no more
+        is returned itself, with what is known of it.
         """
         count = max(1, max_vertices // prod(self.blocks.tile))
+        if count >= len(self.tiles):
+            return self
         first = max(0, (len(self.tiles) - count) // 2)
         other = copy(self)
         other.tiles = self.tiles[first : first + count]

@@ -477,6 +477,7 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         fast, tried = _has_fast_coder(task, attempt), attempt.coding.fast
         attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+        searched = _searched_sample(task, attempt)
         on = allows_trellis(attempt.settings, task.goal, task.config.effort)
         if fast and attempt.quick and task.goal.psnr is not None:
             step = step_after(attempt.settings, attempt.outcome, task.goal, task.slope.slope)
@@ -486,14 +487,10 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
             attempt = replace(attempt, settings=settings, coding=coding)
         elif on:
             settings, coding, outcome = choose_quantiser(
-                _searched_sample(task, attempt),
-                attempt.settings,
-                attempt.coding,
-                task.goal,
-                fast=tried,
+                searched, attempt.settings, attempt.coding, task.goal, fast=tried
             )
             attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
-        return _searched_step(task, attempt)
+        return _searched_step(task, attempt, searched)
 
 
 def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
@@ -538,8 +535,11 @@ def _searched_sample(task: PlanTask, attempt: Attempt) -> Sample:
     return attempt.sample
 
 
-def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Return the attempt with the step that the sample asks for, and with bases fitted to it."""
+def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attempt:
+    """Return the attempt with the step that the sample asks for, and with bases fitted to it.
+
+    searched: see `_searched_sample`.
+    """
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
@@ -550,15 +550,9 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     if attempt.quick:
         settings, fitted = refit(sample, settings), settings.step
     settings, outcome = find_step(
-        _searched_sample(task, attempt),
-        settings,
-        coding,
-        goal,
-        tries=tries,
-        tried=tried,
-        precision=precision,
+        searched, settings, coding, goal, tries=tries, tried=tried, precision=precision
     )
-    if attempt.quick and goal.error is not None:
+    if searched is not sample:
         outcome = sample.run(settings, goal.bounded(coding))
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)

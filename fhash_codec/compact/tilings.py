@@ -26,10 +26,9 @@ from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced, strata
 from fhash_codec.compact.step import find_step, step_after
 from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
-    FITTED_LINES,
     MAX_BASIS_LENGTH,
-    MIN_LINES,
     basis_bytes,
+    lines_of_trials,
     refit,
     rough_transform,
     tile_costs,
@@ -57,7 +56,7 @@ MOST_MISSING = 6.0
 class Trials:
     """Tilings of a series, or of parts of it, coded at one step.
 
-    Where the fast coder is used for trials, they are priced by it instead.
+    Where the fast coder is used for trials, and no residual, they are priced by it instead.
 
     Attributes:
         shape: of the series, or of each part.
@@ -70,6 +69,7 @@ class Trials:
     ) -> None:
         self._task, self._blocks, self.shape = task, blocks, blocks.shape
         self._settings, self._coding = settings, task.goal.bounded(coding)
+        self._is_priced = coding.fast and task.goal.error is None
         self._known: dict[tuple[int, int], AxisTransform] = {}
         self._psnr: float | None = None
         self._settled: list[Outcome] = []
@@ -142,17 +142,17 @@ class Trials:
             self._settings,
             self._coding,
             self._known_transforms(tile),
-            max(FITTED_LINES // prod(sample.blocks.grid), MIN_LINES),
+            lines_of_trials(sample.blocks),
         )
         for axis in (0, 1):
             self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
-        same = trials is sample or (self._coding.fast and self._task.goal.error is None)
+        same = trials is sample or self._is_priced
         return settings, tried if sample.complete and same else None
 
     def _whole(self, tile: Shape) -> Sample:
-        """Return all tiles, priced where the fast coder is used and residuals are not."""
+        """Return all tiles, priced where that stands for coding them."""
         sample = self._sample(tile, 1 << 62)
-        if not self._coding.fast or self._task.goal.error is not None:
+        if not self._is_priced:
             return sample
         return priced(sample, self._settings, self._task.config.effort)
 

@@ -142,14 +142,15 @@ def _some_lines(
     return planes
 
 
-def lines_of_trials(sample: TileSample) -> int | None:
-    """Return the lines of each tile that bases are fitted on for trials; None for all.
+def lines_of_trials(blocks: Blocks) -> int:
+    """Return the lines of each tile that bases are fitted on where some will do."""
+    return max(FITTED_LINES // math.prod(blocks.grid), MIN_LINES)
 
-    Those of a priced sample are made anew when they are chosen (`refit`).
-    """
-    if not isinstance(sample, PricedSample):
-        return None
-    return max(FITTED_LINES // math.prod(sample.blocks.grid), MIN_LINES)
+
+def _bases(sample: TileSample, settings: TileSettings) -> Bases:
+    """Return bases for trials: those of a priced sample are made anew once chosen (`refit`)."""
+    lines = lines_of_trials(sample.blocks) if isinstance(sample, PricedSample) else None
+    return Bases(sample, settings, lines)
 
 
 class CountedBases(Bases):
@@ -228,7 +229,7 @@ def choose_transform(
     coded: whether the best ones by price are coded.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = Bases(sample, settings, lines_of_trials(sample))
+    bases = _bases(sample, settings)
     if quick:
         trials = _quick_trials(shape, settings.transform.axes, bases)
         lowest, axes = _cheapest(sample, settings, trials, coding)
@@ -325,7 +326,7 @@ def adapted_transform(
     found: the transforms along (t, z, y, x); bases among them are made anew for the sample.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = Bases(sample, settings, lines_of_trials(sample))
+    bases = _bases(sample, settings)
     axes = _of_shape(found, shape, bases)
     usual = usual_transform(shape).axes
     trials = [axes]
@@ -340,7 +341,7 @@ def adapted_transform(
 
 def moved_transform(sample: TileSample, settings: TileSettings) -> TileSettings:
     """Return settings with the same kinds of transforms for the tiles of a sample."""
-    bases = Bases(sample, settings, lines_of_trials(sample))
+    bases = _bases(sample, settings)
     axes = _of_shape(settings.transform.axes, sample.tiles[0].values.shape, bases)
     return _along(settings, axes)
 

@@ -165,6 +165,16 @@ FHASH_INLINE int sum(const Ints& of) {  // of numbers that are not negative
 FHASH_INLINE Ints next(Ints of) {
     return Ints{of[1], of[2], of[3], of[4], of[5], of[6], of[7], 0};
 }
+// The lanes of a mask, as bits.
+FHASH_INLINE int lanes_of(Ints mask) {
+#if defined(FHASH_FAST_V3)
+    return _mm256_movemask_ps((__m256)mask);
+#else
+    int lanes = 0;
+    for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
+    return lanes;
+#endif
+}
 // The even places of a block, and the odd ones.
 FHASH_INLINE Ints places(Sums of, int parity) {
 #if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
@@ -203,14 +213,14 @@ FHASH_INLINE Ints tokens_of(Ints magnitudes) {
     return magnitudes < DIRECT ? magnitudes : least(bits + 7, all(LAST));
 }
 const Ints PLACES = {0, 2, 4, 6, 8, 10, 12, 14};  // even ones of a block
-const int OTHER = 1 << 16, MANY_BLOCKS = 1 << 14;   // see `Lattice::same`
+const int OTHER = 1 << 16, MANY_BLOCKS = 1 << 14;  // see `Lattice::same`
 
 // Eight places of a block, of one parity, and what is around them.
 struct Half {
-    Ints levels, contexts, low;  // low: bits of a magnitude that are left raw
-    Ints foretold, odds;         // of signs: 1 for a negative one, and its context
-    Ints magnitudes, signs;      // what is coded; 0 is the sign of 0
-    Ints quantisers;             // of a trellis: 0 or 1
+    Ints contexts, low;      // low: bits of a magnitude that are left raw
+    Ints foretold, odds;     // of signs: 1 for a negative one, and its context
+    Ints magnitudes, signs;  // what is coded; 0 is the sign of 0
+    Ints quantisers;         // of a trellis: 0 or 1
 };
 
 // The way through the bands. Self codes: it has `look_at` a band before its flag, `some_in_row` and
@@ -268,6 +278,9 @@ template <class Self, class Range> struct Lattice {
             for (int z = 0; z < band.size[1]; z++)
                 for (int y = 0; y < band.size[2]; y++) each(t, z, y);
     }
+
+    // Vertices of the row in a block.
+    FHASH_INLINE int room_in(int block) const { return min(row.length - BLOCK * block, BLOCK); }
 
     // Of the first vertex of a row in the tile.
     FHASH_INLINE int64_t place_of(const Band& band, int t, int z, int y) const {
@@ -477,7 +490,7 @@ template <class Self, class Range> struct Lattice {
             if (!flag(self().some_in_block(number, flags_of > 0), BLOCKS + context)) return 0;
         }
         self().begin_block(number);
-        const int room = (int)min<int64_t>(row.length - first, BLOCK);
+        const int room = room_in(number);
         Ints signs[2][SIGNS] = {};  // around
         for (int n = 0; n < 3; n++)
             for (int parity = 0; parity < 2; parity++) {
@@ -509,13 +522,13 @@ template <class Self, class Range> struct Lattice {
 
     // Levels and contexts by the sums around; those of places beyond a row are NOTHING.
     FHASH_INLINE void find_contexts(Half& half, Ints sums, int parity, int room) const {
-        half.levels = levels_of(floats(sums) * row.scale[parity]);
-        half.contexts = half.levels + (row.group * 2 + parity) * LEVELS;
+        const Ints levels = levels_of(floats(sums) * row.scale[parity]);
+        half.contexts = levels + (row.group * 2 + parity) * LEVELS;
         if (trellis) {
             half.quantisers = states & 1;
             half.contexts += (half.quantisers + 1) * MAGNITUDES;
         }
-        half.low = most((half.levels - SHIFTED) >> 1, Ints{}) + row.shift;
+        half.low = most((levels - SHIFTED) >> 1, Ints{}) + row.shift;
         if (room == BLOCK) return;
         const Ints beyond = PLACES + parity >= room;
         half.contexts = beyond ? all(NOTHING) : half.contexts;

@@ -118,7 +118,7 @@ struct Reader : Lattice<Reader, Decoder> {
     FHASH_INLINE void read_words() {
         const Ints needs = (Words)state < LEAST_STATE;
 #if defined(FHASH_FAST_V3)
-        const int mask = _mm256_movemask_ps((__m256)needs);
+        const int mask = lanes_of(needs);
         const __m128i places_of = _mm_loadl_epi64((const __m128i*)order.of[mask]);
         const __m256i places = _mm256_cvtepu8_epi32(places_of);
         const __m256i ahead = _mm256_cvtepu16_epi32(_mm_loadu_si128((const __m128i*)word));

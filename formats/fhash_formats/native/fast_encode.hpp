@@ -5,8 +5,6 @@
 // the contexts that guessed integers have, and FOLLOW writes it.
 #pragma once
 
-#include <tuple>
-
 #include "fast.hpp"
 
 namespace {
@@ -17,7 +15,7 @@ enum Mode { PRICE, CHOOSE, ENCODE, GUESS, FOLLOW };  // CHOOSE: by rate and erro
 FHASH_INLINE int in_context(int context, int symbol) { return context * TOKENS + symbol; }
 const int SYMBOLS = (CONTEXTS + 1) * TOKENS;
 const float SMALLEST = 0.5F;  // value that may become an integer other than 0
-// The index of a value on a trellis: 0 up to the first one, else half of it and the other.
+// The index of a value on a trellis: 0 below the first one, else half of it and the other.
 const float GUESSED_ZERO = 1.05F, GUESSED_MORE = 0.7F;
 
 // Bits in the order in which they are read, the lowest of a byte first.
@@ -52,11 +50,17 @@ struct Task {
 // Bits of an index in a context, by the defaults of the prior, with those of its sign.
 float bits_of(const Prior& prior, int context, int index) {
     const uint16_t* const slots = prior.slots[prior.defaults[context]];
-    const int token = index < DIRECT ? index : min(significant((uint32_t)index - 7) + 7, LAST);
+    const int token = tokens_of(all(index))[0];
     const int beside = max(token - DIRECT + 1, 0);
     const float sign = index > 0;
     return (float)(PRECISION + beside) - std::log2((float)max<int>(slots[token], 1)) + sign;
 }
+
+// What GUESS finds of a band.
+struct Known {
+    bool any = false;
+    int shift = 0;
+};
 
 // The paths of the lanes through a trellis (Viterbi 1967): those of least squared error and bits to
 // each of its states, and of each place that a path goes through what the way back needs.
@@ -64,15 +68,15 @@ struct Paths {
     static const int STATES = 8, RATES = 16;  // indices from the last one on have its bits
     static const int RENEWED = 256;           // places after which the least cost is subtracted
     struct Places {
-        float sizes[LANES];         // in steps
-        int32_t indices[LANES];     // of the path
-        uint16_t contexts[LANES];   // those of the first quantiser
-        uint8_t odd[STATES];  // lanes whose best path to a state comes by an odd index
-        uint8_t zero[2];      // lanes where 0 is better than 2, by quantiser
+        float sizes[LANES];        // in steps
+        int32_t indices[LANES];    // of the path
+        uint16_t contexts[LANES];  // those of the first quantiser
+        uint8_t odd[STATES];       // lanes whose best path to a state comes by an odd index
+        uint8_t zero[2];           // lanes where 0 is better than 2, by quantiser
     };
     std::vector<Places> places;
     std::vector<uint8_t> marks;  // by block of each band: whether the paths go through it
-    std::vector<std::pair<bool, int>> bands;  // whether a band has any, and its shift
+    std::vector<Known> bands;
     float rates[2 * MAGNITUDES * RATES];
     Floats cost[STATES];
     size_t taken = 0;  // places that were written
@@ -116,7 +120,7 @@ struct Paths {
                 at_zero += rate_zero;
             }
             const Ints zero = (low == 1) & (at_zero <= at_high);
-            here.zero[quantiser] = lanes_of(zero);
+            here.zero[quantiser] = (uint8_t)lanes_of(zero);
             const Ints low_odd = -(low & 1);
             costs[quantiser][0] = low_odd ? (zero ? at_zero : at_high) : at_low;
             costs[quantiser][1] = low_odd ? at_low : at_high;
@@ -135,7 +139,7 @@ struct Paths {
         }
         for (int state = 0; state < STATES; state++) {
             cost[state] = inside ? next[state] : cost[state];
-            here.odd[state] = lanes_of(odd[state]);
+            here.odd[state] = (uint8_t)lanes_of(odd[state]);
         }
         places.push_back(here);
         if (places.size() % RENEWED == 0) renew();
@@ -145,16 +149,6 @@ struct Paths {
         Floats lowest = cost[0];
         for (const Floats& of : cost) lowest = of < lowest ? of : lowest;
         for (Floats& of : cost) of -= lowest;
-    }
-
-    FHASH_INLINE static uint8_t lanes_of(Ints mask) {
-#if defined(FHASH_FAST_V3)
-        return (uint8_t)_mm256_movemask_ps((__m256)mask);
-#else
-        int lanes = 0;
-        for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
-        return (uint8_t)lanes;
-#endif
     }
 
     // Go back along the best paths.
@@ -192,7 +186,7 @@ using FlagWriter =
 
 template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     using Base = Lattice<Writer<MODE>, FlagWriter<MODE>>;
-    using Base::row, Base::all_rows, Base::place_of;
+    using Base::row, Base::all_rows, Base::place_of, Base::room_in;
 
     static const bool CHOOSES = MODE != ENCODE;  // whether there are values
     static const bool GUESSES = MODE == GUESS;
@@ -203,14 +197,14 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     int64_t raw = 0;                       // bits beside
     double squares = 0;
     BitsOut out;
-    std::vector<Shorts> steps;  // what the lanes code at one time: symbols in their contexts
+    std::vector<Shorts> steps;             // of the lanes at one time: symbols in their contexts
     float lower[SYMBOLS] = {};             // of a magnitude: below it, one less is cheaper
-    float zero_of_two[CONTEXTS + 1] = {};    // below it a 2 is worth less than its bits
-    std::vector<float> largest;  // value in each block of the band
+    float zero_of_two[CONTEXTS + 1] = {};  // below it a 2 is worth less than its bits
+    std::vector<float> largest;            // value in each block of the band
     float least_near, least_far;  // values that are worth a symbol; far: where all around is 0
     size_t marks = 0, marks_behind = 0;  // of the paths: those before the band, and with it
-    Floats rests = {};           // sums of the squared errors of a row
-    Ints given[2];               // of the block, by parity: values, as bits of floats, or integers
+    Floats rests = {};  // sums of the squared errors of a row
+    Ints given[2];      // of the block, by parity: values, as bits of floats, or integers
 
     Writer(const Task& of, FlagWriter<MODE> flag_coder, Paths* through)
         : Base(of.shape, of.prior, of.trellis, of.bands, flag_coder), task(of), paths(through) {}
@@ -275,7 +269,9 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     FHASH_INLINE void look_at(Band& band) {
         const int blocks = band.blocks;
         if constexpr (MODE == FOLLOW) {
-            std::tie(band.any, band.shift) = paths->bands[(size_t)(&band - Base::bands.data())];
+            const Known known = paths->bands[(size_t)(&band - Base::bands.data())];
+            band.any = known.any;
+            band.shift = known.shift;
             marks = marks_behind;
             marks_behind += (size_t)band.size[0] * band.size[1] * band.size[2] * blocks;
             return;
@@ -350,9 +346,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     // Count the errors of a block of zeros.
     FHASH_INLINE void leave_out(int number) {
         if (!CHOOSES) return;
-        const int64_t first = (int64_t)BLOCK * number;
-        const int room = (int)min<int64_t>(row.length - first, BLOCK);
-        values_of(row.place + first, room, [&](Ints a, Ints b) FHASH_LAMBDA {
+        values_of(row.place + BLOCK * number, room_in(number), [&](Ints a, Ints b) FHASH_LAMBDA {
             const Floats one = sizes_of(a), other = sizes_of(b);
             rests += one * one + other * other;
         });
@@ -364,9 +358,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
     }
 
     FHASH_INLINE void begin_block(int number) {
-        const int64_t first = (int64_t)BLOCK * number;
-        const int room = (int)min<int64_t>(row.length - first, BLOCK);
-        values_of(row.place + first, room, [&](Ints a, Ints b) FHASH_LAMBDA {
+        values_of(row.place + BLOCK * number, room_in(number), [&](Ints a, Ints b) FHASH_LAMBDA {
             given[0] = evens(a, b);
             given[1] = odds(a, b);
         });

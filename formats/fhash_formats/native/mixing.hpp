@@ -99,7 +99,8 @@ using std::uint8_t;
 
 using namespace fhash;
 
-// Stands for an Encoder where only the bits count, in 1/2048.
+// Stands for an Encoder where only the bits count, in 1/2048. It is here and not in
+// fast_encode.hpp, since `code_simple` is compiled for the baseline and inlines it.
 struct Counter {
     int64_t bits = 0;
 
