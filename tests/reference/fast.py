@@ -20,7 +20,9 @@ from reference.bands import Band
 from reference.labels import number_in
 
 LANES, BLOCK, LEVELS = 8, 16, 24
-MAGNITUDES = 8 * LEVELS
+CLASSES = 3
+"""Magnitudes of the nearest reference that differ: 0, at most the mean of the magnitudes around, or more."""
+MAGNITUDES = 8 * CLASSES * LEVELS
 """Contexts of magnitudes of the plain quantiser, and of each of the two of a trellis after them."""
 FIRST = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 15, 23, 39, 71, 135)
 """Smallest magnitude of each token."""
@@ -76,7 +78,7 @@ class FastDecoder:
     def __init__(self, data: bytes | memoryview, trellis: bool) -> None:
         self.trellis, self.lane_states = trellis, [0] * LANES
         size, data = number_in(memoryview(data))
-        self.flags = Adaptive(data[:size], 0, [], BLOCKS + 4 * FLAG_CLASSES)
+        self.flags = Adaptive(data[:size], 0, [], BLOCKS + 8 * FLAG_CLASSES)
         size, data = number_in(data[size:])
         self.bits, self.at = int.from_bytes(data[:size], "little"), 0
         self.words, self.word = bytes(data[size:]), 4 * LANES
@@ -141,7 +143,7 @@ class FastDecoder:
     def decode_row(self, band: BandNumbers, t: int, z: int, y: int) -> npt.NDArray[np.int32]:
         """The integers of a row, and zeros to the end of its last block."""
         values = np.zeros(band.blocks * BLOCK, np.int32)
-        near, sums, weight = self.around(band, t, z, y)
+        near, sums, weight, nearest, kin = self.around(band, t, z, y)
         if not near.any() and not self.flags.simple(ROWS + (band.blocks > 2)):
             return values
         before = 0
@@ -150,15 +152,20 @@ class FastDecoder:
         for block in range(band.blocks):
             here = slice(block * BLOCK, (block + 1) * BLOCK)
             before = self.decode_block(
-                band, (t, z, y), block, near[block], sums[here], weight, odds, before, values[here]
+                *(band, (t, z, y), block, near[block], sums[here], weight, odds),
+                *(2 * before + kin[block], nearest[here], values[here]),
             )
         return values
 
     def around(
         self, band: BandNumbers, t: int, z: int, y: int
-    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[Any], int]:
-        """Blocks that lie near filled ones; weighted sums of magnitudes; sum of the weights."""
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[Any], int, npt.NDArray[Any], list[int]]:
+        """Blocks that lie near filled ones; weighted sums of magnitudes; sum of the weights.
+
+        Then the magnitudes of the nearest reference, and which of its blocks are filled.
+        """
         near, weight = np.zeros(band.blocks, bool), 0
+        nearest, kin = np.zeros(band.blocks * BLOCK, int), [0] * band.blocks
         sums = np.zeros(band.blocks * BLOCK, int)
         for dt, dz, dy, dx, share in AROUND:
             row = t + dt, z + dz, y + dy
@@ -172,6 +179,7 @@ class FastDecoder:
             if reference is None:
                 continue
             weight += share + 2 * sides
+            nearest, kin = np.zeros_like(nearest), [0] * band.blocks
             other = self.bands[reference.band]
             *_, along = halvings = reference.halvings
             moved = [
@@ -186,14 +194,16 @@ class FastDecoder:
                     filled[j + (1 if block & 1 else -1)] if along else filled[j - 1] | filled[j + 1]
                 )
                 near[block] |= filled[j] | sides_filled
+                kin[block] = int(filled[j])
             from_x = np.minimum(np.arange(band.n[3]) >> along, other.n[3] - 1)
             magnitudes = other.row(other.magnitudes, *moved)[BLOCK + from_x]
             more = other.shift - band.shift
             magnitudes = magnitudes << min(more, 8) if more >= 0 else magnitudes >> min(-more, 8)
             there = np.zeros(len(sums) + 2, int)
             there[1 : 1 + band.n[3]] = np.minimum(magnitudes, 255)
-            sums += share * there[1:-1] + sides * (there[:-2] + there[2:])
-        return near, sums, weight
+            nearest = there[1:-1]
+            sums += share * nearest + sides * (there[:-2] + there[2:])
+        return near, sums, weight, nearest, kin
 
     def decode_block(
         self,
@@ -205,9 +215,13 @@ class FastDecoder:
         weight: int,
         odds: list[list[int]],
         before: int,
+        nearest: npt.NDArray[Any],
         values: npt.NDArray[np.int32],
     ) -> int:
-        """Decode a block into `values`; whether it may have others than 0."""
+        """Decode a block into `values`; whether it may have others than 0.
+
+        before: 2 where the block before may, 1 where that of the nearest reference is filled.
+        """
         plane = band.band.kind >> 2
         group = 0 if plane in (0, 13) else 1 + (plane - 1) % 3
         scale = np.float32(1) / np.float32(max(weight, 1))
@@ -216,7 +230,7 @@ class FastDecoder:
             octaves = half_octaves(np.float32(sums.sum()) * scale) - 2 * (127 - 3) + 1
             number = clamp(octaves, 1, FLAG_CLASSES - self.trellis)
         if number < FLAG_CLASSES:
-            flag = BLOCKS + (group > 0) * 2 * FLAG_CLASSES + 2 * number + before
+            flag = BLOCKS + ((group > 0) * FLAG_CLASSES + number) * 4 + before
             if not self.flags.simple(flag):
                 return 0
         there = slice((block + 1) * BLOCK, (block + 2) * BLOCK)
@@ -234,17 +248,23 @@ class FastDecoder:
                 right, right_sign = np.append(magnitudes[2::2], 0), np.append(signs[2::2], 0)
                 total = total + SIDE * (magnitudes[::2] + right)
                 around += [signs[::2], right_sign]
-                scale = np.float32(1) / np.float32(weight + 2 * SIDE)
+                weight += 2 * SIDE
+                scale = np.float32(1) / np.float32(weight)
             levels = [
                 clamp(half_octaves(np.float32(s) * scale) - 2 * (127 - 5) + 1, 0, LEVELS - 1)
                 for s in total.tolist()
             ]
             quantisers = [self.trellis and state & 1 for state in self.lane_states]
+            classes = np.add(nearest[x] > 0, nearest[x] * weight > total, dtype=int)
             contexts = [
-                (2 * group + parity) * LEVELS + level + (self.trellis + quantiser) * MAGNITUDES
+                ((2 * group + parity) * CLASSES + of_class) * LEVELS
+                + level
+                + (self.trellis + quantiser) * MAGNITUDES
                 if i < inside
                 else NOTHING
-                for i, level, quantiser in zip(x, levels, quantisers, strict=True)
+                for i, of_class, level, quantiser in zip(
+                    x, classes.tolist(), levels, quantisers, strict=True
+                )
             ]
             tokens = self.symbols(contexts)
             low = [band.shift + max(level - 13 >> 1, 0) for level in levels]

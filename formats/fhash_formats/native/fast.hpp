@@ -80,9 +80,11 @@ const int SIGNS = 5;         // signs that predict one: above, below, before, to
 const int SIGN_LEVELS = 16;  // half octaves of the odds of a sign
 const int SIGN_SHIFT = 3;    // from 16ths of octaves
 
-// Contexts: of magnitudes by group, parity and level, once for the plain quantiser and once for
-// each of the two of a trellis; then of signs; the last one is of nothing.
-const int MAGNITUDES = GROUPS * 2 * LEVELS, OF_SIGNS = 3 * MAGNITUDES;
+const int CLASSES = 3;  // of the nearest reference: 0, at most the mean around, more than that
+
+// Contexts: of magnitudes by group, parity, class and level, once for the plain quantiser and once
+// for each of the two of a trellis; then of signs; the last one is of nothing.
+const int MAGNITUDES = GROUPS * 2 * CLASSES * LEVELS, OF_SIGNS = 3 * MAGNITUDES;
 const int CONTEXTS = OF_SIGNS + SIGN_LEVELS, NOTHING = CONTEXTS;
 // Whether a context is one of the plain quantiser, or of a trellis; those of signs are of both.
 FHASH_INLINE bool is_used(int context, bool trellis) {
@@ -96,7 +98,7 @@ const uint32_t SLOTS = 1u << PRECISION, LEAST_STATE = 1u << 16;
 
 const int FLAG_CLASSES = 14;  // of flags of blocks, by the magnitudes around; from here on no flag
 const int LOWEST_FLAG = 3;    // the first class has means up to this many octaves below 1
-enum Flag { BANDS = 0, ROWS = 1, SHIFTS = 3, BLOCKS = 8, FLAGS = BLOCKS + 4 * FLAG_CLASSES };
+enum Flag { BANDS = 0, ROWS = 1, SHIFTS = 3, BLOCKS = 8, FLAGS = BLOCKS + 8 * FLAG_CLASSES };
 
 // Weights of the magnitudes around: above along y and beside that, two above; the same one layer
 // and one step before; the vertices of references and beside them; to the left and to the right.
@@ -237,12 +239,14 @@ template <class Self, class Range> struct Lattice {
     uint32_t agreed[KINDS][2][SIGNS][2] = {};  // by parity: how often a sign was the same, or not
     std::vector<uint8_t> nothing;              // a row of zeros
     std::vector<uint8_t> near;                 // by block: whether a block around it is filled
+    std::vector<uint8_t> kin;                  // whether that of the nearest reference is
     std::vector<uint8_t> moved[REFERENCE_COUNT];  // rows of references, at the vertices of this one
 
     struct Around {
         const uint8_t *above, *above2, *below, *below2, *below_near[2];
         const uint8_t *before, *before2, *before_near[4];
         const uint8_t* references[REFERENCE_COUNT];
+        const uint8_t* nearest;  // the last of the references that exist
         int weights[REFERENCE_COUNT], sides[REFERENCE_COUNT], count;
         int weight;  // sum of the weights of all that exist, but for left and right
     } around;
@@ -310,6 +314,7 @@ template <class Self, class Range> struct Lattice {
         band.filled_pitch = (band.blocks + WORD - 1) / WORD * WORD + 1;
         band.filled.assign((size_t)(rows * band.filled_pitch) + 2 * WORD, 0);
         near.resize((size_t)(band.blocks + WORD));
+        kin.resize((size_t)band.blocks);
         if ((int64_t)nothing.size() < band.pitch) nothing.assign((size_t)band.pitch, 0);
         all_rows(band, [&](int t, int z, int y) FHASH_LAMBDA { code_row(band, t, z, y); });
     }
@@ -362,15 +367,19 @@ template <class Self, class Range> struct Lattice {
             to.weight += BEFORE + 2 * BEFORE_SIDES +
                          BEFORE_NEAR * (back + front + up + down) + (t > 1 ? BEFORE2 : 0);
         to.count = 0;
+        to.nearest = nothing.data() + PADDING;
+        std::memset(kin.data(), 0, kin.size());
         for (int k = 0; k < REFERENCE_COUNT; k++)
             if (band.references[k].band >= 0) {
                 to.weight += REFERENCE[k] + 2 * REFERENCE_SIDES[k];
+                to.nearest = nothing.data() + PADDING;
                 look_at_reference(band, k, t, z, y);
             }
     }
 
     FHASH_INLINE void look_at_reference(Band& band, int k, int t, int z, int y) {
         Band& other = bands[(size_t)band.references[k].band];
+        std::memset(kin.data(), 0, kin.size());
         if (!other.any) return;
         const int* const halvings = band.references[k].shift;
         const int64_t number = other.row(min(t >> halvings[0], other.size[0] - 1),
@@ -384,6 +393,7 @@ template <class Self, class Range> struct Lattice {
             const int beside =
                 along ? filled[i & 1 ? j + 1 : j - 1] : filled[j - 1] | filled[j + 1];
             near[i] |= filled[j] | beside;
+            kin[i] = filled[j];
         }
         const uint8_t* from = other.magnitudes_of(number);
         if (along || shift || other.size[3] != band.size[3]) {
@@ -394,7 +404,7 @@ template <class Self, class Range> struct Lattice {
             std::memset(to.data() + end, 0, (size_t)band.pitch - end);
             from = to.data() + PADDING;
         }
-        around.references[around.count] = from;
+        around.references[around.count] = around.nearest = from;
         around.weights[around.count] = REFERENCE[k];
         around.sides[around.count++] = REFERENCE_SIDES[k];
     }
@@ -486,7 +496,8 @@ template <class Self, class Range> struct Lattice {
             if (total) flags_of = min(max(octaves, 1), FLAG_CLASSES - trellis);
         }
         if (flags_of < FLAG_CLASSES) {
-            const int context = (row.group > 0) * 2 * FLAG_CLASSES + flags_of * 2 + before;
+            const int context = ((row.group > 0) * FLAG_CLASSES + flags_of) * 4 +
+                                before * 2 + kin[(size_t)number];
             if (!flag(self().some_in_block(number, flags_of > 0), BLOCKS + context)) return 0;
         }
         self().begin_block(number);
@@ -497,13 +508,15 @@ template <class Self, class Range> struct Lattice {
                 const auto from = loaded<Signs>(row.signs_around[n] + first + LANES * parity);
                 signs[parity][n] = __builtin_convertvector(from, Ints);
             }
+        const auto nearest = __builtin_convertvector(loaded<Bytes>(around.nearest + first), Sums);
         Half even, odd;
-        find_contexts(even, places(sums, 0), 0, room);
+        find_contexts(even, places(sums, 0), places(nearest, 0), 0, room);
         foretell_signs<3>(even, signs[0], 0);
         self().code_half(even, 0);
         step_on(even, 0, room);
         const Ints seen = least(even.magnitudes >> row.shift, all(LARGEST));
-        find_contexts(odd, places(sums, 1) + SIDE * (seen + next(seen)), 1, room);
+        const Ints sides = SIDE * (seen + next(seen));
+        find_contexts(odd, places(sums, 1) + sides, places(nearest, 1), 1, room);
         signs[1][3] = even.signs;
         signs[1][4] = next(even.signs);
         foretell_signs<5>(odd, signs[1], 1);
@@ -521,9 +534,12 @@ template <class Self, class Range> struct Lattice {
     }
 
     // Levels and contexts by the sums around; those of places beyond a row are NOTHING.
-    FHASH_INLINE void find_contexts(Half& half, Ints sums, int parity, int room) const {
+    FHASH_INLINE void find_contexts(Half& half, Ints sums, Ints nearest, int parity,
+                                    int room) const {
         const Ints levels = levels_of(floats(sums) * row.scale[parity]);
-        half.contexts = levels + (row.group * 2 + parity) * LEVELS;
+        const Ints more = nearest * (around.weight + parity * 2 * SIDE) > sums;
+        const Ints of_class = -((nearest > 0) + more);
+        half.contexts = levels + ((row.group * 2 + parity) * CLASSES + of_class) * LEVELS;
         if (trellis) {
             half.quantisers = states & 1;
             half.contexts += (half.quantisers + 1) * MAGNITUDES;

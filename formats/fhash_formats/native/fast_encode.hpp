@@ -236,7 +236,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
 
     // The least values that are worth a symbol in a band.
     FHASH_INLINE void weigh_band(int kind) {
-        const int context = Base::group_of(kind) * 2 * LEVELS;
+        const int context = Base::group_of(kind) * 2 * CLASSES * LEVELS;
         least_near = MODE == GUESS ? GUESSED_ZERO : SMALLEST;
         least_far = least_near;
         if (MODE == PRICE || MODE == CHOOSE) least_far = 1 + lower[in_context(context, 1)];

@@ -327,7 +327,7 @@ CHOICES = 64
 """Distributions of the fast coder, of tokens and as many of signs, that a context may have."""
 TOKENS = 16
 """Symbols of a distribution."""
-FAST_CONTEXTS = 592
+FAST_CONTEXTS = 1744
 """Contexts of the fast coder that have a distribution."""
 SLOTS = 2048
 """Slots of a distribution: the unit of its probabilities."""

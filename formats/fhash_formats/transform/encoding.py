@@ -650,10 +650,16 @@ def _target(task: _Task, transform: Transform) -> Values:
         finite = np.where(task.finite, values, values.dtype.type(0))
     target: Values = finite.astype(settings.dtype)
     target -= settings.dtype.type(settings.center)
-    if task.counted is None or (task.coding.filled and task.finite is None):
+    if task.counted is None:
         return target
-    present = np.ones(values.shape, bool) if task.finite is None else task.finite
-    return filled(target, task.counted, present, transform, settings, task.coding.density)
+    if not (task.coding.filled and task.finite is None):
+        present = np.ones(values.shape, bool) if task.finite is None else task.finite
+        target = filled(target, task.counted, present, transform, settings, task.coding.density)
+    if settings.transform.axes[0].kind == "none":
+        # No step helps another: those beyond the end of a series take the fewest bytes as zeros.
+        steps = np.flatnonzero(task.counted.any(axis=(1, 2, 3)))
+        target[steps[-1] + 1 :] = 0
+    return target
 
 
 def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Values:
