@@ -306,7 +306,7 @@ COMPARED_QUICKLY = 1 << 18
 """The same of parts of tiles, where seconds count."""
 UNDECIDED = 0.05
 """Distance of the ratio on small parts from the one allowed from which on it decides."""
-PRICED_VERTICES = 1 << 20
+PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
@@ -361,7 +361,8 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     quick = quick and plateau_center(sample, task.value_range) is None
     coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
-    settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)
+    looked = priced(sample, settings, task.config.effort) if quick and task.goal.psnr else sample
+    settings, outcome = find_step(looked, settings, coding, task.goal, tries=2)
     require_reach(task.goal, settings, outcome)
     task.gains.note("start", outcome)
     return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding, quick=quick)

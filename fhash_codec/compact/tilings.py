@@ -72,6 +72,7 @@ class Trials:
         self._is_priced = coding.fast and task.goal.error is None
         self._known: dict[tuple[int, int], AxisTransform] = {}
         self._psnr: float | None = None
+        self._tries_own = True
         self._settled: list[Outcome] = []
         self.sizes: dict[Shape, float] = {}
         self.found: dict[Shape, tuple[TileSettings, Outcome]] = {}
@@ -143,7 +144,11 @@ class Trials:
             self._coding,
             self._known_transforms(tile),
             lines_of_trials(sample.blocks),
+            own=self._tries_own,
         )
+        if self._coding.fast and min(tile[1:]) > 1:
+            # Bases in space that are no good for one tile are none for others.
+            self._tries_own = settings.transform.axes[3].basis is not None
         for axis in (0, 1):
             self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
         same = trials is sample or self._is_priced

@@ -286,6 +286,8 @@ def rough_transform(
     coding: Coding,
     known: dict[int, AxisTransform],
     lines: int,
+    *,
+    own: bool = True,
 ) -> tuple[TileSettings, Outcome | None]:
     """Return settings with a good transform by very few trials, to compare tilings with.
 
@@ -293,6 +295,7 @@ def rough_transform(
 
     known: transforms of axes that need no trial, such as those of the same axis elsewhere.
     lines: of each tile, that the data's own bases are fitted on.
+    own: whether these are tried in space.
     """
     shape: Shape = sample.tiles[0].values.shape
     bases = Bases(sample, settings, lines)
@@ -308,12 +311,12 @@ def rough_transform(
         trials = [_changed(best[1], {axis: kind}) for kind in kinds]
         fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
         best = min([best, *_tried(sample, settings, fresh, coding)], key=itemgetter(0))
-    if bases.possible(*shape[1:]):
-        own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
-        trials = [own] if best[2] is not None else [axes, own]
+    if own and bases.possible(*shape[1:]):
+        in_space = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
+        trials = [in_space] if best[2] is not None else [axes, in_space]
         if 0 not in known and best[1][0].basis is None and bases.possible(shape[0]):
             # A basis along time may be good with bases in space alone.
-            trials.append((bases.along(0), *own[1:]))
+            trials.append((bases.along(0), *in_space[1:]))
         best = min([best, *_tried(sample, settings, trials, coding)], key=itemgetter(0))
     return _along(settings, best[1]), best[2]
 

@@ -35,6 +35,25 @@ struct BitsOut {
     }
 };
 
+// Bits of each symbol by its distribution; too many where it has no slots.
+struct SymbolBits {
+    float of[TOKENS][CERTAIN];
+    const uint8_t* const defaults;
+
+    explicit SymbolBits(const Prior& prior) : defaults(prior.defaults) {
+        for (int d = 0; d < CERTAIN; d++)
+            for (int token = 0; token < TOKENS; token++) {
+                const int slots = prior.slots[d][token];
+                of[token][d] = slots ? PRECISION - std::log2((float)slots) : 1e6F;
+            }
+    }
+    // Bits of an index in a context, by the defaults of the prior, with those of its sign.
+    FHASH_INLINE float of_index(int context, int index, int token) const {
+        const int beside = max(token - DIRECT + 1, 0);
+        return of[token][defaults[context]] + (float)(beside + (index > 0));
+    }
+};
+
 struct Task {
     int32_t* q;           // null where prices are asked for
     const float* values;  // where integers are chosen: those that they stand for
@@ -44,17 +63,9 @@ struct Task {
     const int32_t* table;
     size_t bands;
     const Prior& prior;
+    const SymbolBits& bits;
     bool trellis;
 };
-
-// Bits of an index in a context, by the defaults of the prior, with those of its sign.
-float bits_of(const Prior& prior, int context, int index) {
-    const uint16_t* const slots = prior.slots[prior.defaults[context]];
-    const int token = tokens_of(all(index))[0];
-    const int beside = max(token - DIRECT + 1, 0);
-    const float sign = index > 0;
-    return (float)(PRECISION + beside) - std::log2((float)max<int>(slots[token], 1)) + sign;
-}
 
 // What GUESS finds of a band.
 struct Known {
@@ -81,13 +92,15 @@ struct Paths {
     Floats cost[STATES];
     size_t taken = 0;  // places that were written
 
-    Paths(const Prior& prior, size_t count, float weight) : bands(count) {
-        for (int context = 0; context < 2 * MAGNITUDES; context++)
-            for (int index = 0; index < RATES; index++) {
+    explicit Paths(const Task& task) : bands(task.bands) {
+        for (int index = 0; index < RATES; index++) {
+            const int token = tokens_of(all(index))[0];
+            for (int context = 0; context < 2 * MAGNITUDES; context++) {
                 const bool raw = low_bits(context % LEVELS) > 0;
-                const float bits = raw ? 0.0F : bits_of(prior, MAGNITUDES + context, index);
-                rates[context * RATES + index] = weight * bits;
+                const float bits = task.bits.of_index(MAGNITUDES + context, index, token);
+                rates[context * RATES + index] = raw ? 0.0F : (float)task.weight * bits;
             }
+        }
         for (Floats& of : cost) of = Floats{} + 1e9F;
         cost[0] = Floats{};
     }
@@ -221,7 +234,7 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
             const bool raw_too = low_bits(context % LEVELS) > 0;
             float bits[DIRECT];
             for (int token = 0; token < DIRECT; token++)
-                bits[token] = bits_of(task.prior, context, token);
+                bits[token] = task.bits.of_index(context, token, token);
             for (int token = 0; token < TOKENS; token++) {
                 const bool direct = token > 0 && token < DIRECT && !raw_too;
                 const float more = direct ? bits[token] - bits[token - 1] : 0.0F;
@@ -448,36 +461,29 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
 };
 
 // The distribution of each context that takes the fewest bits for what was counted. Their bits.
-double choose_distributions(const uint32_t (*counts)[LANES], const Prior& prior, bool trellis,
-                            uint8_t* chosen) {
-    std::vector<float> bits((size_t)CERTAIN * TOKENS);
-    for (int d = 0; d < CERTAIN; d++)
-        for (int token = 0; token < TOKENS; token++) {
-            const int slots = prior.slots[d][token];
-            bits[(size_t)d * TOKENS + token] = slots ? PRECISION - std::log2((float)slots) : 1e6F;
-        }
+double choose_distributions(const uint32_t (*counts)[LANES], const Task& task, uint8_t* chosen) {
+    const Prior& prior = task.prior;
     double total = 0, saved = 0;
     for (int context = 0; context < CONTEXTS; context++) {
         chosen[context] = prior.defaults[context];
-        if (!is_used(context, trellis)) continue;
+        if (!is_used(context, task.trellis)) continue;
         const int first = context < OF_SIGNS ? 0 : CHOICES, in_group = context % LEVELS;
-        double numbers[TOKENS], any_number = 0, usual = 0, least = 0;
+        double sums[CHOICES] = {};
         for (int token = 0; token < TOKENS; token++) {
-            int64_t sum = 0;
-            for (int i = 0; i < LANES; i++) sum += counts[in_context(context, token)][i];
-            numbers[token] = (double)sum;
-            any_number += numbers[token];
+            const uint32_t* const of = counts[in_context(context, token)];
+            int64_t number = 0;
+            for (int i = 0; i < LANES; i++) number += of[i];
+            if (!number) continue;
+            const float* const bits = task.bits.of[token] + first;
+            for (int n = 0; n < CHOICES; n++) sums[n] += (double)number * (double)bits[n];
         }
-        for (int pass = -1; pass < CHOICES && any_number > 0; pass++) {
-            const int choice = pass < 0 ? prior.defaults[context] : pass;
-            double sum = pass < 0 ? 0 : CHOICE_BITS;
-            const float* const of = &bits[(size_t)(first + choice) * TOKENS];
-            for (int token = 0; token < TOKENS; token++) sum += numbers[token] * (double)of[token];
-            if (pass < 0) usual = least = sum;
-            if (sum >= least) continue;
-            least = sum;
-            chosen[context] = (uint8_t)choice;
-        }
+        const double usual = sums[chosen[context]];
+        double least = usual;
+        for (int n = 0; n < CHOICES; n++)
+            if (sums[n] + CHOICE_BITS < least) {
+                least = sums[n] + CHOICE_BITS;
+                chosen[context] = (uint8_t)n;
+            }
         // A group of contexts without a choice has one bit for all.
         saved = (in_group ? saved : 0) + usual - least;
         total += least;
@@ -554,8 +560,7 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
     writer->run_all();
     if constexpr (MODE == GUESS) return 0;
     uint8_t chosen[CONTEXTS];
-    results[0] = choose_distributions(writer->counts, task.prior, task.trellis, chosen) +
-                 (double)writer->raw;
+    results[0] = choose_distributions(writer->counts, task, chosen) + (double)writer->raw;
     results[1] = writer->squares;
     if constexpr (MODE == PRICE) results[0] += (double)writer->range.bits / 2048;
     results[0] /= 8;
@@ -589,7 +594,7 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
 
 // Write the integers of the best paths through the trellis.
 FHASH_INLINE int64_t write_paths(const Task& task, std::vector<uint8_t>& bytes, double* results) {
-    Paths paths(task.prior, task.bands, (float)task.weight);
+    Paths paths(task);
     const int64_t code = write<GUESS>(task, bytes, results, &paths);
     if (code < 0) return code;
     paths.trace();
@@ -605,8 +610,9 @@ int64_t FHASH_FAST(encode)(int32_t* q, const float* values, int64_t trellis, dou
                            int64_t capacity, double* results) {
     return guarded([&]() -> int64_t {
         const Prior prior = {reinterpret_cast<const uint16_t(*)[TOKENS]>(slots), defaults, nullptr};
-        const Task task = {q,     values, (float)scale,  weight, shape,
-                           table, (size_t)count, prior, trellis != 0};
+        const SymbolBits bits(prior);
+        const Task task = {q,     values,        (float)scale, weight, shape,
+                           table, (size_t)count, prior,        bits,   trellis != 0};
         std::vector<uint8_t> bytes;
         const int64_t code = !q        ? write<PRICE>(task, bytes, results)
                              : !values ? write<ENCODE>(task, bytes, results)
