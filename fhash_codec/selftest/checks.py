@@ -360,8 +360,7 @@ def _count(mask: Mask) -> float:
 SIZE = (48, 48)
 """Width and height of the picture in pixels."""
 MODES = ("stream", "arm")
-"""Modes of marching through a network. It has values of its own between vertices, where the mode
-`cache` interpolates: the pictures differ."""
+"""Modes of marching through a network; their pictures differ from those of the mode `cache`."""
 
 
 def picture(run: Run) -> Iterator[Finding]:

@@ -54,28 +54,21 @@ class Pretended:
     """The state of the pretended device.
 
     Attributes:
-        counts: launches, waits, copies (to the device), and pageable (copies among them from memory
-            that is not pinned).
+        counts: launches, waits, and copies to the device.
         waits: waits by the operation that waits.
-        launches: launches by kernel.
         free: bytes that the device says are free.
-        recording: calls of kernels (function, arguments, keywords, result) of the graph that is
-            captured at present; None while none is.
     """
 
     def __init__(self) -> None:
         self.counts: collections.Counter[str] = collections.Counter()
         self.waits: collections.Counter[str] = collections.Counter()
-        self.launches: collections.Counter[str] = collections.Counter()
         self.free = 1 << 40
-        self.recording: list[tuple[Any, Any, Any, Any]] | None = None
         self._labels: dict[int, torch.device] = {}
-        self._pinned: set[int] = set()
 
     def forget(self) -> None:
         """Set all counts to zero."""
-        for counter in (self.counts, self.waits, self.launches):
-            counter.clear()
+        self.counts.clear()
+        self.waits.clear()
 
     def label(self, tensor: torch.Tensor) -> torch.device | None:
         """Return the device that a tensor claims; None for one that torch made within itself."""
@@ -83,38 +76,20 @@ class Pretended:
 
     def claim(self, tensor: torch.Tensor, device: torch.device | None) -> torch.Tensor:
         """Note the device of a tensor's storage."""
-        self._pinned.discard(storage_of(tensor))
         if device is None:
             self._labels.pop(storage_of(tensor), None)
         else:
             self._labels[storage_of(tensor)] = device
         return tensor
 
-    def pin(self, tensor: torch.Tensor) -> torch.Tensor:
-        """Note that a tensor lies in pinned memory of the host."""
-        self.claim(tensor, CPU)
-        self._pinned.add(storage_of(tensor))
-        return tensor
-
-    def pinned(self, tensor: torch.Tensor) -> bool:
-        """Return whether a tensor lies in pinned memory."""
-        return storage_of(tensor) in self._pinned
-
     def waited(self, name: str) -> None:
         """Count a wait."""
-        self._refuse_in_a_graph(name)
         self.counts["waits"] += 1
         self.waits[name] += 1
 
-    def copied(self, source: torch.Tensor | None) -> None:
-        """Count a copy to the device; the source None is a list of Python."""
-        self._refuse_in_a_graph("a copy to the device")
+    def copied(self) -> None:
+        """Count a copy to the device."""
         self.counts["copies"] += 1
-        self.counts["pageable"] += source is None or not self.pinned(source)
-
-    def _refuse_in_a_graph(self, name: str) -> None:
-        if self.recording is not None:
-            raise RuntimeError(f"CUDA error: {name} is not permitted when a stream is capturing")
 
 
 def storage_of(tensor: torch.Tensor) -> int:
@@ -150,14 +125,11 @@ class _Kernels(TorchDispatchMode):
             self._check(base, name, given, labels)
             if base not in FREE:
                 pretended.counts["launches"] += 1
-                pretended.launches[base] += 1
         result = func(*args, **kwargs)
         known = {storage_of(tensor) for tensor in given}
         for tensor in tensors_in(result):
             if storage_of(tensor) not in known:
                 pretended.claim(tensor, device)
-        if pretended.recording is not None:
-            pretended.recording.append((func, args, kwargs, result))
         return result
 
     def _check(
@@ -170,7 +142,7 @@ class _Kernels(TorchDispatchMode):
             if labels[0] == CPU:
                 pretended.waited("copy to the host")
             elif strange:
-                pretended.copied(given[1])
+                pretended.copied()
         elif base in ("index", "index_put", "_index_put_impl"):
             self._check_index(base, given, labels)
         elif strange and (
@@ -189,9 +161,9 @@ class _Kernels(TorchDispatchMode):
         if labels[0] == CPU:
             raise MixedDevices(f"{base}: a tensor of the CPU indexed from {labels}")
         indices = given[1:] if base == "index" else given[1:-1]
-        for index, label in zip(indices, labels[1:], strict=False):
+        for label in labels[1 : 1 + len(indices)]:
             if label == CPU:
-                self.pretended.copied(index)
+                self.pretended.copied()
         if base == "index":
             filled = False
         else:
@@ -226,10 +198,6 @@ class _Interface(TorchFunctionMode):
             return func(*args, **kwargs)
         if name in ("to", "cpu", "cuda"):
             return self._moved(func, name, args, kwargs)
-        if name == "pin_memory":
-            return pretended.pin(args[0].clone())
-        if name == "is_pinned":
-            return pretended.pinned(args[0])
         return self._made(func, name, args, kwargs)
 
     def _attribute(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
@@ -260,7 +228,7 @@ class _Interface(TorchFunctionMode):
         if goal == CPU and before == CUDA:
             self.pretended.waited("copy to the host")
         elif goal == CUDA:
-            self.pretended.copied(tensor)
+            self.pretended.copied()
         with torch._C.DisableTorchFunction():
             moved = moved.clone() if storage_of(moved) == storage_of(tensor) else moved
         return self.pretended.claim(moved, goal)
@@ -270,18 +238,14 @@ class _Interface(TorchFunctionMode):
         pretended, goal = self.pretended, None
         if kwargs.get("device") is not None:
             goal, kwargs["device"] = _device(kwargs["device"]), CPU
-        pinned = bool(kwargs.pop("pin_memory", False))
         result = func(*args, **kwargs)
         made = isinstance(result, torch.Tensor) and not tensors_in(args, kwargs)
-        if pinned:
-            return pretended.pin(result)
         if goal is not None:
             if goal == CUDA:
                 if name in ("tensor", "as_tensor"):
-                    pretended.copied(None)
+                    pretended.copied()
                 elif name.split("_like")[0].removeprefix("new_") != "empty":
                     pretended.counts["launches"] += made
-                    pretended.launches[name] += made
             return pretended.claim(result, goal)
         # One that torch makes within itself has no claim: it follows its operands.
         return pretended.claim(result, CPU) if made else result
@@ -289,34 +253,6 @@ class _Interface(TorchFunctionMode):
 
 def _device(name: str | torch.device) -> torch.device:
     return CUDA if torch.device(name).type == "cuda" else CPU
-
-
-class _Graph:
-    """`torch.cuda.CUDAGraph`: the kernels of a capture, run again on the same memory.
-
-    Numbers of Python and addresses stay those of the capture, as in a graph of CUDA. The capture
-    itself has already run the kernels, so the first replay does nothing.
-    """
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[Any, Any, Any, Any]] = []
-        self.replays = 0
-
-    def pool(self) -> tuple[int, int]:
-        return (0, 0)
-
-    def replay(self) -> None:
-        self.replays += 1
-        if self.replays == 1:
-            return
-        for func, args, kwargs, result in self.calls:
-            if func.name().split("::")[1].split(".")[0] in FREE:
-                continue
-            known = {storage_of(tensor) for tensor in tensors_in(args, kwargs)}
-            again = func(*args, **kwargs)
-            for old, new in zip(tensors_in(result), tensors_in(again), strict=True):
-                if storage_of(old) not in known:
-                    old.copy_(new)
 
 
 @contextmanager
@@ -327,14 +263,6 @@ def pretended_cuda() -> Iterator[Pretended]:
     def from_numpy(array: Any) -> torch.Tensor:
         return pretended.claim(plain(array), CPU)
 
-    @contextmanager
-    def capture(graph: _Graph, **_: Any) -> Iterator[None]:
-        pretended.recording = graph.calls
-        try:
-            yield
-        finally:
-            pretended.recording = None
-
     def synchronize(*_: Any) -> None:
         pretended.waited("synchronize")
 
@@ -343,8 +271,6 @@ def pretended_cuda() -> Iterator[Pretended]:
         "mem_get_info": lambda *_: (pretended.free, 1 << 40),
         "synchronize": synchronize,
         "get_device_name": lambda *_: "pretended",
-        "CUDAGraph": _Graph,
-        "graph": capture,
     }
     with ExitStack() as stack:
         stack.enter_context(patch.object(torch, "from_numpy", from_numpy))

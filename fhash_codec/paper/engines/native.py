@@ -3,7 +3,7 @@
 It does what the slab engine does, and both go on from each other's state. What a brick needs stays
 in a core's cache from the upsampling to Adam. Like the finest embeddings, the numbers of the
 largest coarse table take part in the steps that need them alone, in blocks: they catch up on the
-steps between in closed form (`training.adam.catch_up`).
+steps between in closed form (`parameters.catch_up`).
 
 The bricks of a batch are divided among the threads in a fixed way. The same seed, number of
 threads and instructions of the processor give the same bits.

@@ -74,36 +74,9 @@ def adam_step(
         rate: learning rate.
     """
     correction, pace = corrections(step, rate)
-    _average(gradient, mean, square)
-    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
-
-
-def adam_step_on_device(
-    parameter: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    correction: Tensor,
-    pace: Tensor,
-) -> None:
-    """Do what `adam_step` does, by numbers on the device: a captured graph reads them anew.
-
-    Args:
-        parameter: the numbers to move.
-        gradient: their gradient.
-        mean: mean of the gradients.
-        square: mean of the squared gradients.
-        correction: factor of the root, of no axis (`corrections`).
-        pace: pace, of no axis.
-    """
-    _average(gradient, mean, square)
-    parameter.addcdiv_(mean * pace, square.sqrt().mul_(correction).add_(EPSILON), value=-1.0)
-
-
-def _average(gradient: Tensor, mean: Tensor, square: Tensor) -> None:
-    """Let a gradient into the mean of gradients and the mean of their squares, in place."""
     mean.lerp_(gradient, 1 - BETA1)
     square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
 
 
 def catch_up(visited: Longs, step: int, rates: Double) -> CatchUp:

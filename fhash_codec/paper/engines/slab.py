@@ -3,48 +3,40 @@
 A training sample is a lattice vertex. Its embedding at the finest level is therefore one entry of
 the table, and every coarser level is a separable linear upsampling of a small sub-lattice; no 16
 corners are looked up per sample. The unit of work is a brick of vertices of one key frame, and a
-batch is a random set of bricks. The same code runs on a CPU and on CUDA; there the host never waits
-for a step, sends it one message (`Sender`), and launches it as one graph (`StepGraphs`).
+batch is a random set of bricks. The same operations of torch run on a CPU and on CUDA. There, slab
+trains the models that the kernels of `fused`, which is faster, do not take.
 
 The finest embeddings are stored for the samples alone, brick by brick. Adam visits just the bricks
 of a batch, yet gives what a dense Adam gives: a brick that was passed over catches up on its
-missing steps, whose gradient is zero, in closed form before it is used (`training.adam.catch_up`).
+missing steps, whose gradient is zero, in closed form before it is used (`parameters.catch_up`).
 """
 
 from __future__ import annotations
 
-import warnings
-from collections import Counter
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from math import prod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from fhash_codec.devices import first_line
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.parameters import (
-    CatchUp,
     Chosen,
     Lattices,
     Parameters,
     Upsampling,
     adam_step,
-    adam_step_on_device,
     catch_up,
     catch_up_numbers,
     check_state,
-    corrections,
     initial_parameters,
     layer_matrices,
     true_positions,
 )
 from fhash_codec.paper.network import Architecture
-from fhash_formats.errors import FhashWarning
 
 
 class Columns(NamedTuple):
@@ -85,135 +77,10 @@ def columns_of(in_coreset: Tensor, offsets: Tensor, none: int, alone: int | None
     return Columns(bricks, ranks[vertices], vertices, None)
 
 
-WARM_UPS = 2
-"""Steps of a shape that run kernel by kernel before one is captured: libraries start up in them."""
-MAX_GRAPHS = 64
-"""Shapes that are captured, at most; each holds the memory of a step's results."""
-
-
-class StepGraphs:
-    """The captured steps by their shape.
-
-    A step must read whatever changes from one step to the next from the same memory at each call,
-    and write to the same memory, but for its result.
-    """
-
-    def __init__(self) -> None:
-        self._captured: dict[Hashable, tuple[Any, Tensor]] = {}
-        self._seen: Counter[Hashable] = Counter()
-        self._failed = False
-
-    def run(self, shape: Hashable, step: Callable[[], Tensor]) -> Tensor:
-        """Do a step and return its result, a tensor of its own.
-
-        The third step of a shape is captured. Where that fails, this and all later steps run kernel
-        by kernel, with one FhashWarning.
-        """
-        if shape not in self._captured:
-            self._seen[shape] += 1
-            early = self._seen[shape] <= WARM_UPS
-            if early or self._failed or len(self._captured) == MAX_GRAPHS:
-                return step()
-            try:
-                self._captured[shape] = self._capture(step)
-            except RuntimeError as error:
-                self._failed = True
-                warnings.warn(
-                    f"no CUDA graph of a training step ({first_line(error)}); training goes on "
-                    "kernel by kernel, which is slower",
-                    FhashWarning,
-                    stacklevel=3,
-                )
-                return step()
-        graph, result = self._captured[shape]
-        graph.replay()
-        return result.clone()
-
-    def _capture(self, step: Callable[[], Tensor]) -> tuple[Any, Tensor]:
-        """Return the graph of a step, and where its result lies after each replay."""
-        graph = torch.cuda.CUDAGraph()
-        # Graphs share their memory: one runs after the other, and each result is copied at once.
-        pool = next(iter(self._captured.values()))[0].pool() if self._captured else None
-        with torch.cuda.graph(graph, pool=pool):
-            result = step()
-        return graph, result
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sent:
-    """A batch of bricks and the numbers of its step, on the device.
-
-    Attributes:
-        ids: numbers of the bricks, int64 (bricks,).
-        caught_up: the columns of `adam.CatchUp`, float32 (4, bricks).
-        correction: `adam.corrections`' factor of the root, float32 ().
-        pace: `adam.corrections`' pace, float32 ().
-        scale: factor of the gradients, float32 ().
-    """
-
-    ids: Tensor
-    caught_up: Tensor
-    correction: Tensor
-    pace: Tensor
-    scale: Tensor
-
-
-class Sender:
-    """Memory on a device for the numbers of steps, one piece for each number of bricks.
-
-    On CUDA the numbers go through pinned memory, so that the host does not wait, and always to the
-    same place for a batch of one size, so that a captured graph finds them there.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._memory: dict[int, Tensor] = {}
-
-    def send(
-        self,
-        chosen: npt.NDArray[np.int64],
-        columns: CatchUp,
-        scalars: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> Sent:
-        """Return a step's numbers on the device. The next call with as many bricks overwrites them.
-
-        Args:
-            chosen: numbers of the bricks, int64 (bricks,).
-            columns: effect of the steps that the bricks were passed over.
-            scalars: correction, pace and scale.
-        """
-        count = len(chosen)
-        # The int64 come first: so all numbers lie at multiples of their own size.
-        parts = (np.ascontiguousarray(chosen), *columns, np.array(scalars, dtype=np.float32))
-        received = self._received(np.concatenate([part.view(np.uint8) for part in parts]), count)
-        numbers = received[8 * count :].view(torch.float32)
-        correction, pace, scale = numbers[4 * count :].unbind()
-        return Sent(
-            ids=received[: 8 * count].view(torch.int64),
-            caught_up=numbers[: 4 * count].view(4, count),
-            correction=correction,
-            pace=pace,
-            scale=scale,
-        )
-
-    def _received(self, packed: npt.NDArray[np.uint8], count: int) -> Tensor:
-        """Return bytes on the device."""
-        if self._device.type == "cpu":
-            return torch.from_numpy(packed)
-        if count not in self._memory:
-            self._memory[count] = torch.empty(len(packed), dtype=torch.uint8, device=self._device)
-        # Fresh at each step: torch hands pinned memory out again only after its copy is done.
-        pinned = torch.empty(len(packed), dtype=torch.uint8, pin_memory=True)
-        pinned.numpy()[:] = packed
-        return self._memory[count].copy_(pinned, non_blocking=True)
-
-
 LIBRARIES = 1 << 28
 """Bytes for the libraries of CUDA: their code and the workspaces of matrix products."""
 UNEVEN = 2
 """Largest number of bricks of a batch, as a multiple of the mean: batches have as many samples."""
-TIMES = 2
-"""Copies of a step's memory: captured graphs hold theirs beside that of the first steps."""
 
 
 def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> int:
@@ -235,7 +102,7 @@ def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> 
     # Four vectors of the numbers in use, their places, rank, mask, and the initial tables.
     held += coarse * (4 * 4 + 8 + 4 + 1 + 4) + 16 * network
     batch = min(UNEVEN * -(-bricks // batches), bricks)
-    return LIBRARIES + held + TIMES * batch * vertices * _bytes_a_vertex(architecture)
+    return LIBRARIES + held + batch * vertices * _bytes_a_vertex(architecture)
 
 
 def _bytes_a_vertex(architecture: Architecture) -> int:
@@ -312,7 +179,6 @@ class SlabEngine:
         self.offsets = torch.from_numpy(coreset.offsets).to(device)
         self._bits = torch.arange(7, -1, -1, device=device, dtype=torch.uint8)
         self._scratch_memory: dict[str, Tensor] = {}
-        self._sender, self._graphs = Sender(device), StepGraphs()
         self.upsampling = Upsampling(architecture, coreset, device)
 
         start = initial_parameters(architecture, coreset, seed)
@@ -336,55 +202,39 @@ class SlabEngine:
     def train(self, chosen: Chosen) -> Tensor:
         """Do one training step on a batch; return the sum of squared errors before it."""
         samples = int(self.counts[chosen].sum())
-        self.step += 1
-        sent = self._sender.send(
-            chosen,
-            catch_up(self.visited[chosen], self.step - 1, self.rates),
-            (*corrections(self.step, float(self.rates[self.step])), 2.0 / max(samples, 1)),
-        )
-        if self.on_cpu:
-            error = self._step(sent, samples)
-        else:
-            picked = samples if self._is_sparse(samples, len(chosen)) else None
-            error = self._graphs.run((len(chosen), picked), lambda: self._step(sent, samples))
-        self.visited[chosen] = self.step
-        return error
-
-    def _step(self, sent: Sent, samples: int) -> Tensor:
-        """Do a training step on the device; return the sum of squared errors before it.
-
-        Args:
-            sent: the batch.
-            samples: samples of the batch.
-        """
-        columns = self._columns(sent.ids, samples)
-        numbers = self._caught_up(sent, columns)
-        lattices = self.upsampling.lattices(self.bricks[sent.ids])
+        ids, effect = self._sent(chosen)
+        columns = self._columns(ids, samples)
+        numbers = self._caught_up(effect, columns)
+        lattices = self.upsampling.lattices(self.bricks[ids])
         inputs = self._inputs(lattices, numbers[0], columns)
         self.gradient.zero_()
-        error, input_gradient = self._backpropagate(inputs, columns, sent.scale)
+        error, input_gradient = self._backpropagate(inputs, columns, 2.0 / max(samples, 1))
         size = len(self.fine)
         level_gradients = self._at_all_vertices(input_gradient[size:], columns)
         lattices.add_transposed(self.gradient, self._by_level(level_gradients))
 
+        self.step += 1
+        step, rate = self.step, float(self.rates[self.step])
         fine, mean, square = numbers
-        self._move((fine, input_gradient[:size], mean, square), sent)
-        vectors = (self.flat, self.gradient, self.flat_mean, self.flat_square)
+        adam_step(fine, input_gradient[:size], mean, square, step, rate)
         for part in self._chunks(len(self.flat), ADAM_PART):
-            self._move(tuple(vector[part] for vector in vectors), sent)
+            mean, square = self.flat_mean[part], self.flat_square[part]
+            adam_step(self.flat[part], self.gradient[part], mean, square, step, rate)
         self._numbers.index_copy_(2, columns.ranks, numbers)
+        self.visited[chosen] = step
         return error
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
         """Return the values (n,) at the samples of some bricks."""
-        sent, count = self._sent(chosen), int(self.counts[chosen].sum())
-        columns = self._columns(sent.ids, count)
+        count = int(self.counts[chosen].sum())
+        ids, effect = self._sent(chosen)
+        columns = self._columns(ids, count)
         if self.settled == self.step:
             fine = self._numbers[0].index_select(1, columns.ranks)
         else:
-            fine = self._caught_up(sent, columns)[0]
-        lattices = self.upsampling.lattices(self.bricks[sent.ids])
+            fine = self._caught_up(effect, columns)[0]
+        lattices = self.upsampling.lattices(self.bricks[ids])
         values = self._value(self._inputs(lattices, fine, columns))
         if columns.in_coreset is None:
             return values
@@ -396,10 +246,9 @@ class SlabEngine:
         for first in range(0, len(self.bricks), FLUSH):
             end = min(first + FLUSH, len(self.bricks))
             span = slice(*self.coreset.offsets[[first, end]].tolist())
-            effect = self._sent(np.arange(first, end)).caught_up.repeat_interleave(
-                self.offsets[first : end + 1].diff(), dim=1, output_size=span.stop - span.start
-            )
-            catch_up_numbers(self._numbers[..., span], effect)
+            _, effect = self._sent(np.arange(first, end))
+            samples = self.offsets[first : end + 1].diff()
+            catch_up_numbers(self._numbers[..., span], effect.repeat_interleave(samples, dim=1))
         self.visited[self.visited > 0] = self.step
         self.settled = self.step
 
@@ -431,31 +280,34 @@ class SlabEngine:
         for name in STATE:
             getattr(self, name).copy_(torch.from_numpy(state[name]))
 
-    def _sent(self, chosen: Chosen) -> Sent:
-        """Return bricks on the device, with what they missed up to the present step."""
-        return self._sender.send(chosen, catch_up(self.visited[chosen], self.step, self.rates))
+    def _sent(self, chosen: Chosen) -> tuple[Tensor, Tensor]:
+        """Return bricks on the device, and what they missed up to the present step.
+
+        Returns:
+            Their numbers (bricks,), and the columns of `CatchUp` (4, bricks).
+        """
+        effect = np.stack(catch_up(self.visited[chosen], self.step, self.rates))
+        ids = torch.from_numpy(np.ascontiguousarray(chosen))
+        return ids.to(self.device), torch.from_numpy(effect).to(self.device)
 
     def _columns(self, ids: Tensor, samples: int) -> Columns:
         """Return the columns of the MLP's inputs for bricks that have so many samples."""
-        alone = samples if self._is_sparse(samples, len(ids)) else None
+        alone = samples if samples <= FULL * len(ids) * self.vertices else None
         return columns_of(self._in_coreset(ids), self.offsets[ids], len(self.values) - 1, alone)
 
-    def _caught_up(self, sent: Sent, columns: Columns) -> Tensor:
+    def _caught_up(self, effect: Tensor, columns: Columns) -> Tensor:
         """Return what a dense Adam has for columns of bricks that missed steps.
 
         The numbers (3, E, columns) are the finest embeddings, their mean and their square.
+        `effect` is that of `_sent`.
         """
         numbers = self._numbers.index_select(2, columns.ranks)
         if columns.vertices is None:
-            effect = sent.caught_up.unsqueeze(2).expand(-1, -1, self.vertices).reshape(4, -1)
+            effect = effect.unsqueeze(2).expand(-1, -1, self.vertices).reshape(4, -1)
         else:
-            effect = sent.caught_up[:, columns.vertices // self.vertices]
+            effect = effect[:, columns.vertices // self.vertices]
         catch_up_numbers(numbers, effect)
         return numbers
-
-    def _is_sparse(self, samples: int, bricks: int) -> bool:
-        """Return whether a batch has so few samples that the MLP takes them alone."""
-        return samples <= FULL * bricks * self.vertices
 
     def _in_coreset(self, ids: Tensor) -> Tensor:
         """Return which vertices (bricks, vertices) are in the coreset, as 0 and 1, uint8."""
@@ -508,15 +360,6 @@ class SlabEngine:
         size = most if self.on_cpu else max(count, 1)
         return [slice(first, first + size) for first in range(0, count, size)]
 
-    def _move(self, tensors: tuple[Tensor, ...], sent: Sent) -> None:
-        """Do a step of Adam on parameters, their gradient and its moments."""
-        parameter, gradient, mean, square = tensors
-        if self.on_cpu:
-            rate = float(self.rates[self.step])
-            adam_step(parameter, gradient, mean, square, self.step, rate)
-        else:
-            adam_step_on_device(parameter, gradient, mean, square, sent.correction, sent.pace)
-
     def _forward(self, inputs: Tensor) -> list[Tensor]:
         """Return the activations of each layer for a chunk of samples, the inputs first.
 
@@ -536,7 +379,7 @@ class SlabEngine:
         return activations
 
     def _backpropagate(
-        self, inputs: Tensor, columns: Columns, scale: Tensor
+        self, inputs: Tensor, columns: Columns, scale: float
     ) -> tuple[Tensor, Tensor]:
         """Return the sum of squared errors, and the gradient of scale/2 times it by the inputs.
 
@@ -545,7 +388,7 @@ class SlabEngine:
         Args:
             inputs: inputs of the MLP (levels E + 1, columns).
             columns: the columns.
-            scale: factor of the gradients, of no axis.
+            scale: factor of the gradients.
         """
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
@@ -572,13 +415,10 @@ class SlabEngine:
         return error, gradient
 
     def _scratch(self, name: str, rows: int, columns: int) -> Tensor:
-        """Return an uninitialised matrix, on a CPU in the same memory at every call with a name.
+        """Return an uninitialised matrix, in the same memory at every call with a name.
 
-        Fresh pages would cost more than the arithmetic on them. On CUDA torch keeps freed memory
-        itself, and a captured graph must not refer to memory that a larger batch replaces.
+        Fresh pages would cost more than the arithmetic on them.
         """
-        if not self.on_cpu:
-            return torch.empty(rows, columns, device=self.device)
         memory = self._scratch_memory.get(name)
         if memory is None or len(memory) < rows * columns:
             memory = self._scratch_memory[name] = torch.empty(rows * columns, device=self.device)

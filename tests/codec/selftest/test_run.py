@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
+from fhash_codec.rendering.plan import plan_picture
+from fhash_codec.rendering.scenes import Scene
 from fhash_codec.selftest import checks, ray_cases, value_cases
 from fhash_codec.selftest.case import Case, Check, Finding, Run, describe_machine, environment
 from fhash_codec.selftest.field_cases import TIME_CASES, series
@@ -462,6 +464,18 @@ def test_a_picture_that_differs_from_that_of_float64_is_seen(
     reference = ray_cases.reference_picture
     monkeypatch.setattr(ray_cases, "reference_picture", lambda *given: reference(*given) + 2e-3)
     assert broken(compact_run, checks.picture) == {"float64 picture"}
+
+
+def test_the_float64_picture_of_a_network_is_the_same_on_a_gpu(
+    paper_run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There `auto` marches through the network, whose values between vertices are others."""
+    (here,) = (each for each in checks.picture(paper_run) if each.name == "float64 picture")
+    monkeypatch.setattr("fhash_codec.rendering.plan.arrays_on", lambda device: device)
+    assert plan_picture(paper_run.volume, Scene()).mode == "arm"
+    (there,) = (each for each in checks.picture(paper_run) if each.name == "float64 picture")
+    assert there.worst == here.worst
+    assert here.holds
 
 
 @pytest.mark.parametrize("thorough", [False, True])

@@ -76,7 +76,7 @@ def _axis_tables(size: int, resolutions: list[int], length: int, count: int) -> 
 def missed_step_tables(
     rates: npt.NDArray[np.float64],
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Return the two tables by which a kernel sums what `training.adam.catch_up` sums.
+    """Return the two tables by which a kernel sums what `parameters.catch_up` sums.
 
     A step i after the last one with a gradient, step j in all, moves a number by
     r^i rate_j c_j m / (sqrt(v) + eps ...), as said there; the sum for eps has b1^i rate_j / (1 -

@@ -20,10 +20,8 @@ from fhash_codec.paper.engines.parameters import (
     SPREAD,
     Upsampling,
     adam_step,
-    adam_step_on_device,
     catch_up,
     catch_up_numbers,
-    corrections,
     initial_parameters,
     true_positions,
 )
@@ -152,21 +150,6 @@ def test_a_step_is_that_of_torch() -> None:
         theirs.grad = gradient
         adam.step()
     torch.testing.assert_close(ours, theirs.detach(), rtol=1e-10, atol=1e-12)
-
-
-def test_a_step_by_numbers_on_the_device_is_the_same() -> None:
-    random = torch.Generator().manual_seed(1)
-    here = [torch.rand(50, generator=random) for _ in range(4)]
-    there = [tensor.clone() for tensor in here]
-    for step in (1, 2, 30):
-        adam_step(*here, step, 0.01)
-        correction, pace = (torch.tensor(number) for number in corrections(step, 0.01))
-        adam_step_on_device(*there, correction, pace)
-    for ours, theirs in zip(here, there, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)
-    before = there[0].clone()
-    adam_step_on_device(*there, torch.tensor(1.0), torch.tensor(0.0))  # the end of a schedule
-    assert torch.equal(there[0], before)
 
 
 def test_catching_up_equals_stepping_without_gradient() -> None:
