@@ -21,7 +21,7 @@ from reference.labels import number_in
 
 LANES, BLOCK, LEVELS = 8, 16, 24
 CLASSES = 3
-"""Magnitudes of the nearest reference that differ: 0, at most the mean of the magnitudes around, or more."""
+"""Kinds of magnitudes of the nearest reference: 0, at most the mean of those around, or more."""
 MAGNITUDES = 8 * CLASSES * LEVELS
 """Contexts of magnitudes of the plain quantiser, and of each of the two of a trellis after them."""
 FIRST = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 15, 23, 39, 71, 135)
