@@ -306,6 +306,8 @@ COMPARED_QUICKLY = 1 << 18
 """The same of parts of tiles, where seconds count."""
 UNDECIDED = 0.05
 """Distance of the ratio on small parts from the one allowed from which on it decides."""
+PLAIN_COSTS = 1.03
+"""Factor of the bytes by the plain quantiser on small parts, where the trellis is as good later."""
 PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 SAMPLE_VERTICES = 6 << 20
@@ -476,57 +478,93 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        fast, tried = _has_fast_coder(task, attempt), attempt.coding.fast
-        attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
-        searched = _searched_sample(task, attempt)
+        if attempt.quick:
+            attempt = _with_coder(task, attempt)
+            return _searched_step(task, attempt, _searched_sample(task, attempt))
         on = allows_trellis(attempt.settings, task.goal, task.config.effort)
-        if fast and attempt.quick and task.goal.psnr is not None:
-            step = step_after(attempt.settings, attempt.outcome, task.goal, task.slope.slope)
-            settings, coding = replace(attempt.settings, step=step), attempt.coding
-            if on:
-                settings, coding = on_trellis(settings, coding)
-            attempt = replace(attempt, settings=settings, coding=coding)
-        elif on:
+        fast, tried = _has_fast_coder(task, attempt, on=on), attempt.coding.fast
+        attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+        if on:
             settings, coding, outcome = choose_quantiser(
-                searched, attempt.settings, attempt.coding, task.goal, fast=tried
+                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
             )
             attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
-        return _searched_step(task, attempt, searched)
+        return _searched_step(task, attempt, attempt.sample)
 
 
-def _has_fast_coder(task: PlanTask, attempt: Attempt) -> bool:
-    """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it."""
-    access, settings = task.config.access, attempt.settings
+def _has_fast_coder(task: PlanTask, attempt: Attempt, *, on: bool) -> bool:
+    """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it.
+
+    on: whether on the trellis.
+    """
     if not task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size):
         return False
     if task.config.effort == 1:
         return True
     part = attempt.sample.narrowed(COMPARED_VERTICES)
-    if attempt.quick:
-        parts = task.blocks.retile(sub_tile(part.blocks.tile, COMPARED_QUICKLY))
-        usual = replace(settings, transform=usual_transform(parts.tile))
-        small = _sample(task, parts, usual, COMPARED_QUICKLY)
-        ratio = _bytes_of_fast(task, attempt, small, moved_transform(small, settings))
-        low, high = (FAST_BYTES[access] + away for away in (-UNDECIDED, UNDECIDED))
-        if not low < ratio < high:
-            return ratio <= low
-    return _bytes_of_fast(task, attempt, part, settings) <= FAST_BYTES[access]
+    costs = [_trial(task, attempt, part, fast=fast, on=on) for fast in (True, False)]
+    return _is_fast_enough(task, costs, 0.0) is not False
 
 
-def _bytes_of_fast(task: PlanTask, attempt: Attempt, part: Sample, settings: TileSettings) -> float:
-    """Return the bytes of the fast coder as a multiple of those of the other, at equal quality."""
-    goal, coding = task.goal, attempt.coding
-    if allows_trellis(settings, goal, task.config.effort):
-        settings, coding = on_trellis(settings, coding)
-    fast = part.run(settings, goal.bounded(replace(coding, fast=True)))
-    mixed = part.run(settings, goal.bounded(replace(coding, fast=False)))
-    size = float(mixed.size)
-    if goal.error is None and goal.data_range > 0 and mixed.squares and fast.squares:
-        better = fast.psnr(goal.data_range) - mixed.psnr(goal.data_range)
-        size *= 2 ** (better / EXCHANGE)
-    ratio = fast.size / max(size, 1.0)
+def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt with coder and quantiser chosen on parts of few tiles.
+
+    Where these leave it open, the coders are compared once more on whole tiles.
+    """
+    settings, goal = attempt.settings, task.goal
+    parts = task.blocks.retile(sub_tile(attempt.sample.blocks.tile, COMPARED_QUICKLY))
+    usual = replace(settings, transform=usual_transform(parts.tile))
+    small = _sample(task, parts, usual, COMPARED_QUICKLY)
+    moved = replace(attempt, settings=moved_transform(small, settings))
+    slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
+    quantisers = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
+    best = [
+        min(
+            (_trial(task, moved, small, fast=fast, on=on) * (1.0 if on else PLAIN_COSTS), not on)
+            for on in quantisers
+        )
+        for fast in ((True, False) if slow else (False,))
+    ]
+    fast = slow
+    if slow:
+        found = _is_fast_enough(task, [cost for cost, _ in best], UNDECIDED)
+        if found is None:
+            part = attempt.sample.narrowed(COMPARED_VERTICES)
+            costs = [
+                _trial(task, attempt, part, fast=fast, on=not plain)
+                for fast, (_, plain) in zip((True, False), best, strict=True)
+            ]
+            found = _is_fast_enough(task, costs, 0.0)
+        fast = found is not False
+    plain = best[0 if fast else -1][1]
+    if goal.psnr is not None:
+        settings = replace(
+            settings, step=step_after(settings, attempt.outcome, goal, task.slope.slope)
+        )
+    coding = replace(attempt.coding, fast=fast)
+    settings, coding = (settings, coding) if plain else on_trellis(settings, coding)
+    return replace(attempt, settings=settings, coding=coding)
+
+
+def _trial(task: PlanTask, attempt: Attempt, part: Sample, *, fast: bool, on: bool) -> float:
+    """Return the bytes of a part by one of the coders, at equal quality.
+
+    on: whether on the trellis.
+    """
+    how = attempt.settings, replace(attempt.coding, fast=fast)
+    settings, coding = on_trellis(*how) if on else how
+    return _cost(part.run(settings, task.goal.bounded(coding)), task.goal)
+
+
+def _is_fast_enough(task: PlanTask, costs: Sequence[float], undecided: float) -> bool | None:
+    """Whether the fast coder takes few enough bytes; None where they come too near the limit.
+
+    costs: bytes by the fast coder and by the other one.
+    undecided: distance from the limit up to which it is left open.
+    """
+    ratio, limit = costs[0] / max(costs[1], 1.0), FAST_BYTES[task.config.access]
     tell("step", f"the fast coder takes {ratio:.3f} times the bytes")
-    return ratio
+    return None if abs(ratio - limit) < undecided else ratio <= limit
 
 
 def _searched_sample(task: PlanTask, attempt: Attempt) -> Sample:
