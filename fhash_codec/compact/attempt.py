@@ -450,8 +450,7 @@ class Attempt:
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
     quick: bool = False
-    """Whether trials are few, and coded by the fast coder.
-
-    Not where many values are alike: of the sharp shells in a plateau the two coders make so
-    different numbers of bytes, up to 1.7, that one does not tell what the other would choose.
-    """
+    """Whether trials are few, and priced or coded by the fast coder."""
+    sharp: bool = False
+    """Whether trials are some more, since many values are alike: beside a plateau are often shocks,
+    for which other transforms are good, and of which one part tells little of others."""

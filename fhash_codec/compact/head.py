@@ -84,7 +84,7 @@ EFFORTS = {
         candidates=0,
         budget=None,
         perceptron=Budget(updates=2000, samples=400_000, rate=3e-2),
-        least=0.02,
+        least=0.03,
         least_bytes=12_000,
         most_bits=0.75,
     ),
@@ -318,12 +318,11 @@ def _searched(
     if not heads:
         return None
     trained = [(head, replace(settings, head=head.head)) for head, settings in heads]
-    if without.aim is None and len(trained) == 1:
-        head, settings = trained[0]
-        return _Candidate(head, *find_step(settings))
     candidates = [_Candidate(head, settings, look(settings)) for head, settings in trained]
     best = min(candidates, key=without.extra_bytes)
     if without.aim is None:
+        if without.extra_bytes(best) > POINTLESS * without.outcome.size:
+            return best
         return _Candidate(best.trained, *find_step(best.settings))
     missing = without.aim - best.outcome.psnr(without.data_range)
     if abs(missing) < CLOSE or without.extra_bytes(best) > POINTLESS * without.outcome.size:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from math import prod
 
 import numpy as np
@@ -14,7 +13,7 @@ from fhash_codec.compact.attempt import FAST_BYTES, Attempt, PlanTask, Tiling, s
 from fhash_codec.compact.goal import EXCHANGE, Goal, step_after_gain
 from fhash_codec.compact.head import choose_head
 from fhash_codec.compact.predictor import choose_predictor
-from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, priced
+from fhash_codec.compact.sample import MAX_PRICED_EFFORT, Sample, mask_levels, priced
 from fhash_codec.compact.step import (
     EXACT,
     NEAR,
@@ -30,7 +29,7 @@ from fhash_codec.compact.step import (
     step_after,
     with_step,
 )
-from fhash_codec.compact.tiles import Blocks, Coding, Outcome, Tile
+from fhash_codec.compact.tiles import Blocks, Coding, Outcome
 from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
     adapted_transform,
@@ -41,10 +40,8 @@ from fhash_codec.compact.transform import (
     tile_costs,
     usual_transform,
 )
-from fhash_codec.features.features import Feature, Interval, Isosurface, Segmentation
 from fhash_codec.measure.value_range import ValueRange, mean_of
 from fhash_codec.progress import skip, stage, tell
-from fhash_formats.transform.coder import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
 from fhash_formats.transform.encoding import OFFSETS
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
@@ -95,131 +92,6 @@ def _rounded_center(center: float) -> float:
     return float(np.float32(center)) if abs(center) < MAX_CENTER else center
 
 
-EDGE_OFFSETS = {
-    1: (0, 0.15, 0.35, 0.6, 1, 1.5, 2.2, 3.2),
-    2: (0, 0.4, 1, 2.2),
-    5: (0, 0.8),
-    MAX_EDGES: (0,),
-}
-"""Edges to both sides of a threshold, in errors, by the largest number of thresholds for them."""
-MIN_PROBABILITY = 2.0**-16
-"""Smallest probability that a score expresses."""
-CLASSES = 16
-"""Number of classes of values where scores are learned."""
-
-
-def mask_levels(
-    features: Sequence[Feature], dilation: int, error: float, tiles: Iterable[Tile]
-) -> MaskLevels:
-    """Return the scores for features.
-
-    Features without thresholds, or with too many of them, are learned from tiles.
-
-    features: what was selected.
-    dilation: vertices by which the features were grown.
-    error: root of the mean squared error of the decoded values, in data units.
-    tiles: tiles of a sample.
-    """
-    reach = min(dilation, MAX_REACH)
-    error = max(error, 1e-30)
-    if len(features) == 1 and isinstance(features[0], Isosurface):
-        return _isosurface_levels(features[0].value, reach, error)
-    spans = [_span(feature) for feature in features]
-    thresholds = sorted(
-        {end for span in spans if span is not None for end in span if math.isfinite(end)}
-    )
-    if None in spans or not 1 <= len(thresholds) <= MAX_EDGES:
-        return _learned_levels(tiles)
-    edges = _edges(thresholds, error)
-    outside = [
-        math.prod(
-            1 - _normal((high - center) / error) + _normal((low - center) / error)
-            for low, high in filter(None, spans)
-        )
-        for center in _centers(edges, error)
-    ]
-    return MaskLevels(edges=edges, scores=tuple(_score(1 - p) for p in outside), reach=reach)
-
-
-def _isosurface_levels(value: float, reach: int, error: float) -> MaskLevels:
-    """Return the scores that a vertex lies above and below an isosurface."""
-    edges = _edges([value], error)
-    above = [_normal((center - value) / error) for center in _centers(edges, error)]
-    return MaskLevels(
-        edges=edges,
-        scores=tuple(_score(p) for p in above),
-        others=tuple(_score(1 - p) for p in above),
-        reach=max(reach, 1),
-    )
-
-
-def _span(feature: Feature) -> tuple[float, float] | None:
-    """Return the interval of values that a feature selects; None if it selects otherwise."""
-    if isinstance(feature, Interval):
-        return feature.low, feature.high
-    if isinstance(feature, Segmentation) and feature.threshold is not None:
-        return feature.threshold, math.inf
-    return None
-
-
-def _edges(thresholds: list[float], error: float) -> tuple[float, ...]:
-    """Return the edges of the classes of values around thresholds."""
-    offsets = EDGE_OFFSETS[min(count for count in EDGE_OFFSETS if count >= len(thresholds))]
-    edges = {
-        _rounded(threshold + sign * offset * error)
-        for threshold in thresholds
-        for offset in offsets
-        for sign in (-1, 1)
-    }
-    return tuple(sorted(edges))[:MAX_EDGES]
-
-
-def _centers(edges: tuple[float, ...], error: float) -> list[float]:
-    """Return a value that stands for each class."""
-    inner = [low + (high - low) / 2 for low, high in pairwise(edges)]
-    return [edges[0] - 0.8 * error, *inner, edges[-1] + 0.8 * error]
-
-
-def _learned_levels(tiles: Iterable[Tile]) -> MaskLevels:
-    """Return scores by the share of vertices that count in each of some classes of equal size."""
-    tiles = list(tiles)
-    values = np.concatenate([tile.values.ravel() for tile in tiles])
-    counted = np.concatenate(
-        [
-            np.ones(tile.values.size, bool) if tile.counted is None else tile.counted.ravel()
-            for tile in tiles
-        ]
-    )
-    finite = np.isfinite(values)
-    values, counted = values[finite].astype(np.float64), counted[finite]
-    if not values.size:
-        return MaskLevels()
-    quantiles = np.quantile(values, np.arange(1, CLASSES) / CLASSES)
-    edges = tuple(sorted({_rounded(float(edge)) for edge in quantiles}))
-    classes = np.searchsorted(edges, values, side="right")
-    sizes = np.bincount(classes, minlength=len(edges) + 1)
-    counted_sizes = np.bincount(classes, weights=counted, minlength=len(edges) + 1)
-    shares = counted_sizes / np.maximum(sizes, 1)
-    return MaskLevels(edges=edges, scores=tuple(_score(float(p)) for p in shares))
-
-
-def _score(p: float) -> int:
-    """Return the score of a probability that a vertex counts."""
-    return round(-UNIT * math.log2(max(1 - p, MIN_PROBABILITY)))
-
-
-def _normal(deviation: float) -> float:
-    """Return the standard normal distribution function."""
-    if not math.isfinite(deviation):
-        return float(deviation > 0)
-    return 0.5 * (1 + math.erf(deviation / math.sqrt(2)))
-
-
-def _rounded(value: float) -> float:
-    """Return a value of few digits: the settings are stored as text."""
-    return float(f"{value:.7g}")
-
-
 STEP_SHARES = (0.0, 0.25, 0.5, 1.0)
 """Quantiser steps tried for filling, as shares of the final step; 0 keeps the existing values."""
 TRIAL_DENSITY = 2
@@ -266,7 +138,13 @@ TRIES = 4
 
 
 def coarser_bases(
-    sample: Sample, settings: TileSettings, outcome: Outcome, coding: Coding, goal: Goal
+    sample: Sample,
+    settings: TileSettings,
+    outcome: Outcome,
+    coding: Coding,
+    goal: Goal,
+    *,
+    quick: bool = False,
 ) -> tuple[TileSettings, Outcome] | None:
     """Return settings with bases made for a coarser step if the sample gets smaller by them.
 
@@ -274,6 +152,7 @@ def coarser_bases(
     tried. Sizes are compared at the same PSNR, or under a bound as they are.
 
     outcome: outcome of the settings, which keeps the promise.
+    quick: whether the step is searched by few trials.
     """
     taken = basis_bytes(settings.transform)
     if not outcome.count or taken < LEAST * (outcome.size + taken):
@@ -284,7 +163,8 @@ def coarser_bases(
         for factor in FACTORS:
             tried: list[Outcome] = []
             coarser = refit(sample, settings, factor)
-            found, new = find_step(sample, coarser, coding, goal, tries=TRIES, tried=tried)
+            tries = 2 if quick else TRIES
+            found, new = find_step(sample, coarser, coding, goal, tries=tries, tried=tried)
             cost = new.size + basis_bytes(found.transform) - outcome.size - taken
             if goal.error is None:
                 # The rest of the difference in quality between the two searches, in bytes.
@@ -306,10 +186,14 @@ COMPARED_QUICKLY = 1 << 18
 """The same of parts of tiles, where seconds count."""
 UNDECIDED = 0.05
 """Distance of the ratio on small parts from the one allowed from which on it decides."""
+FEWEST_BITS = 0.1
+"""Bits of a vertex in the first guess below which trials beside a plateau are not quick."""
 PLAIN_COSTS = 1.03
 """Factor of the bytes by the plain quantiser on small parts, where the trellis is as good later."""
 PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
+PRICED_SHARP = 1 << 20
+"""The same beside a plateau."""
 SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
 MAX_SEARCHED_VERTICES = 12 << 20
@@ -360,14 +244,26 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     """Code a few tiles for a first idea of the size."""
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
     quick = task.config.effort <= MAX_PRICED_EFFORT and task.config.access != "small"
-    quick = quick and plateau_center(sample, task.value_range) is None
     coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
-    looked = priced(sample, settings, task.config.effort) if quick and task.goal.psnr else sample
+    looked = sample
+    if quick and task.goal.psnr is not None:
+        looked = priced(sample, settings, task.config.effort)
     settings, outcome = find_step(looked, settings, coding, task.goal, tries=2)
     require_reach(task.goal, settings, outcome)
     task.gains.note("start", outcome)
-    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding, quick=quick)
+    sharp = quick and plateau_center(sample, task.value_range) is not None
+    if sharp and 8 * outcome.size < FEWEST_BITS * prod(task.blocks.shape):
+        # Of a shock in a few bytes, one coder does not tell what the other would choose.
+        coding, quick, sharp = replace(coding, fast=False), False, False
+    return Attempt(
+        sample=sample,
+        settings=settings,
+        outcome=outcome,
+        coding=coding,
+        quick=quick,
+        sharp=sharp,
+    )
 
 
 def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -379,11 +275,12 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     else:
         skip("tiles", f"--tile {task.config.tile}")
     settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
-    if attempt.quick and tiling is not None and tiling.found is not None:
-        settings, outcome = tiling.found
+    found = tiling.found if attempt.quick and tiling is not None else None
+    if found is not None:
+        settings, outcome = found
         attempt = replace(attempt, outcome=outcome)
     with stage("sample", SAMPLE_WHY):
-        sample = _sample(task, tiled, settings, vertices_of_trials(attempt.quick))
+        sample = _sample(task, tiled, settings, vertices_of_trials(attempt.quick, attempt.sharp))
     # Tiles were chosen about the mean: about the plateau of a shock wave their trials misled.
     plateau = plateau_center(sample, task.value_range)
     settings = settings if plateau is None else replace(settings, center=plateau)
@@ -391,11 +288,11 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     if task.config.effort == 1:
         skip("transform", "effort 1 tries none; from 2 on")
         return attempt
-    if sample.is_single and task.goal.error and tiled.tile != guessed:
+    if found is None and sample.is_single and task.goal.error and tiled.tile != guessed:
         # Under a bound, the step of the first guess may be six times too coarse for other tiles.
         with stage("step", "first guess for the tiles that were chosen"):
-            found, _ = find_step(sample, settings, attempt.coding, task.goal, tries=2)
-        attempt = replace(attempt, settings=found)
+            settings, _ = find_step(sample, settings, attempt.coding, task.goal, tries=2)
+        attempt = replace(attempt, settings=settings)
     if _asked(task, "transform"):
         with stage("transform", f"trials along each axis, at effort {task.config.effort}"):
             attempt = _choose_transform(task, attempt)
@@ -408,14 +305,16 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         return replace(attempt, sample=attempt.sample.wider(searched))
 
 
-def vertices_of_trials(quick: bool) -> int:
-    """Return the vertices on which each transform is tried. quick: see `Attempt`."""
-    return PRICED_VERTICES if quick else TRIAL_VERTICES
+def vertices_of_trials(quick: bool, sharp: bool = False) -> int:
+    """Return the vertices on which each transform is tried. quick, sharp: see `Attempt`."""
+    if not quick:
+        return TRIAL_VERTICES
+    return PRICED_SHARP if sharp else PRICED_VERTICES
 
 
-def is_tried_in_parts(tile: Shape, quick: bool) -> bool:
-    """Whether transforms of a tile are tried on parts of it. quick: see `Attempt`."""
-    return prod(tile) > (2 if quick else LARGE) * vertices_of_trials(quick)
+def is_tried_in_parts(tile: Shape, quick: bool, sharp: bool = False) -> bool:
+    """Whether transforms of a tile are tried on parts of it. quick, sharp: see `Attempt`."""
+    return prod(tile) > (2 if quick else LARGE) * vertices_of_trials(quick, sharp)
 
 
 def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
@@ -426,7 +325,7 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    vertices = vertices_of_trials(attempt.quick)
+    vertices = vertices_of_trials(attempt.quick, attempt.sharp)
     parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
     usual = replace(attempt.settings, transform=usual_transform(parts.tile))
     small = _sample(task, parts, usual, vertices)
@@ -448,7 +347,8 @@ def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
             skip("tiles", "--without tiles")
         return cheap
     with stage("tiles", f"trials for --access {access}"):
-        tiling = choose_tiling(task, attempt.settings, attempt.coding, access)
+        settings, coding = attempt.settings, attempt.coding
+        tiling = choose_tiling(task, settings, coding, access, sharp=attempt.sharp)
     tell("tiles", f"--access {access}: {tiling.describe()}")
     return tiling
 
@@ -512,10 +412,13 @@ def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
     Where these leave it open, the coders are compared once more on whole tiles.
     """
     settings, goal = attempt.settings, task.goal
-    parts = task.blocks.retile(sub_tile(attempt.sample.blocks.tile, COMPARED_QUICKLY))
-    usual = replace(settings, transform=usual_transform(parts.tile))
-    small = _sample(task, parts, usual, COMPARED_QUICKLY)
-    moved = replace(attempt, settings=moved_transform(small, settings))
+    part, moved = attempt.sample.narrowed(COMPARED_VERTICES), attempt
+    small = part
+    if not attempt.sharp:
+        parts = task.blocks.retile(sub_tile(part.blocks.tile, COMPARED_QUICKLY))
+        usual = replace(settings, transform=usual_transform(parts.tile))
+        small = _sample(task, parts, usual, COMPARED_QUICKLY)
+        moved = replace(attempt, settings=moved_transform(small, settings))
     slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
     quantisers = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
     best = [
@@ -527,9 +430,9 @@ def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
     ]
     fast = slow
     if slow:
-        found = _is_fast_enough(task, [cost for cost, _ in best], UNDECIDED)
+        open_by = 0.0 if attempt.sharp else UNDECIDED
+        found = _is_fast_enough(task, [cost for cost, _ in best], open_by)
         if found is None:
-            part = attempt.sample.narrowed(COMPARED_VERTICES)
             costs = [
                 _trial(task, attempt, part, fast=fast, on=not plain)
                 for fast, (_, plain) in zip((True, False), best, strict=True)
@@ -580,7 +483,7 @@ def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attemp
     searched: see `_searched_sample`.
     """
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
-    tries = 3 if task.config.effort == 1 else 5
+    tries = 3 if task.config.effort == 1 or attempt.quick else 5
     tried: list[Outcome] = []
     precision = _precision(task, attempt)
     if not attempt.quick and not _without_head(task, attempt):
@@ -596,7 +499,7 @@ def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attemp
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)
         settings = _with_mask(task, sample, settings, error)
-    for _ in range(REFITS):
+    for _ in range(1 if attempt.quick else REFITS):
         # A basis is as precise as the step that it was made for needs: a finer step needs another.
         if fitted is not None and abs(math.log(settings.step / fitted)) < SAME_STEP:
             break
@@ -605,7 +508,7 @@ def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attemp
             break
         fitted, before = settings.step, (settings, outcome)
         settings, outcome = find_step(
-            sample, refitted, coding, goal, tried=tried, precision=precision
+            sample, refitted, coding, goal, tries=tries, tried=tried, precision=precision
         )
         if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
             settings, outcome = before
@@ -694,7 +597,8 @@ def refit_bases(task: PlanTask, attempt: Attempt) -> Attempt:
     if task.config.effort == 1 or task.goal.size is not None:
         return attempt
     found = coarser_bases(
-        attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal
+        *(attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal),
+        quick=attempt.quick,
     )
     if found is None:
         return attempt
@@ -761,7 +665,7 @@ def _with_mask(
 def _is_coded(task: PlanTask, attempt: Attempt) -> bool:
     """Whether the best transforms by price are coded by the mixing coder, which may be used."""
     slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
-    return not (attempt.quick and slow)
+    return attempt.sharp or not (attempt.quick and slow)
 
 
 def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -770,7 +674,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif sample.is_single or is_tried_in_parts(sample.blocks.tile, attempt.quick):
+    elif sample.is_single or is_tried_in_parts(sample.blocks.tile, attempt.quick, attempt.sharp):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)
@@ -778,7 +682,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
             trials, attempt.settings, goal.bounded(coding), coded=_is_coded(task, attempt)
         )
     tiling = attempt.tiling
-    if attempt.quick and goal.psnr is not None and tiling is not None and tiling.found is not None:
+    if attempt.quick and tiling is not None and tiling.found is not None:
         return replace(attempt, settings=settings)  # the step is that of all tiles already
     tries, slope = (2, task.slope) if attempt.quick else (4, None)
     near = replace(NEAR, slope=slope)

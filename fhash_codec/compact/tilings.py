@@ -29,6 +29,7 @@ from fhash_codec.compact.transform import (
     MAX_BASIS_LENGTH,
     basis_bytes,
     lines_of_trials,
+    plane,
     refit,
     rough_transform,
     tile_costs,
@@ -65,14 +66,21 @@ class Trials:
     """
 
     def __init__(
-        self, task: PlanTask, blocks: Blocks, settings: TileSettings, coding: Coding
+        self,
+        task: PlanTask,
+        blocks: Blocks,
+        settings: TileSettings,
+        coding: Coding,
+        *,
+        sharp: bool = False,
     ) -> None:
         self._task, self._blocks, self.shape = task, blocks, blocks.shape
         self._settings, self._coding = settings, task.goal.bounded(coding)
         self._is_priced = coding.fast and task.goal.error is None
+        self._is_sharp = sharp and self._is_priced
         self._known: dict[tuple[int, int], AxisTransform] = {}
         self._psnr: float | None = None
-        self._tries_own = True
+        self._tries_own, self._plane = True, None  # type: bool, AxisTransform | None
         self._settled: list[Outcome] = []
         self.sizes: dict[Shape, float] = {}
         self.found: dict[Shape, tuple[TileSettings, Outcome]] = {}
@@ -145,12 +153,15 @@ class Trials:
             self._known_transforms(tile),
             lines_of_trials(sample.blocks),
             own=self._tries_own,
+            sharp=self._is_sharp,
         )
         if self._coding.fast and min(tile[1:]) > 1:
             # Bases in space that are no good for one tile are none for others.
             self._tries_own = settings.transform.axes[3].basis is not None
         for axis in (0, 1):
             self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
+        if self._coding.fast and self._plane is None:
+            self._plane = settings.transform.axes[3]
         same = trials is sample or self._is_priced
         return settings, tried if sample.complete and same else None
 
@@ -175,6 +186,8 @@ class Trials:
             if same or (axis == 1 and transform.wavelet and tile[1] > 1):
                 kind, depth = transform.kind, transform.depth
                 known[axis] = transform if same else wavelet(kind, depth, tile[1])
+        if self._plane is not None and self._plane.wavelet:
+            known[2], known[3] = plane(self._plane.kind, self._plane.depth, *tile[2:])
         return known
 
     def _note(self, sample: Sample, outcome: Outcome, settings: TileSettings) -> None:
@@ -244,11 +257,14 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
     return cheap_tiling(task.blocks.shape, size, config.access)
 
 
-def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access: str) -> Tiling:
+def choose_tiling(
+    task: PlanTask, settings: TileSettings, coding: Coding, access: str, *, sharp: bool = False
+) -> Tiling:
     """Choose the tiles of a series that is to be cut, by trial.
 
     settings: with the step that all trials take.
     access: the wish, a name of `PRICES`.
+    sharp: see `Attempt`.
     """
     shape = task.blocks.shape
     if prod(shape) > MAX_WHOLE_VERTICES:
@@ -257,7 +273,7 @@ def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access
         candidates = tiles_to_try(shape, MAX_WHOLE_VERTICES, slabs=True)
     if candidates == [shape]:
         return Tiling(tile=shape, price=1.0)
-    prices = _Prices(task, settings, coding, candidates)
+    prices = _Prices(task, settings, coding, candidates, sharp)
     tile = _search(prices, access, shape)
     return Tiling(
         tile=tile,
@@ -281,9 +297,14 @@ class _Prices:
     """
 
     def __init__(
-        self, task: PlanTask, settings: TileSettings, coding: Coding, candidates: list[Shape]
+        self,
+        task: PlanTask,
+        settings: TileSettings,
+        coding: Coding,
+        candidates: list[Shape],
+        sharp: bool,
     ) -> None:
-        self._task, self._coding, self._settings = task, coding, settings
+        self._task, self._coding, self._settings, self._sharp = task, coding, settings, sharp
         self._columns: list[Trials] = []
         self.sizes: dict[Shape, float] = {}
         self.parts: list[Shape] = []
@@ -298,7 +319,7 @@ class _Prices:
         slab = None if longest is None else _slab(self.candidates, blocks.shape)
         if longest is not None:
             in_time = in_space = _few_steps(longest, blocks.shape)
-        self.base = Trials(task, blocks, self._settings, coding)
+        self.base = Trials(task, blocks, self._settings, coding, sharp=sharp)
         self._settings = self.base.settle(in_space)
         # The error of the first one is what the others are compared at.
         for tile in (blocks.shape, in_space, slab, in_time, longest):
@@ -351,7 +372,8 @@ class _Prices:
             if _fits(tile, trials.shape):
                 return trials
         columns = self._cut_out(tile, min(PLACES, max(2, COLUMN_VERTICES // prod(tile))))
-        self._columns.append(Trials(self._task, columns, self._settings, self._coding))
+        trials = Trials(self._task, columns, self._settings, self._coding, sharp=self._sharp)
+        self._columns.append(trials)
         return self._columns[-1]
 
     def _cut_out(self, tile: Shape, count: int) -> Blocks:

@@ -208,7 +208,7 @@ def usual_transform(shape: Shape) -> TransformSpec:
     t, z, y, x = shape
     depth = min(4, max(1, max(y, x).bit_length() - 2))
     return TransformSpec(
-        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", depth, y, x))
+        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *plane("9/7", depth, y, x))
     )
 
 
@@ -288,6 +288,7 @@ def rough_transform(
     lines: int,
     *,
     own: bool = True,
+    sharp: bool = False,
 ) -> tuple[TileSettings, Outcome | None]:
     """Return settings with a good transform by very few trials, to compare tilings with.
 
@@ -296,6 +297,7 @@ def rough_transform(
     known: transforms of axes that need no trial, such as those of the same axis elsewhere.
     lines: of each tile, that the data's own bases are fitted on.
     own: whether these are tried in space.
+    sharp: whether none along t and z, and haar in the plane, are tried, as for a shock.
     """
     shape: Shape = sample.tiles[0].values.shape
     bases = Bases(sample, settings, lines)
@@ -305,12 +307,16 @@ def rough_transform(
         if axis in known or shape[axis] == 1:
             continue
         tried = [wavelet(kind, depth, shape[axis]) for kind, depth in ROUGH_WAVELETS]
-        kinds = list(dict.fromkeys([best[1][axis], *tried]))
+        kinds = list(dict.fromkeys([best[1][axis], *tried, *([NONE] if sharp else [])]))
         if axis == 0 and bases.possible(shape[0]):
             kinds.append(bases.along(0))
         trials = [_changed(best[1], {axis: kind}) for kind in kinds]
         fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
         best = min([best, *_tried(sample, settings, fresh, coding)], key=itemgetter(0))
+    if sharp and 3 not in known and min(shape[2:]) > 1:
+        along_y, along_x = plane("haar", 3, *shape[2:])
+        haar = _changed(best[1], {2: along_y, 3: along_x})
+        best = min([best, *_tried(sample, settings, [haar], coding)], key=itemgetter(0))
     if own and bases.possible(*shape[1:]):
         in_space = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
         trials = [in_space] if best[2] is not None else [axes, in_space]
@@ -461,7 +467,7 @@ def _tried(
     ]
 
 
-def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
+def plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
     """Return a wavelet along y and x, of one depth where both have more than one vertex."""
     if min(y, x) > 1:
         depth = min(depth, max(1, (max(y, x) - 1).bit_length()))
@@ -474,7 +480,7 @@ def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransfor
     y, x = shape[2:]
     for kind, depth in PLANE_WAVELETS:
         if 2 ** (depth - 1) < max(y, x):
-            along_y, along_x = _plane(kind, depth, y, x)
+            along_y, along_x = plane(kind, depth, y, x)
             yield {2: along_y, 3: along_x}
     if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}

@@ -461,9 +461,10 @@ template <Mode MODE> struct Writer : Lattice<Writer<MODE>, FlagWriter<MODE>> {
 };
 
 // The distribution of each context that takes the fewest bits for what was counted. Their bits.
-double choose_distributions(const uint32_t (*counts)[LANES], const Task& task, uint8_t* chosen) {
+double choose_distributions(const uint32_t (*counts)[LANES], const Task& task, double raw,
+                            uint8_t* chosen) {
     const Prior& prior = task.prior;
-    double total = 0, saved = 0;
+    double total = raw, saved = 0, zeros = 0;
     for (int context = 0; context < CONTEXTS; context++) {
         chosen[context] = prior.defaults[context];
         if (!is_used(context, task.trellis)) continue;
@@ -488,15 +489,15 @@ double choose_distributions(const uint32_t (*counts)[LANES], const Task& task, u
         saved = (in_group ? saved : 0) + usual - least;
         total += least;
         if (in_group < LEVELS - 1 && context < CONTEXTS - 1) continue;
-        total += 1;
-        if (saved > in_group + 1) total += in_group + 1;
+        zeros += 1;
+        if (saved > in_group + 1) total += zeros + in_group + 1, zeros = 0;
         else {
             total += saved;
             std::memcpy(chosen + context - in_group, prior.defaults + context - in_group,
                         (size_t)in_group + 1);
         }
     }
-    return total;
+    return total + (raw > 0 ? zeros : 0);  // at the end of all they are not stored
 }
 
 // The words of the lanes: the steps are coded backwards, so that they are read forwards.
@@ -560,7 +561,7 @@ FHASH_INLINE int64_t write(const Task& task, std::vector<uint8_t>& bytes, double
     writer->run_all();
     if constexpr (MODE == GUESS) return 0;
     uint8_t chosen[CONTEXTS];
-    results[0] = choose_distributions(writer->counts, task, chosen) + (double)writer->raw;
+    results[0] = choose_distributions(writer->counts, task, (double)writer->raw, chosen);
     results[1] = writer->squares;
     if constexpr (MODE == PRICE) results[0] += (double)writer->range.bits / 2048;
     results[0] /= 8;

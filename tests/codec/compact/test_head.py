@@ -403,8 +403,8 @@ def test_no_head_is_trained_that_the_other_one_is_sure_to_beat() -> None:
 def test_at_effort_5_a_perceptron_must_save_a_share_of_the_whole_file() -> None:
     spent = EFFORTS[5]
     assert likely_heads(60_000, 3.0, 4.5, spent) == [PERCEPTRON]
-    assert likely_heads(60_000, 0.2, 4.5, spent) == [PERCEPTRON]
-    assert likely_heads(60_000, 0.2, 4.5, spent, besides=300_000) == []
+    assert likely_heads(60_000, 0.3, 4.5, spent) == [PERCEPTRON]
+    assert likely_heads(60_000, 0.3, 4.5, spent, besides=300_000) == []
     assert likely_heads(60_000, 0.1, 4.5, spent) == []
     assert spent.tries(20_000, 1 << 20)
     assert not spent.tries(2_000, 1 << 20)  # no head saves its own bytes
@@ -646,7 +646,9 @@ def test_prices_of_trials_are_those_of_files(
     one = bytes_of(tile="whole")[0]
     best = bytes_of(tile="x".join(map(str, record["best"])))[0]
     assert size <= 1.1 * min(one, best)
-    assert size / best <= record["price"] + 0.05
+    # Both other files are of the mixing coder.
+    coder = access.FAST_BYTES["balanced"] if record.get("coder") == "fast" else 1.0
+    assert size / best <= coder * record["price"] + 0.05
 
 
 def test_a_wish_is_kept_and_faster_ones_have_faster_regions(

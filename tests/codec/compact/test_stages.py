@@ -40,13 +40,12 @@ from fhash_codec.compact.goal import (
 from fhash_codec.compact.head import EFFORTS, Budget
 from fhash_codec.compact.plan import CodingPlan, holds_beside, plan, rank_share
 from fhash_codec.compact.predictor import IntegerTile, best_predictor, fit_weights
-from fhash_codec.compact.sample import Sample
+from fhash_codec.compact.sample import Sample, mask_levels
 from fhash_codec.compact.stages import (
     choose_tiles,
     coarser_bases,
     first_guess,
     first_settings,
-    mask_levels,
 )
 from fhash_codec.compact.step import (
     find_step,
