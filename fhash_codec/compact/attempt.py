@@ -447,6 +447,8 @@ class Attempt:
     """Outcomes on the way of the search for the PSNR, without a head."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head."""
+    predicted: tuple[TileSettings, int] | None = None
+    """Settings with a predictor, and the bytes of all tiles by it; None where none was trained."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
     quick: bool = False

@@ -25,6 +25,7 @@ from fhash_codec.compact.attempt import (
 from fhash_codec.compact.goal import Goal, integer_goal
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.stages import (
+    choose_predicted,
     choose_step,
     choose_tiles,
     fill_tiles,
@@ -417,13 +418,13 @@ def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
         ("tiles and transform", choose_tiles),
         ("fill values", fill_tiles),
         ("quantiser step", choose_step),
+        ("prediction", try_predictor),
         ("head", try_head),
         ("coarser bases", refit_bases),
-        ("prediction", try_predictor),
     ):
         task.parts.begin(part)
         attempt = choose(task, attempt)
-    return attempt
+    return choose_predicted(task, attempt)
 
 
 def _keeps_promise(task: PlanTask, outcome: Outcome) -> bool:

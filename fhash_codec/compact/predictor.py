@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.attempt import sub_tile
 from fhash_codec.compact.sample import Sample
 from fhash_codec.compact.tiles import Tile
 from fhash_codec.compact.transform import gram_of, usual_transform
@@ -25,7 +26,7 @@ from fhash_formats.transform.predict import (
     integers_of,
     passes_of,
 )
-from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.tile_format import Shape, TileSettings
 
 ORDERS = ((0, 1, 2, 3), (0, 3, 2, 1), (3, 2, 1, 0))
 """Orders in which axes are refined: the last axis is predicted best and makes half of all."""
@@ -37,12 +38,20 @@ TRIAL_ROWS = 8_000
 """Vertices of a pass that its weights are trained on for a trial."""
 HOPELESS = 1.3
 """Size of the first trial, as a multiple of the rival's, from which on no other trial helps."""
+HOPELESS_PARTS = 1.1
+"""The same for the parts of tiles, which tell more of a series that they are tried for."""
+LOST = 1.015
+"""Such a multiple of the best trial of parts from which on not all tiles are coded."""
 ROUNDS = 4
 """Rounds of the reweighted least squares."""
 MAX_TRAINING_VERTICES = 48 << 20
 """Vertices of a series up to which the weights are trained on all of its tiles."""
 TRIAL_VERTICES = 4 << 20
 """Vertices of the tiles that are coded by each trial."""
+QUICK_VERTICES = 1 << 20
+"""The same where seconds count, in the middle of each of these tiles."""
+FEWEST = 1 << 14
+"""Vertices in the middle of a tile that tell something of it."""
 RIDGE = 1e-3
 """Ridge of the least squares, as a share of the mean of the diagonal."""
 MAX_INTEGER_BOUND = 2.0**40
@@ -61,25 +70,30 @@ class IntegerTile(NamedTuple):
 
 
 def choose_predictor(
-    sample: Sample, settings: TileSettings, size: int, *, error: float, effort: int
-) -> tuple[TileSettings, int]:
+    sample: Sample,
+    settings: TileSettings,
+    size: int,
+    *,
+    error: float,
+    effort: int,
+    quick: bool = False,
+) -> tuple[TileSettings, int] | None:
     """Return settings with a predictor, and the bytes of all tiles, if that is less than `size`.
-
-    Otherwise the settings and the size are returned as they are.
 
     size: bytes of all tiles by the transform.
     error: strict bound in data units. The residual's quantum, which keeps the bound, is also the
         distance of predicted values.
+    quick: whether trials are those of parts of tiles.
     """
     step, origin = settings.quantum, settings.center
     if sample.blocks.dtype.kind in "iu" and error < MAX_INTEGER_BOUND:
         # Integer data: a quantum of 2 floor(error) + 1 keeps every error at or below floor(error).
         step, origin = 2.0 * int(error) + 1.0, float(round(settings.center))
     if step <= 0:
-        return settings, size
-    best = best_predictor(sample, step=step, origin=origin, effort=effort, rival=size)
+        return None
+    best = best_predictor(sample, step=step, origin=origin, effort=effort, rival=size, quick=quick)
     if best is None or best[1] >= size:
-        return settings, size
+        return None
     predictor, predicted_size = best
     # The transform is unused from here on; store the cheapest description of one.
     plain = usual_transform(sample.tiles[0].values.shape)
@@ -89,7 +103,13 @@ def choose_predictor(
 
 
 def best_predictor(
-    sample: Sample, *, step: float, origin: float, effort: int, rival: float = math.inf
+    sample: Sample,
+    *,
+    step: float,
+    origin: float,
+    effort: int,
+    rival: float = math.inf,
+    quick: bool = False,
 ) -> tuple[Predictor, int] | None:
     """Return the predictor of the smallest streams, and the approximate bytes of all tiles by it.
 
@@ -102,6 +122,7 @@ def best_predictor(
 
     step, origin: distance of predicted values, and one of them, in data units.
     rival: bytes of all tiles by what the predictor competes with.
+    quick: see `choose_predictor`.
     """
     plain = _predictor(step, origin, (0, 0, 0, 0), ORDERS[0], 0, None)
     tiles = sample.map(lambda tile: _quantised(tile, plain))
@@ -116,9 +137,9 @@ def best_predictor(
     codable = [tile for tile in tiles if tile is not None]
     if not training or len(codable) < len(tiles):
         return None
-    trials = _Trials(sample, training, step, origin)
+    trials = _Trials(sample, training, step, origin, quick=quick)
     best = trials.run(DEPTHS[0], ORDERS[0], 1)
-    if best[0] > HOPELESS * rival:
+    if best[0] > (HOPELESS_PARTS if quick else HOPELESS) * rival:
         return None
     for order in ORDERS[1:] if effort > 2 else ():
         best = min(best, trials.run(DEPTHS[0], order, 1), key=lambda pair: pair[0])
@@ -130,6 +151,8 @@ def best_predictor(
         trial = trials.run(best[1].levels, best[1].order, reach)
         best = min(best, trial, key=lambda pair: pair[0])
         sample.tick()
+    if quick and best[0] > LOST * rival:
+        return None
     chosen = best[1]
     predictor = _predictor(step, origin, chosen.levels, chosen.order, chosen.reach, training)
     sizes = _coded_sizes(codable, predictor)
@@ -141,11 +164,22 @@ class _Trials:
     """Trials of predictors on some of the training tiles."""
 
     def __init__(
-        self, sample: Sample, training: list[IntegerTile], step: float, origin: float
+        self,
+        sample: Sample,
+        training: list[IntegerTile],
+        step: float,
+        origin: float,
+        *,
+        quick: bool,
     ) -> None:
         vertices = sum(tile.integers.size for tile in training)
         self._training = training
         self._tiles = training[:: -(-vertices // TRIAL_VERTICES)]
+        if quick:
+            part = sub_tile(
+                training[0].integers.shape, max(QUICK_VERTICES // len(self._tiles), FEWEST)
+            )
+            self._tiles = [_middle(tile, part) for tile in self._tiles]
         self._step, self._origin = step, origin
         counted = sum(
             tile.integers.size if tile.counted is None else int(np.count_nonzero(tile.counted))
@@ -164,6 +198,16 @@ class _Trials:
         )
         size = sum(_coded_sizes(self._tiles, predictor)) * self._factor
         return size + _weight_bytes(predictor), predictor
+
+
+def _middle(tile: IntegerTile, part: Shape) -> IntegerTile:
+    """Return the middle of a tile."""
+    middle = tuple(
+        slice(first := max(0, (length - short) // 2), first + short)
+        for length, short in zip(tile.integers.shape, part, strict=True)
+    )
+    counted = None if tile.counted is None else np.ascontiguousarray(tile.counted[middle])
+    return IntegerTile(np.ascontiguousarray(tile.integers[middle]), counted)
 
 
 def _coded_sizes(tiles: list[IntegerTile], predictor: Predictor) -> list[int]:

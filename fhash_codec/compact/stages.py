@@ -182,9 +182,11 @@ TRIAL_VERTICES = 3 << 20
 """Vertices coded for each trial of a transform."""
 COMPARED_VERTICES = 1 << 20
 """Vertices of the tiles on which the two coders are compared; one tile may have more."""
+WITH_HEAD = 0.6
+"""Share of the bytes that no head takes fewer than."""
 COMPARED_QUICKLY = 1 << 18
 """The same of parts of tiles, where seconds count."""
-UNDECIDED = 0.05
+UNDECIDED = 0.03
 """Distance of the ratio on small parts from the one allowed from which on it decides."""
 FEWEST_BITS = 0.1
 """Bits of a vertex in the first guess below which trials beside a plateau are not quick."""
@@ -326,14 +328,25 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
     vertices = vertices_of_trials(attempt.quick, attempt.sharp)
-    parts = task.blocks.retile(sub_tile(sample.blocks.tile, vertices // PARTS))
-    usual = replace(attempt.settings, transform=usual_transform(parts.tile))
-    small = _sample(task, parts, usual, vertices)
+    usual, small = _in_parts(task, attempt, vertices // PARTS, vertices)
     trials = priced(small, usual, task.config.effort)
     first = usual if not attempt.quick else moved_transform(trials, attempt.settings)
     found, _ = choose_transform(trials, first, coding, coded=_is_coded(task, attempt))
     trials = priced(sample, attempt.settings, task.config.effort)
     return adapted_transform(trials, attempt.settings, found.transform.axes, coding)
+
+
+def _in_parts(
+    task: PlanTask, attempt: Attempt, part: int, vertices: int
+) -> tuple[TileSettings, Sample]:
+    """Return a sample of parts of the tiles, and settings for them.
+
+    part: vertices of each of them at most.
+    vertices: those of all.
+    """
+    parts = task.blocks.retile(sub_tile(attempt.sample.blocks.tile, part))
+    usual = replace(attempt.settings, transform=usual_transform(parts.tile))
+    return usual, _sample(task, parts, usual, vertices)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
@@ -378,18 +391,29 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        if attempt.quick:
-            attempt = _with_coder(task, attempt)
-            return _searched_step(task, attempt, _searched_sample(task, attempt))
-        on = allows_trellis(attempt.settings, task.goal, task.config.effort)
-        fast, tried = _has_fast_coder(task, attempt, on=on), attempt.coding.fast
-        attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
-        if on:
-            settings, coding, outcome = choose_quantiser(
-                attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
-            )
-            attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
-        return _searched_step(task, attempt, attempt.sample)
+        attempt = _with_coder(task, attempt) if attempt.quick else _with_quantiser(task, attempt)
+        if attempt.quick and task.goal.error is not None:
+            attempt = _bounded_step(task, attempt, attempt.settings)
+            settings = _with_new_mask(task, attempt.sample, attempt.settings, attempt.outcome)
+            attempt = replace(attempt, settings=settings)
+        else:
+            attempt = _searched_step(task, attempt)
+    if task.config.effort > 1:
+        task.gains.note("transform by trial", attempt.outcome)
+    return attempt
+
+
+def _with_quantiser(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt with coder and quantiser chosen on all tiles."""
+    on = allows_trellis(attempt.settings, task.goal, task.config.effort)
+    fast, tried = _has_fast_coder(task, attempt, on=on), attempt.coding.fast
+    attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
+    if not on:
+        return attempt
+    settings, coding, outcome = choose_quantiser(
+        attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
+    )
+    return replace(attempt, settings=settings, coding=coding, outcome=outcome)
 
 
 def _has_fast_coder(task: PlanTask, attempt: Attempt, *, on: bool) -> bool:
@@ -415,9 +439,7 @@ def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
     part, moved = attempt.sample.narrowed(COMPARED_VERTICES), attempt
     small = part
     if not attempt.sharp:
-        parts = task.blocks.retile(sub_tile(part.blocks.tile, COMPARED_QUICKLY))
-        usual = replace(settings, transform=usual_transform(parts.tile))
-        small = _sample(task, parts, usual, COMPARED_QUICKLY)
+        _, small = _in_parts(task, attempt, COMPARED_QUICKLY, COMPARED_QUICKLY)
         moved = replace(attempt, settings=moved_transform(small, settings))
     slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
     quantisers = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
@@ -470,18 +492,24 @@ def _is_fast_enough(task: PlanTask, costs: Sequence[float], undecided: float) ->
     return None if abs(ratio - limit) < undecided else ratio <= limit
 
 
-def _searched_sample(task: PlanTask, attempt: Attempt) -> Sample:
-    """Return the tiles on which a step is searched: few under a bound, where each keeps it."""
-    if attempt.quick and task.goal.error is not None:
-        return attempt.sample.narrowed(COMPARED_VERTICES)
-    return attempt.sample
+def _bounded_step(task: PlanTask, attempt: Attempt, settings: TileSettings) -> Attempt:
+    """Return the attempt with settings of the step that a bound asks for, by few trials.
 
-
-def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attempt:
-    """Return the attempt with the step that the sample asks for, and with bases fitted to it.
-
-    searched: see `_searched_sample`.
+    Each tile keeps the bound with any step: few of them tell which costs least.
     """
+    sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
+    few = sample.narrowed(COMPARED_VERTICES)
+    settings, outcome = find_step(few, settings, coding, task.goal, tries=3)
+    refitted = refit(sample, settings)
+    if refitted is not settings:
+        extra = basis_bytes(refitted.transform) - basis_bytes(settings.transform)
+        if few.run(refitted, coding).size + extra < outcome.size:
+            settings = refitted
+    return replace(attempt, settings=settings, outcome=sample.run(settings, coding))
+
+
+def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt with the step that the sample asks for, and with bases fitted to it."""
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 or attempt.quick else 5
     tried: list[Outcome] = []
@@ -492,13 +520,9 @@ def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attemp
     if attempt.quick:
         settings, fitted = refit(sample, settings), settings.step
     settings, outcome = find_step(
-        searched, settings, coding, goal, tries=tries, tried=tried, precision=precision
+        sample, settings, coding, goal, tries=tries, tried=tried, precision=precision
     )
-    if searched is not sample:
-        outcome = sample.run(settings, goal.bounded(coding))
-    if goal.psnr is None and outcome.count:
-        error = math.sqrt(outcome.squares / outcome.count)
-        settings = _with_mask(task, sample, settings, error)
+    settings = _with_new_mask(task, sample, settings, outcome)
     for _ in range(1 if attempt.quick else REFITS):
         # A basis is as precise as the step that it was made for needs: a finer step needs another.
         if fitted is not None and abs(math.log(settings.step / fitted)) < SAME_STEP:
@@ -513,15 +537,26 @@ def _searched_step(task: PlanTask, attempt: Attempt, searched: Sample) -> Attemp
         if goal.psnr is not None and outcome.psnr(goal.data_range) < goal.psnr - LOST:
             settings, outcome = before
             break
-    if task.config.effort > 1:
-        task.gains.note("transform by trial", outcome)
     return replace(attempt, settings=settings, outcome=outcome, tried=tried)
+
+
+def _with_new_mask(
+    task: PlanTask, sample: Sample, settings: TileSettings, outcome: Outcome
+) -> TileSettings:
+    """Return settings with scores of a mask for the error that a bound or a size leaves."""
+    if task.goal.psnr is not None or not outcome.count:
+        return settings
+    return _with_mask(task, sample, settings, math.sqrt(outcome.squares / outcome.count))
 
 
 def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     """Train a head, and keep it if the file gets smaller by it."""
     goal = task.goal
     if not _asked(task, "head"):
+        return attempt
+    predicted = math.inf if attempt.predicted is None else attempt.predicted[1]
+    if attempt.quick and predicted < WITH_HEAD * attempt.outcome.size:
+        skip("head", "predicted values take fewer bytes than it would leave")
         return attempt
     if reason := _without_head(task, attempt):
         skip("head", reason)
@@ -561,6 +596,9 @@ def _head_step(
     task: PlanTask, attempt: Attempt, settings: TileSettings
 ) -> tuple[TileSettings, Outcome]:
     """Return settings with the step that keeps the promise, and their outcome."""
+    if attempt.quick and task.goal.error is not None:
+        attempt = _bounded_step(task, attempt, settings)
+        return attempt.settings, attempt.outcome
     return find_step(
         attempt.sample,
         settings,
@@ -609,7 +647,7 @@ def refit_bases(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Train a predictor for a strict bound, and keep it if the file gets smaller by it."""
+    """Train a predictor for a strict bound, which is kept for `choose_predicted`."""
     goal, effort = task.goal, task.config.effort
     if not goal.error or goal.data_range <= 0:
         skip("predictor", "only a bound on each error has use for it")
@@ -617,18 +655,39 @@ def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
     if effort == 1 or not _asked(task, "predictor"):
         return attempt
     with stage("predictor", "trials beside the transform, for the bound on each error"):
-        # What a predictor codes is read slowly: no reason to give up the fast coder for little.
-        share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
-        least = round(attempt.outcome.size / share)
-        settings, size = choose_predictor(
-            attempt.sample, attempt.settings, least, error=goal.error, effort=effort
+        predicted = choose_predictor(
+            *(attempt.sample, attempt.settings, _rival(task, attempt)),
+            error=goal.error,
+            effort=effort,
+            quick=attempt.quick and not attempt.sharp,
         )
-    kept = settings.predictor is not None
-    outcome = replace(attempt.outcome, size=size) if kept else attempt.outcome
-    if kept and settings.trellis:
+    return replace(attempt, predicted=predicted)
+
+
+def choose_predicted(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Take the predictor if the file gets smaller by it."""
+    if attempt.predicted is None:
+        return attempt
+    settings, size = attempt.predicted
+    kept = size < _rival(task, attempt)
+    task.gains.note(
+        "prediction" if kept else "prediction (left out)",
+        replace(attempt.outcome, size=size) if kept else attempt.outcome,
+    )
+    if not kept:
+        return attempt
+    if settings.trellis:
         settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients now
-    task.gains.note("prediction" if kept else "prediction (left out)", outcome)
-    return replace(attempt, settings=settings, outcome=outcome)
+    return replace(attempt, settings=settings, outcome=replace(attempt.outcome, size=size))
+
+
+def _rival(task: PlanTask, attempt: Attempt) -> int:
+    """Return the bytes that a predictor must stay below.
+
+    What it codes is read slowly: no reason to give up the fast coder for little.
+    """
+    share = FAST_BYTES[task.config.access] if attempt.coding.fast else 1.0
+    return round(attempt.outcome.size / share)
 
 
 def _asked(task: PlanTask, name: str) -> bool:

@@ -77,7 +77,7 @@ class Trials:
         self._task, self._blocks, self.shape = task, blocks, blocks.shape
         self._settings, self._coding = settings, task.goal.bounded(coding)
         self._is_priced = coding.fast and task.goal.error is None
-        self._is_sharp = sharp and self._is_priced
+        self._is_sharp = sharp
         self._known: dict[tuple[int, int], AxisTransform] = {}
         self._psnr: float | None = None
         self._tries_own, self._plane = True, None  # type: bool, AxisTransform | None
@@ -113,8 +113,9 @@ class Trials:
         goal, settings = self._task.goal, self._settings
         if settings.labels or goal.size is not None or (not goal.error and not goal.psnr):
             return settings
+        few = None
         if in_space is not None:
-            self._picked(in_space)
+            few = self._sample(in_space, PICKED_VERTICES), self._picked(in_space)[0]
         found, tried = self._picked(self.shape)
         coding = self._coding
         if self.shape != self._task.blocks.shape:
@@ -132,6 +133,10 @@ class Trials:
             outcome = sample.run(found, coding)
             slope.note(found.step, outcome.psnr(goal.data_range))
             self._settled.append(outcome)
+        elif coding.fast and few is not None and not self._is_sharp:
+            searched, _ = find_step(*few, coding, goal, tries=2)
+            found = refit(sample, replace(searched, transform=found.transform))
+            outcome = sample.run(found, coding)
         else:
             found, outcome = find_step(sample, found, coding, goal, tries=2, tried=self._settled)
             # Bases made for the finer step of the first guess would take too many bytes.
@@ -153,7 +158,7 @@ class Trials:
             self._known_transforms(tile),
             lines_of_trials(sample.blocks),
             own=self._tries_own,
-            sharp=self._is_sharp,
+            sharp=self._is_sharp and self._is_priced,
         )
         if self._coding.fast and min(tile[1:]) > 1:
             # Bases in space that are no good for one tile are none for others.
