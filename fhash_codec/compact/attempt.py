@@ -19,6 +19,7 @@ from fhash_codec.features.features import Feature
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Parts
 from fhash_formats.errors import InputError
+from fhash_formats.transform.spec import AxisTransform
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
 from fhash_formats.transform.tile_format import Shape, TileSettings
 
@@ -184,6 +185,8 @@ The most that was found on series of many kinds where nothing is tried (effort 1
 """
 CUT_IN_TIME = 10.0
 """The same of a cut in time, by steps."""
+CUT_BETWEEN = 0.2
+"""The same between two wavelets."""
 BYTES_OF_TILE = 100
 """Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
 
@@ -331,12 +334,17 @@ def is_small(shape: Shape) -> bool:
     return prod(shape) <= 4 * FAST_ENOUGH
 
 
-def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
+def foretold_price(
+    shape: Shape, tile: Shape, size: float, time: AxisTransform | None = None
+) -> float:
     """Return the price of tiles that nothing was tried for: the most that is likely.
 
-    size: bytes of the series as one tile.
+    size, time: see `cheap_tiling`.
     """
-    cuts = CUT_IN_TIME * (1 / tile[0] - 1 / shape[0])
+    cuts = 1 / tile[0] - 1 / shape[0]
+    # Haar reaches across no multiple of its longest wavelet.
+    alone = time is not None and time.kind == "haar" and tile[0] % (1 << time.depth) == 0
+    cuts *= CUT_BETWEEN if alone else CUT_IN_TIME
     cuts += CUT_IN_SPACE * sum(
         1 / n - 1 / length for length, n in zip(shape[1:], tile[1:], strict=True) if n < length
     )
@@ -344,17 +352,20 @@ def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
     return 1 + cuts + BYTES_OF_TILE * (count - 1) / max(size, 1.0)
 
 
-def cheap_tiling(shape: Shape, size: float, access: str) -> Tiling:
+def cheap_tiling(
+    shape: Shape, size: float, access: str, time: AxisTransform | None = None
+) -> Tiling:
     """Return the tiles of the fastest region whose foretold price is allowed.
 
     Foretold prices are too rough to say which tiles are best.
 
-    size: bytes of the series, roughly.
+    size: bytes of the series as one tile, roughly.
     access: the wish, a name of `PRICES`.
+    time: transform along time, where it is known.
     """
     may_be_one = prod(shape) <= MAX_WHOLE_VERTICES
     tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES if may_be_one else MAX_VERTICES)
-    prices = [foretold_price(shape, tile, size) for tile in tiles]
+    prices = [foretold_price(shape, tile, size, time) for tile in tiles]
     # The best tiling of a long series is no single tile.
     lowest = min(prices)
     allowed = max(PRICES[access] - MARGIN_FORETOLD, 1.0)

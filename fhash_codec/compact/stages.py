@@ -34,6 +34,7 @@ from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
     adapted_transform,
     basis_bytes,
+    cheapest_in_time,
     choose_transform,
     moved_transform,
     refit,
@@ -192,6 +193,8 @@ FEWEST_BITS = 0.1
 """Bits of a vertex in the first guess below which trials beside a plateau are not quick."""
 PLAIN_COSTS = 1.03
 """Factor of the bytes by the plain quantiser on small parts, where the trellis is as good later."""
+TIMED_VERTICES = 1 << 18
+"""Vertices that are priced for each transform along time at effort 1."""
 PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 PRICED_SHARP = 1 << 20
@@ -239,7 +242,20 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         offsets=OFFSETS,
         double=True,
     )
-    return with_step(settings, step, goal)
+    settings = with_step(settings, step, goal)
+    return settings if task.config.effort > 1 else _with_time(task, tiled, settings)
+
+
+def _with_time(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSettings:
+    """Return settings with the transform along time for which parts of tiles have least prices."""
+    parts = tiled.retile(sub_tile(tiled.tile, TIMED_VERTICES // PARTS))
+    usual = replace(settings, transform=usual_transform(parts.tile))
+    sample = Sample(parts, TIMED_VERTICES, task.workers)
+    trials = priced(sample, usual, task.config.effort)
+    if trials is sample or tiled.tile[0] == 1:
+        return settings
+    time = cheapest_in_time(trials, usual, task.goal.bounded(Coding(fast=True)))
+    return replace(settings, transform=usual_transform(tiled.tile, time))
 
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
@@ -276,7 +292,8 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         tiled = task.blocks.retile(tiling.tile)
     else:
         skip("tiles", f"--tile {task.config.tile}")
-    settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
+    time = attempt.settings.transform.axes[0] if task.config.effort == 1 else None
+    settings = replace(attempt.settings, transform=usual_transform(tiled.tile, time))
     found = tiling.found if attempt.quick and tiling is not None else None
     if found is not None:
         settings, outcome = found
@@ -352,7 +369,8 @@ def _in_parts(
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
     """Return the choice of the tiles: by trial from effort 2 on."""
     access = task.config.access
-    cheap = tiling_without_trials(task, attempt.outcome.size)
+    time = attempt.settings.transform.axes[0]
+    cheap = tiling_without_trials(task, attempt.outcome.size, time)
     if cheap is not None:
         if task.config.effort == 1:
             skip("tiles", "effort 1 foretells what tiles cost; from 2 on they are tried")
@@ -436,6 +454,9 @@ def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
     Where these leave it open, the coders are compared once more on whole tiles.
     """
     settings, goal = attempt.settings, task.goal
+    if task.config.effort == 1:
+        slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
+        return replace(attempt, coding=replace(attempt.coding, fast=slow))
     part, moved = attempt.sample.narrowed(COMPARED_VERTICES), attempt
     small = part
     if not attempt.sharp:

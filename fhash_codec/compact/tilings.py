@@ -248,10 +248,12 @@ COLUMN_SPACE = 4096
 """Vertices of a column in space, at least."""
 
 
-def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
+def tiling_without_trials(
+    task: PlanTask, size: float, time: AxisTransform | None = None
+) -> Tiling | None:
     """Return tiles by what is foretold where none are tried, at effort 1 or if asked; else None.
 
-    size: bytes of the series, roughly.
+    size, time: see `cheap_tiling`.
     """
     config, shape = task.config, task.blocks.shape
     few = config.effort <= MAX_PRICED_EFFORT and config.access == "balanced"
@@ -259,7 +261,7 @@ def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
         return Tiling(tile=shape, price=1.0)
     if config.effort > 1 and "tiles" not in config.without:
         return None
-    return cheap_tiling(task.blocks.shape, size, config.access)
+    return cheap_tiling(task.blocks.shape, size, config.access, time)
 
 
 def choose_tiling(

@@ -203,13 +203,29 @@ def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
     return AxisTransform(kind=kind, depth=depth) if depth else NONE
 
 
-def usual_transform(shape: Shape) -> TransformSpec:
-    """Return a good guess without trial: 9/7 along all axes, deepest in the plane."""
+def usual_transform(shape: Shape, time: AxisTransform | None = None) -> TransformSpec:
+    """Return a good guess without trial: 9/7 along all axes, deepest in the plane.
+
+    time: what there is along time instead.
+    """
     t, z, y, x = shape
     depth = min(4, max(1, max(y, x).bit_length() - 2))
-    return TransformSpec(
-        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *plane("9/7", depth, y, x))
-    )
+    along_t = wavelet("9/7", 2, t) if time is None else _fitted(time, t)
+    return TransformSpec(axes=(along_t, wavelet("9/7", 2, z), *plane("9/7", depth, y, x)))
+
+
+USUAL_IN_TIME = 0.96
+"""Share of the usual price below which another transform along time is taken by few prices."""
+
+
+def cheapest_in_time(sample: TileSample, settings: TileSettings, coding: Coding) -> AxisTransform:
+    """Return haar or none along time if it is clearly cheaper on a sample, else the usual one."""
+    axes = settings.transform.axes
+    haar = wavelet("haar", 2, sample.tiles[0].values.shape[0])
+    trials = [axes, *(_changed(axes, {0: kind}) for kind in (haar, NONE))]
+    (usual, *_), *others = _tried(sample, settings, trials, coding)
+    cost, best, _ = min(others, key=itemgetter(0))
+    return best[0] if cost < USUAL_IN_TIME * usual else axes[0]
 
 
 def choose_transform(
@@ -645,7 +661,8 @@ def estimated_step(
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
         blocks = blocks.retile(even_tile(blocks.tile, parts, TRIAL_STEPS))
-        settings = replace(settings, transform=usual_transform(blocks.tile))
+        transform = usual_transform(blocks.tile, settings.transform.axes[0])
+        settings = replace(settings, transform=transform)
         tiles = _tile_magnitudes(blocks, settings, workers)
     settings = replace(settings, step=step)
     indices = list(blocks.indices())

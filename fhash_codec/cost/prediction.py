@@ -329,7 +329,8 @@ def _all_tiles(work: _Work, rate: float) -> float:
     """Seconds of coding all tiles once."""
     tile = work.look.tile
     if _estimated(work.look, work.config) and work.look.task.fixed_tile is None:
-        tile = cheap_tiling(work.look.shape, work.bytes_of_tiles, work.config.access).tile
+        time = work.look.attempt.settings.transform.axes[0]
+        tile = cheap_tiling(work.look.shape, work.bytes_of_tiles, work.config.access, time).tile
     return work.wall(rate, tile, work.tiles(tile))
 
 

@@ -148,12 +148,12 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
     costing = now() - costs_begun
     attempt = first_guess(task, tiled, settings)
     guessing = now() - begun - costing - labelling
-    size = attempt.outcome.size / share
+    size, time = attempt.outcome.size / share, attempt.settings.transform.axes[0]
     return Look(
         task=task,
         attempt=attempt,
         labels=labels,
-        tile=fixed or cheap_tiling(shape, size, config.access).tile,
+        tile=fixed or cheap_tiling(shape, size, config.access, time).tile,
         shape=shape,
         share=share,
         selecting=selecting,

@@ -290,6 +290,18 @@ def test_a_file_has_the_plateau_as_its_centre(tmp_path, effort: int) -> None:
     assert settings.center == float(np.float32(0.777))
 
 
+@pytest.mark.parametrize("related", [True, False])
+def test_effort_1_asks_what_pays_along_time(tmp_path: Path, *, related: bool) -> None:
+    t, z, y, x = np.indices((8, 12, 40, 40))
+    moved = t / 8 if related else 977 * t * t
+    values = (np.sin(x / 5 + moved) * np.cos(y / 7 + moved / 3) + z / 9).astype(np.float32)
+    path = tmp_path / "a.fhz"
+    fhash_codec.encode(values, path, EncodeConfig(psnr=45.0, effort=1))
+    with fhash_codec.open(path) as volume:
+        settings = volume.container.arrays["tables/level_1"].settings
+    assert settings.transform.axes[0].kind == ("9/7" if related else "haar")
+
+
 GOAL = Goal(psnr=40.0, data_range=8.0)
 
 
