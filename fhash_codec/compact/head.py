@@ -83,7 +83,7 @@ EFFORTS = {
         ),
         candidates=0,
         budget=None,
-        perceptron=Budget(updates=2000, samples=400_000, rate=3e-2),
+        perceptron=Budget(updates=1000, samples=400_000, rate=3e-2),
         least=0.03,
         least_bytes=12_000,
         most_bits=0.75,

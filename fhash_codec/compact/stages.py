@@ -262,7 +262,9 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     """Code a few tiles for a first idea of the size."""
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
     quick = task.config.effort <= MAX_PRICED_EFFORT and task.config.access != "small"
-    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick)
+    coding = Coding(
+        filled=task.blocks.complete, density=0, bulk=task.goal.bulk, fast=quick, rough=quick
+    )
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     looked = sample
     if quick and task.goal.psnr is not None:
@@ -273,7 +275,7 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     sharp = quick and plateau_center(sample, task.value_range) is not None
     if sharp and 8 * outcome.size < FEWEST_BITS * prod(task.blocks.shape):
         # Of a shock in a few bytes, one coder does not tell what the other would choose.
-        coding, quick, sharp = replace(coding, fast=False), False, False
+        coding, quick, sharp = replace(coding, fast=False, rough=False), False, False
     return Attempt(
         sample=sample,
         settings=settings,

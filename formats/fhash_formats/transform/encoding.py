@@ -372,6 +372,7 @@ class Coding:
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         rounds: how often the values that are free to change are replaced by their decoded values.
+        rough: whether these are those of the nearest integers, and not of those that are chosen.
         passes: 2 codes the integers that the optimisation chose once more, or searches the path
             through the trellis once more; 1 does not.
         filled: whether the values that are not counted are a good filling already, such as repeated
@@ -385,6 +386,7 @@ class Coding:
     weight: float = 0.0
     error: float | None = None
     rounds: int = 0
+    rough: bool = False
     passes: int = 1
     filled: bool = False
     density: int = 1
@@ -676,12 +678,16 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     ends = (target <= settings.dtype.type(low)) | (target >= settings.dtype.type(high))
     free = np.count_nonzero(ends if task.counted is None else ends | ~task.counted)
     for _ in range(task.coding.rounds if free > _FEW * target.size else 0):
-        integers = choose_integers(coefficients, settings, task.coding.weight)
+        step, offsets = settings.step, settings.offsets
+        integers: Integers | None
+        if task.coding.rough:
+            step, offsets = plain_step(settings), OFFSETS
+            integers, _ = quantise(coefficients, step)
+        else:
+            integers = choose_integers(coefficients, settings, task.coding.weight)
         if integers is None:
             break
-        rebuilt = transform.inverse(
-            dequantise(integers, settings.step, settings.offsets, settings.dtype)
-        )
+        rebuilt = transform.inverse(dequantise(integers, step, offsets, settings.dtype))
         freed = free_values(target, rebuilt, task.counted, low, high)
         if not freed:
             break
