@@ -134,6 +134,8 @@ FACTORS = (1.5, 2.2)
 """Factors of the final step for which bases are tried, until one does not pay."""
 LEAST = 0.01
 """Share of tiles and bases that the bases must take, so that coarser ones are tried."""
+LEAST_QUICKLY = 0.1
+"""The same where seconds count, as a share of tiles alone."""
 TRIES = 4
 """Trials of a step for each of them."""
 
@@ -144,8 +146,6 @@ def coarser_bases(
     outcome: Outcome,
     coding: Coding,
     goal: Goal,
-    *,
-    quick: bool = False,
 ) -> tuple[TileSettings, Outcome] | None:
     """Return settings with bases made for a coarser step if the sample gets smaller by them.
 
@@ -153,7 +153,6 @@ def coarser_bases(
     tried. Sizes are compared at the same PSNR, or under a bound as they are.
 
     outcome: outcome of the settings, which keeps the promise.
-    quick: whether the step is searched by few trials.
     """
     taken = basis_bytes(settings.transform)
     if not outcome.count or taken < LEAST * (outcome.size + taken):
@@ -164,8 +163,7 @@ def coarser_bases(
         for factor in FACTORS:
             tried: list[Outcome] = []
             coarser = refit(sample, settings, factor)
-            tries = 2 if quick else TRIES
-            found, new = find_step(sample, coarser, coding, goal, tries=tries, tried=tried)
+            found, new = find_step(sample, coarser, coding, goal, tries=TRIES, tried=tried)
             cost = new.size + basis_bytes(found.transform) - outcome.size - taken
             if goal.error is None:
                 # The rest of the difference in quality between the two searches, in bytes.
@@ -657,9 +655,11 @@ def refit_bases(task: PlanTask, attempt: Attempt) -> Attempt:
     """Make the data's own bases anew for the final step, and keep them if the file is smaller."""
     if task.config.effort == 1 or task.goal.size is not None:
         return attempt
+    taken = basis_bytes(attempt.settings.transform)
+    if attempt.quick and taken < LEAST_QUICKLY * attempt.outcome.size:
+        return attempt
     found = coarser_bases(
-        *(attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal),
-        quick=attempt.quick,
+        attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal
     )
     if found is None:
         return attempt
