@@ -110,8 +110,13 @@ EFFORTS = {
 
 At 5 a cross is left out: it gains up to a fifth more, and takes six times as long.
 """
-OF_FEWEST_BYTES: dict[str, Any] = {"least": 0.003, "least_bytes": 900, "most_bits": math.inf}
-"""Limits of a trial where the fewest bytes are wished for, whatever they cost."""
+OF_FEWEST_BYTES: dict[str, Any] = {
+    "least": 0.003,
+    "least_bytes": 900,
+    "most_bits": math.inf,
+    "perceptron": Budget(updates=2000, samples=400_000, rate=3e-2),
+}
+"""Limits of a trial, and the training, where the fewest bytes are wished for at any cost."""
 MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
