@@ -84,11 +84,13 @@ def padded_tile(values: Values, in_coreset: Mask | None, tile: Shape) -> Tile:
 
 
 class _BoxInMemory:
-    """Values and mask of the box over all steps once they were read, shared by all tilings."""
+    """Values and mask of what was read of the box, shared by all tilings: all steps, or some."""
 
     def __init__(self) -> None:
         self.lock = Lock()
         self.content: Tile | None = None
+        self.layer: tuple[range, Tile] | None = None
+        """The last steps that were read, of a series that is not in memory."""
 
 
 class Blocks:
@@ -123,7 +125,6 @@ class Blocks:
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
         t, z, y, x = (-(-length // n) for length, n in zip(self.shape, self.tile, strict=True))
         self.grid: Index = (t * len(self.weights), z, y, x)
-        self._last_layer: tuple[int, Tile] | None = None
 
     def retile(self, tile: Shape) -> Blocks:
         """Return the same series in other tiles; the box in memory is shared."""
@@ -137,14 +138,13 @@ class Blocks:
         So nothing is read of the other layers, of a short series either.
         """
         other = copy(self)
-        other._only_layers, other._last_layer = True, None
+        other._only_layers = True
         return other
 
     def forget(self) -> None:
         """Free the memory of the values, which are read again when they are asked for."""
         with self._box.lock:
-            self._box.content = None
-        self._last_layer = None
+            self._box.content = self._box.layer = None
 
     def window(self, shape: Shape) -> Blocks:
         """Return a part of the box over some steps, as one tile in memory: where values vary most.
@@ -250,10 +250,11 @@ class Blocks:
         steps = range(box * self.shape[0] + first, box * self.shape[0] + last)
         if self.in_memory:
             return self._steps(steps)
-        if self._last_layer is None or self._last_layer[0] != t:
-            self._last_layer = None  # frees its memory before the next layer is read
-            self._last_layer = (t, self._load(steps))
-        return self._last_layer[1]
+        layer = self._box.layer
+        if layer is None or layer[0] != steps:
+            layer = self._box.layer = None  # frees its memory before the next layer is read
+            layer = self._box.layer = (steps, self._load(steps))
+        return layer[1]
 
     def _load(self, steps: range) -> Tile:
         """Read the box at some steps from the series; an array in memory is not copied."""

@@ -113,7 +113,7 @@ def in_threads(
     is one of them. The first failure is raised, and items not begun by then are left out. Nothing
     is computed before the first result is asked for.
     """
-    arguments = list(items)
+    work, arguments = [function], list(items)
     results: list[Future[Result]] = [Future() for _ in arguments]
     numbers = count()
     stopped = False
@@ -124,7 +124,7 @@ def in_threads(
         if stopped or number >= len(arguments):
             return False
         try:
-            results[number].set_result(function(arguments[number]))
+            results[number].set_result(work[0](arguments[number]))
         except BaseException as error:
             results[number].set_exception(error)
         return True
@@ -155,6 +155,7 @@ def in_threads(
             if not helper.cancel():
                 helper.result()
         # The pool holds such a helper until it is free, and would hold all of this with it.
+        work.clear()
         arguments.clear()
         results.clear()
 

@@ -151,6 +151,26 @@ def test_calls_within_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(sums) == [outer * sum(range(30)) for outer in range(30)]
 
 
+def test_a_busy_pool_holds_no_work_that_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_threads", lambda: 2)
+    pool, free = parallel._threads.pool(1), threading.Event()
+    waiting = [pool.submit(free.wait, 60) for _ in range(pool._max_workers)]
+
+    class Work:
+        def __call__(self, number: int) -> int:
+            return number
+
+    work = Work()
+    held = weakref.ref(work)
+    try:
+        assert list(in_threads(work, range(3))) == [0, 1, 2]
+        del work
+        assert held() is None  # else each decoded tile of a large layer stays until its end
+    finally:
+        free.set()
+    assert all(each.result() for each in waiting)
+
+
 def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
     begun: list[int] = []
 
