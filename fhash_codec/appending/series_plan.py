@@ -50,7 +50,7 @@ from fhash_formats.transform.tile_format import Shape, TileSettings
 
 MAX_TILE_LENGTH = 1 << 24
 """Vertices of a tile along an axis, at most."""
-_SWITCHES = ("filled", "keep_missing", "own_settings", "exact", "fast")
+_SWITCHES = ("filled", "keep_missing", "own_settings", "exact", "fast", "rough")
 """Options of the encoder that are true or false."""
 _COUNTS = ("rounds", "passes")
 """Options of the encoder that count how often it does something."""
