@@ -509,10 +509,10 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
     tiling = None
     if task.fixed_tile is None:
         size = _estimated_bytes(task, tiled, settings)
-        time = settings.transform.axes[0]
-        tiling = cheap_tiling(task.blocks.shape, size, task.config.access, time)
+        chosen = settings.transform
+        tiling = cheap_tiling(task.blocks.shape, size, task.config.access, chosen.axes[0])
         tiled = task.blocks.retile(tiling.tile)
-        settings = replace(settings, transform=usual_transform(tiled.tile, time))
+        settings = replace(settings, transform=usual_transform(tiled.tile, chosen))
     slow = task.is_slow(tiled.tile, _estimated_bytes(task, tiled, settings))
     coding = Coding(filled=True, density=0, bulk=goal.bulk, fast=slow)
     step = estimated_step(

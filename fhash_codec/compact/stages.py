@@ -34,8 +34,8 @@ from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
     adapted_transform,
     basis_bytes,
-    cheapest_in_time,
     choose_transform,
+    chosen_by_prices,
     moved_transform,
     refit,
     tile_costs,
@@ -191,8 +191,8 @@ FEWEST_BITS = 0.1
 """Bits of a vertex in the first guess below which trials beside a plateau are not quick."""
 PLAIN_COSTS = 1.03
 """Factor of the bytes by the plain quantiser on small parts, where the trellis is as good later."""
-TIMED_VERTICES = 1 << 18
-"""Vertices that are priced for each transform along time at effort 1."""
+LEAST_PRICED = 1 << 18
+"""Vertices that are priced for each transform at effort 1."""
 PRICED_VERTICES = 1 << 19
 """Vertices that are priced for each trial of a transform, in parts of tiles."""
 PRICED_SHARP = 1 << 20
@@ -241,19 +241,19 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         double=True,
     )
     settings = with_step(settings, step, goal)
-    return settings if task.config.effort > 1 else _with_time(task, tiled, settings)
+    return settings if task.config.effort > 1 else _by_prices(task, tiled, settings)
 
 
-def _with_time(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSettings:
-    """Return settings with the transform along time for which parts of tiles have least prices."""
-    parts = tiled.retile(sub_tile(tiled.tile, TIMED_VERTICES // PARTS))
+def _by_prices(task: PlanTask, tiled: Blocks, settings: TileSettings) -> TileSettings:
+    """Return settings with the transform for which parts of the tiles have the least prices."""
+    parts = tiled.retile(sub_tile(tiled.tile, LEAST_PRICED // PARTS))
     usual = replace(settings, transform=usual_transform(parts.tile))
-    sample = Sample(parts, TIMED_VERTICES, task.workers)
+    sample = Sample(parts, LEAST_PRICED, task.workers)
     trials = priced(sample, usual, task.config.effort)
-    if trials is sample or tiled.tile[0] == 1:
+    if trials is sample:
         return settings
-    time = cheapest_in_time(trials, usual, task.goal.bounded(Coding(fast=True)))
-    return replace(settings, transform=usual_transform(tiled.tile, time))
+    chosen = chosen_by_prices(trials, usual, task.goal.bounded(Coding(fast=True)))
+    return replace(settings, transform=usual_transform(tiled.tile, chosen))
 
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
@@ -292,8 +292,8 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         tiled = task.blocks.retile(tiling.tile)
     else:
         skip("tiles", f"--tile {task.config.tile}")
-    time = attempt.settings.transform.axes[0] if task.config.effort == 1 else None
-    settings = replace(attempt.settings, transform=usual_transform(tiled.tile, time))
+    chosen = attempt.settings.transform if task.config.effort == 1 else None
+    settings = replace(attempt.settings, transform=usual_transform(tiled.tile, chosen))
     found = tiling.found if attempt.quick and tiling is not None else None
     if found is not None:
         settings, outcome = found

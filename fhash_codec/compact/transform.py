@@ -203,29 +203,45 @@ def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
     return AxisTransform(kind=kind, depth=depth) if depth else NONE
 
 
-def usual_transform(shape: Shape, time: AxisTransform | None = None) -> TransformSpec:
+def usual_transform(shape: Shape, like: TransformSpec | None = None) -> TransformSpec:
     """Return a good guess without trial: 9/7 along all axes, deepest in the plane.
 
-    time: what there is along time instead.
+    like: of another shape, whose kinds are taken instead.
     """
     t, z, y, x = shape
     depth = min(4, max(1, max(y, x).bit_length() - 2))
-    along_t = wavelet("9/7", 2, t) if time is None else _fitted(time, t)
-    return TransformSpec(axes=(along_t, wavelet("9/7", 2, z), *plane("9/7", depth, y, x)))
+    usual = (wavelet("9/7", 2, t), wavelet("9/7", 2, z), *plane("9/7", depth, y, x))
+    if like is None:
+        return TransformSpec(axes=usual)
+    along_t, along_z = (_fitted(like.axes[axis], shape[axis]) for axis in (0, 1))
+    of_plane = like.axes[3]
+    in_plane = plane("haar", of_plane.depth, y, x) if of_plane.kind == "haar" else usual[2:]
+    return TransformSpec(axes=(along_t, along_z, *in_plane))
 
 
-USUAL_IN_TIME = 0.96
+CLEARLY_IN_TIME = 0.96
 """Share of the usual price below which another transform along time is taken by few prices."""
+CLEARLY_IN_SPACE = 0.85
+"""The same in space, of which small parts of tiles say less."""
 
 
-def cheapest_in_time(sample: TileSample, settings: TileSettings, coding: Coding) -> AxisTransform:
-    """Return haar or none along time if it is clearly cheaper on a sample, else the usual one."""
-    axes = settings.transform.axes
-    haar = wavelet("haar", 2, sample.tiles[0].values.shape[0])
-    trials = [axes, *(_changed(axes, {0: kind}) for kind in (haar, NONE))]
-    (usual, *_), *others = _tried(sample, settings, trials, coding)
-    cost, best, _ = min(others, key=itemgetter(0))
-    return best[0] if cost < USUAL_IN_TIME * usual else axes[0]
+def chosen_by_prices(sample: TileSample, settings: TileSettings, coding: Coding) -> TransformSpec:
+    """Return the transform of the settings, or one that is clearly cheaper on a sample.
+
+    Along time haar and none are tried, then haar in the plane and in all of space.
+    """
+    axes, shape = settings.transform.axes, sample.tiles[0].values.shape
+    haar = dict(enumerate(plane("haar", 3, *shape[2:]), 2))
+    along_t, along_z = (wavelet("haar", 2, shape[axis]) for axis in (0, 1))
+    for changes, share in (
+        ([{0: along_t}, {0: NONE}], CLEARLY_IN_TIME),
+        ([haar, {**haar, 1: along_z}], CLEARLY_IN_SPACE),
+    ):
+        tried = [_changed(axes, change) for change in changes]
+        (usual, *_), *others = _tried(sample, settings, [axes, *tried], coding)
+        price, best, _ = min(others, key=itemgetter(0))
+        axes = best if price < share * usual else axes
+    return TransformSpec(axes=axes)
 
 
 def choose_transform(
@@ -661,7 +677,7 @@ def estimated_step(
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
         blocks = blocks.retile(even_tile(blocks.tile, parts, TRIAL_STEPS))
-        transform = usual_transform(blocks.tile, settings.transform.axes[0])
+        transform = usual_transform(blocks.tile, settings.transform)
         settings = replace(settings, transform=transform)
         tiles = _tile_magnitudes(blocks, settings, workers)
     settings = replace(settings, step=step)

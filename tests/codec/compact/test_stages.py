@@ -302,6 +302,15 @@ def test_effort_1_asks_what_pays_along_time(tmp_path: Path, *, related: bool) ->
     assert settings.transform.axes[0].kind == ("9/7" if related else "haar")
 
 
+def test_effort_1_takes_haar_for_blocks_of_equal_values(tmp_path: Path) -> None:
+    blocks = np.random.default_rng(0).normal(size=(4, 4, 8, 8)).repeat(4, 1).repeat(8, 2)
+    path = tmp_path / "a.fhz"
+    fhash_codec.encode(blocks.repeat(8, 3).astype("f4"), path, EncodeConfig(psnr=45.0, effort=1))
+    with fhash_codec.open(path) as volume:
+        settings = volume.container.arrays["tables/level_1"].settings
+    assert [axis.kind for axis in settings.transform.axes[2:]] == ["haar", "haar"]
+
+
 GOAL = Goal(psnr=40.0, data_range=8.0)
 
 
