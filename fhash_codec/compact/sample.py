@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from functools import partial
 from itertools import pairwise
 from math import prod
 from typing import NamedTuple, TypeVar
@@ -334,10 +333,16 @@ class PricedSample(Sample):
         self.sample = sample
 
     def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        """Return what is foretold of the series for each pair of settings and coding."""
+        """Return what is foretold of the series for each pair of settings and coding.
+
+        All trials run at once, as those of a `Sample`.
+        """
+        jobs = [(tile, *trial) for trial in trials for tile in self.tiles]
+        prices = list(self._ticking(self._pool.map(lambda job: _price(*job), jobs)))
+        number = len(self.tiles)
         return [
-            total(self.map(partial(_price, settings=settings, coding=coding)), self.weights)
-            for settings, coding in trials
+            total(prices[start : start + number], self.weights)
+            for start in range(0, len(prices), number)
         ]
 
 
