@@ -454,15 +454,14 @@ def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
     Where these leave it open, the coders are compared once more on whole tiles.
     """
     settings, goal = attempt.settings, task.goal
+    slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
     if task.config.effort == 1:
-        slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
         return replace(attempt, coding=replace(attempt.coding, fast=slow))
     part, moved = attempt.sample.narrowed(COMPARED_VERTICES), attempt
     small = part
     if not attempt.sharp:
         _, small = _in_parts(task, attempt, COMPARED_QUICKLY, COMPARED_QUICKLY)
         moved = replace(attempt, settings=moved_transform(small, settings))
-    slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
     quantisers = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
     best = [
         min(

@@ -28,8 +28,8 @@ from fhash_codec.compact.tiles import Blocks, Coding, Index, Outcome
 from fhash_codec.compact.transform import (
     MAX_BASIS_LENGTH,
     basis_bytes,
+    in_plane,
     lines_of_trials,
-    plane,
     refit,
     rough_transform,
     tile_costs,
@@ -80,7 +80,8 @@ class Trials:
         self._is_sharp = sharp
         self._known: dict[tuple[int, int], AxisTransform] = {}
         self._psnr: float | None = None
-        self._tries_own, self._plane = True, None  # type: bool, AxisTransform | None
+        self._plane: AxisTransform | None = None
+        self._tries_own = True
         self._settled: list[Outcome] = []
         self.sizes: dict[Shape, float] = {}
         self.found: dict[Shape, tuple[TileSettings, Outcome]] = {}
@@ -192,7 +193,7 @@ class Trials:
                 kind, depth = transform.kind, transform.depth
                 known[axis] = transform if same else wavelet(kind, depth, tile[1])
         if self._plane is not None and self._plane.wavelet:
-            known[2], known[3] = plane(self._plane.kind, self._plane.depth, *tile[2:])
+            known |= in_plane(self._plane.kind, self._plane.depth, tile)
         return known
 
     def _note(self, sample: Sample, outcome: Outcome, settings: TileSettings) -> None:

@@ -209,14 +209,14 @@ def usual_transform(shape: Shape, like: TransformSpec | None = None) -> Transfor
     like: of another shape, whose kinds are taken instead.
     """
     t, z, y, x = shape
-    depth = min(4, max(1, max(y, x).bit_length() - 2))
-    usual = (wavelet("9/7", 2, t), wavelet("9/7", 2, z), *plane("9/7", depth, y, x))
-    if like is None:
-        return TransformSpec(axes=usual)
-    along_t, along_z = (_fitted(like.axes[axis], shape[axis]) for axis in (0, 1))
-    of_plane = like.axes[3]
-    in_plane = plane("haar", of_plane.depth, y, x) if of_plane.kind == "haar" else usual[2:]
-    return TransformSpec(axes=(along_t, along_z, *in_plane))
+    along_t, along_z = wavelet("9/7", 2, t), wavelet("9/7", 2, z)
+    kind, depth = "9/7", min(4, max(1, max(y, x).bit_length() - 2))
+    if like is not None:
+        along_t, along_z = _fitted(like.axes[0], t), _fitted(like.axes[1], z)
+        if like.axes[3].kind == "haar":
+            kind, depth = "haar", like.axes[3].depth
+    of_plane = in_plane(kind, depth, shape)
+    return TransformSpec(axes=(along_t, along_z, of_plane[2], of_plane[3]))
 
 
 CLEARLY_IN_TIME = 0.96
@@ -230,17 +230,18 @@ def chosen_by_prices(sample: TileSample, settings: TileSettings, coding: Coding)
 
     Along time haar and none are tried, then haar in the plane and in all of space.
     """
-    axes, shape = settings.transform.axes, sample.tiles[0].values.shape
-    haar = dict(enumerate(plane("haar", 3, *shape[2:]), 2))
+    shape: Shape = sample.tiles[0].values.shape
     along_t, along_z = (wavelet("haar", 2, shape[axis]) for axis in (0, 1))
+    haar = in_plane("haar", 3, shape)
+    price, axes = _cheapest(sample, settings, [settings.transform.axes], coding)
     for changes, share in (
         ([{0: along_t}, {0: NONE}], CLEARLY_IN_TIME),
         ([haar, {**haar, 1: along_z}], CLEARLY_IN_SPACE),
     ):
-        tried = [_changed(axes, change) for change in changes]
-        (usual, *_), *others = _tried(sample, settings, [axes, *tried], coding)
-        price, best, _ = min(others, key=itemgetter(0))
-        axes = best if price < share * usual else axes
+        trials = [_changed(axes, change) for change in changes]
+        other, best = _cheapest(sample, settings, trials, coding)
+        if other < share * price:
+            price, axes = other, best
     return TransformSpec(axes=axes)
 
 
@@ -346,8 +347,7 @@ def rough_transform(
         fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
         best = min([best, *_tried(sample, settings, fresh, coding)], key=itemgetter(0))
     if sharp and 3 not in known and min(shape[2:]) > 1:
-        along_y, along_x = plane("haar", 3, *shape[2:])
-        haar = _changed(best[1], {2: along_y, 3: along_x})
+        haar = _changed(best[1], in_plane("haar", 3, shape))
         best = min([best, *_tried(sample, settings, [haar], coding)], key=itemgetter(0))
     if own and bases.possible(*shape[1:]):
         in_space = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
@@ -499,12 +499,13 @@ def _tried(
     ]
 
 
-def plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
-    """Return a wavelet along y and x, of one depth where both have more than one vertex."""
+def in_plane(kind: str, depth: int, shape: Shape) -> dict[int, AxisTransform]:
+    """Return a wavelet by the axes y and x, of one depth where both have more than one vertex."""
+    y, x = shape[2:]
     if min(y, x) > 1:
         depth = min(depth, max(1, (max(y, x) - 1).bit_length()))
-        return AxisTransform(kind=kind, depth=depth), AxisTransform(kind=kind, depth=depth)
-    return wavelet(kind, depth, y), wavelet(kind, depth, x)
+        return dict.fromkeys((2, 3), AxisTransform(kind=kind, depth=depth))
+    return {2: wavelet(kind, depth, y), 3: wavelet(kind, depth, x)}
 
 
 def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
@@ -512,8 +513,7 @@ def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransfor
     y, x = shape[2:]
     for kind, depth in PLANE_WAVELETS:
         if 2 ** (depth - 1) < max(y, x):
-            along_y, along_x = plane(kind, depth, y, x)
-            yield {2: along_y, 3: along_x}
+            yield in_plane(kind, depth, shape)
     if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}
 

@@ -23,7 +23,14 @@ from fhash_codec import EncodeConfig
 from fhash_codec.compact import attempt as access
 from fhash_codec.compact import tilings
 from fhash_codec.compact import tilings as tiling_trials
-from fhash_codec.compact.attempt import PRICES, PlanTask, Tiling, region_vertices
+from fhash_codec.compact.attempt import (
+    PRICES,
+    PlanTask,
+    Tiling,
+    cheap_tiling,
+    foretold_price,
+    region_vertices,
+)
 from fhash_codec.compact.goal import step_after_gain
 from fhash_codec.compact.head import (
     EFFORTS,
@@ -649,6 +656,13 @@ def test_prices_of_trials_are_those_of_files(
     # Both other files are of the mixing coder.
     coder = access.FAST_BYTES["balanced"] if record.get("coder") == "fast" else 1.0
     assert size / best <= coder * record["price"] + 0.05
+
+
+def test_cuts_between_wavelets_of_haar_are_cheap() -> None:
+    shape, haar = (12, 25, 125, 125), AxisTransform(kind="haar", depth=2)
+    assert cheap_tiling(shape, 1e6, "balanced").tile == shape
+    assert cheap_tiling(shape, 1e6, "balanced", haar).tile == (4, 25, 125, 125)
+    assert foretold_price(shape, (6, 25, 125, 125), 1e6, haar) > 1.5  # through a wavelet
 
 
 def test_a_wish_is_kept_and_faster_ones_have_faster_regions(
