@@ -299,7 +299,7 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         settings, outcome = found
         attempt = replace(attempt, outcome=outcome)
     with stage("sample", SAMPLE_WHY):
-        sample = _sample(task, tiled, settings, vertices_of_trials(attempt.quick, attempt.sharp))
+        sample = _sample(task, tiled, settings, vertices_of_trials(attempt))
     # Tiles were chosen about the mean: about the plateau of a shock wave their trials misled.
     plateau = plateau_center(sample, task.value_range)
     settings = settings if plateau is None else replace(settings, center=plateau)
@@ -324,16 +324,16 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         return replace(attempt, sample=attempt.sample.wider(searched))
 
 
-def vertices_of_trials(quick: bool, sharp: bool = False) -> int:
-    """Return the vertices on which each transform is tried. quick, sharp: see `Attempt`."""
-    if not quick:
+def vertices_of_trials(attempt: Attempt) -> int:
+    """Return the vertices on which each transform is tried."""
+    if not attempt.quick:
         return TRIAL_VERTICES
-    return PRICED_SHARP if sharp else PRICED_VERTICES
+    return PRICED_SHARP if attempt.sharp else PRICED_VERTICES
 
 
-def is_tried_in_parts(tile: Shape, quick: bool, sharp: bool = False) -> bool:
-    """Whether transforms of a tile are tried on parts of it. quick, sharp: see `Attempt`."""
-    return prod(tile) > (2 if quick else LARGE) * vertices_of_trials(quick, sharp)
+def is_tried_in_parts(tile: Shape, attempt: Attempt) -> bool:
+    """Whether transforms of a tile are tried on parts of it."""
+    return prod(tile) > (2 if attempt.quick else LARGE) * vertices_of_trials(attempt)
 
 
 def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
@@ -344,7 +344,7 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
     choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    vertices = vertices_of_trials(attempt.quick, attempt.sharp)
+    vertices = vertices_of_trials(attempt)
     usual, small = _in_parts(task, attempt, vertices // PARTS, vertices)
     trials = priced(small, usual, task.config.effort)
     first = usual if not attempt.quick else moved_transform(trials, attempt.settings)
@@ -755,7 +755,7 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
-    elif sample.is_single or is_tried_in_parts(sample.blocks.tile, attempt.quick, attempt.sharp):
+    elif sample.is_single or is_tried_in_parts(sample.blocks.tile, attempt):
         settings = _transform_of_large_tile(task, attempt)
     else:
         trials = priced(sample, attempt.settings, task.config.effort)

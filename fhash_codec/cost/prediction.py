@@ -212,9 +212,9 @@ def _choices(work: _Work) -> dict[str, float]:
         coded = trials if rates.price is None else min(trials, CODED)
         coding = TRIAL_SHARE * work.wall(rates.trial, tile, coded * tried)
         pricing = work.wall(rates.price or 0.0, tile, trials * tried)
-        if is_tried_in_parts(tile, quick):
+        if is_tried_in_parts(tile, look.attempt):
             # A part stands for the tile in all trials but two.
-            part = vertices_of_trials(quick) / usable_threads()
+            part = vertices_of_trials(look.attempt) / usable_threads()
             coding = TRIAL_SHARE * rates.trial * (coded * part + 2 * prod(tile))
             pricing = (rates.price or 0.0) * trials * part
         coding += pricing
