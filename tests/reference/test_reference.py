@@ -21,11 +21,13 @@ from fhash_codec import EncodeConfig, FhashError, encode
 from fhash_codec.selftest.run import cases
 from fhash_formats.container.reader import Container
 from fhash_formats.transform.chunk import encode_chunk
-from fhash_formats.transform.coder import MaskLevels
+from fhash_formats.transform.coder import MaskLevels, encode_block
 from fhash_formats.transform.decoding import decode_tile_mask
 from fhash_formats.transform.encoding import Coding, encode_tile
+from fhash_formats.transform.predict import encode_predicted
 from fhash_formats.transform.stream import ArrayAxes
 from fhash_formats.transform.tile_format import TileSettings
+from reference import predictor as reference_predictor
 from reference.tile import chunk_of, decode_tile
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -198,6 +200,21 @@ def test_chunks_of_any_numbers(values: Any, quality: dict[str, float]) -> None:
     data = encode_chunk(values, **quality)
     theirs = decode_tile_mask(data, values.shape, values.dtype)
     assert equal(decode_tile(data, values.shape, values.dtype), theirs)
+
+
+@pytest.mark.parametrize("scale", [1e2, 1e4, 1e6])
+def test_predicted_integers_of_any_size(scale: float) -> None:
+    """Where they are small, predictions are summed in 32 bits: here they grow from row to row."""
+    shape = (3, 4, 5, 29)
+    growing = np.linspace(0.0, 3 * scale, shape[1] * shape[2]).reshape(1, *shape[1:3], 1)
+    integers = np.random.default_rng(2).normal(0, 1 + growing, shape).astype(np.int32)
+    ours = predictor_of((1, 1, 1, 2), (0, 3, 1, 2), 2)
+    data, coded = encode_predicted(integers, None, ours)
+    weights = encode_block(np.array(ours.weights, np.int32).reshape(1, 1, 1, -1))
+    passes = reference_predictor.passes_of(ours.levels, ours.order, ours.reach, weights)
+    theirs = reference_predictor.decode_predicted(data, shape, ours.levels, passes)
+    np.testing.assert_array_equal(theirs, integers)
+    np.testing.assert_array_equal(coded, integers)
 
 
 @pytest.mark.parametrize("count", [3, 300])

@@ -30,6 +30,14 @@ constexpr std::int64_t FHASH_ABI = 16;
 #define FHASH_LAMBDA __attribute__((always_inline))
 #endif
 
+// FHASH_RARE around a condition: left to the branch predictor, and not computed as a value that the
+// next step would wait for.
+#if defined(_MSC_VER)
+#define FHASH_RARE(condition) (condition)
+#else
+#define FHASH_RARE(condition) __builtin_expect(condition, 0)
+#endif
+
 // FHASH_INDEPENDENT before a loop: no iteration reads what another one writes.
 #if defined(__GNUC__) && !defined(__clang__)
 #define FHASH_INDEPENDENT _Pragma("GCC ivdep")

@@ -132,15 +132,16 @@ template <bool DECODES> struct Pass : Rows {
         const int64_t n3 = N.n[3];
         const int kind = plan.kind;
         for (std::vector<int32_t>* array :
-             {&base, &activity, &slope, &known, &step, &sizes, &signs})
-            array->assign((size_t)n3, 0);
-        sum.assign((size_t)n3, 0);
+             {&base, &activity, &slope, &known, &step, &sizes, &signs, &narrow})
+            array->assign((size_t)n3 + TOGETHER, 0);
+        wide.assign((size_t)n3, 0);
         const int64_t n0 = N.n[0], n1 = N.n[1], n2 = N.n[2];
         for (int64_t t = 0; t < n0; t++)
         for (int64_t z = 0; z < n1; z++)
         for (int64_t y = 0; y < n2; y++) {
             const int64_t r_row = N.row(t, z, y);
-            Row row = {t, z, y, N.values.data() + r_row, N.errors.data() + r_row, {}, 0, false, 0};
+            Row row = {t,  z, y,     N.values.data() + r_row, N.errors.data() + r_row,
+                       {}, 0, false, false,                   0};
             prepare(plan, row);
             const int64_t q_row =
                 plan.at + t * plan.stride[0] + z * plan.stride[1] + y * plan.stride[2];
@@ -150,7 +151,10 @@ template <bool DECODES> struct Pass : Rows {
                 moved |= activity[x] | slope[x];
             }
             // Where no difference is known nearby, a whole row may be as predicted.
-            if (!any && !code_whole_row(range, plan, row, q, counted, q_row, moved != 0)) continue;
+            if (!any && !code_whole_row(range, plan, row, q, counted, q_row, moved != 0)) {
+                note_largest(row);
+                continue;
+            }
             const int to_level = log16(max(row.weight, 1)), to_left = log16(row.weight + SIDE);
             prepare_contexts(plan, row);
             int32_t *const V = row.values, *const E = row.errors;
@@ -194,6 +198,7 @@ template <bool DECODES> struct Pass : Rows {
                 q[i] = (int32_t)value;
                 E[x] = (int32_t)min<int64_t>(max<int64_t>(error, -MAX_VALUE), MAX_VALUE);
             }
+            note_largest(row);
         }
         this->range = range;
         return 0;
@@ -201,34 +206,34 @@ template <bool DECODES> struct Pass : Rows {
 
     // Join the two lattices, their vertices by turns along the axis, into C.
     FHASH_INLINE void join(int axis) {
-        Grid both;
         int64_t n[4] = {N.n[0], N.n[1], N.n[2], N.n[3]};
         n[axis] += C.n[axis];
-        both.size(n);
-        const int64_t n0 = n[0], n1 = n[1], n2 = n[2];
+        joined.size(n);
+        const int64_t n0 = n[0], n1 = n[1], n2 = n[2], n3 = N.n[3], c3 = C.n[3];
         for (int64_t t = 0; t < n0; t++)
         for (int64_t z = 0; z < n1; z++)
         for (int64_t y = 0; y < n2; y++) {
-            const int64_t to = both.row(t, z, y);
-            if (axis < 3) {
-                int64_t place[3] = {t, z, y};
-                const Grid& G = place[axis] & 1 ? N : C;
-                place[axis] /= 2;
-                const int64_t from = G.row(place[0], place[1], place[2]);
-                std::memcpy(both.values.data() + to, G.values.data() + from, 4 * (size_t)n[3]);
-                std::memcpy(both.errors.data() + to, G.errors.data() + from, 4 * (size_t)n[3]);
-                continue;
-            }
-            for (int odd = 0; odd < 2; odd++) {
-                const Grid& G = odd ? N : C;
-                const int64_t from = G.row(t, z, y);
-                for (int64_t x = 0; x < G.n[3]; x++) {
-                    both.values[(size_t)(to + 2 * x + odd)] = G.values[(size_t)(from + x)];
-                    both.errors[(size_t)(to + 2 * x + odd)] = G.errors[(size_t)(from + x)];
+            const int64_t to = joined.row(t, z, y);
+            int64_t place[3] = {t, z, y};
+            const Grid& G = axis < 3 && place[axis] & 1 ? N : C;
+            if (axis < 3) place[axis] /= 2;
+            const int64_t from = G.row(place[0], place[1], place[2]), new_from = N.row(t, z, y);
+            for (auto of : {&Grid::values, &Grid::errors}) {
+                int32_t* FHASH_RESTRICT const into = (joined.*of).data() + to;
+                const int32_t* FHASH_RESTRICT const a = (G.*of).data() + from;
+                if (axis < 3) {
+                    std::memcpy(into, a, 4 * (size_t)n3);
+                    continue;
                 }
+                const int32_t* FHASH_RESTRICT const b = (N.*of).data() + new_from;
+                for (int64_t x = 0; x < n3; x++) {
+                    into[2 * x] = a[x];
+                    into[2 * x + 1] = b[x];
+                }
+                if (c3 > n3) into[2 * n3] = a[n3];
             }
         }
-        std::swap(C, both);
+        std::swap(C, joined);
     }
 
     // Code all passes over a tile; arguments as for fhash_encode_predicted. 0 or -1.
@@ -243,7 +248,8 @@ template <bool DECODES> struct Pass : Rows {
             const int axis = pass[AXIS];
             const int32_t* const first_tap = taps + (int64_t)pass[FIRST_TAP] * TAP_COLUMNS;
             PassPlan plan = {0, {}, axis, pass[KIND], pass[TAP_COUNT], first_tap,
-                             weights + pass[FIRST_TAP]};
+                             weights + pass[FIRST_TAP], 8192};
+            for (int k = 0; k < plan.count; k++) plan.reach += 4 * std::abs(plan.weights[k]);
             for (int a = 0; a < 4; a++) {
                 n[a] = ((shape[a] - 1) >> shift[a]) + 1;
                 plan.stride[a] = S[a] << shift[a];
@@ -259,7 +265,7 @@ template <bool DECODES> struct Pass : Rows {
             const int64_t code = run(plan, q, counted);
             if (code < 0) return code;
             if (axis < 0) std::swap(C, N);
-            else join(axis);
+            else if (i + 1 < pass_count) join(axis);
         }
         return 0;
     }

@@ -40,6 +40,19 @@ const int ACTIVE = 14;                 // number of taps, the first ones, that m
 const int FRACTION_BITS = 13;          // of a prediction
 const int MAX_ROW_TAPS = 8;            // most taps to the left in the row itself
 
+const int MAX_TAPS = 64;               // most taps of a pass
+const int TOGETHER = 8;                // vertices that are worked on at a time
+const int ROOM = 16;                   // numbers on both sides of a lattice that may be read
+
+typedef std::uint32_t Numbers __attribute__((vector_size(4 * TOGETHER)));
+
+// A tap for the vertices of a row: its values and weight, and where it exists.
+struct RowTap {
+    const int32_t* values;
+    int32_t weight;
+    int64_t first, last;
+};
+
 // Columns of the taps: the lattice (1 for N, 0 for C), then offsets along t, z, y and x.
 enum TapColumn { IN_N, OFFSET_T, OFFSET_Z, OFFSET_Y, OFFSET_X, TAP_COLUMNS };
 // Columns of the passes.
@@ -48,7 +61,7 @@ enum PassColumn { AXIS, KIND, FIRST_TAP, TAP_COUNT, PASS_COLUMNS };
 // A dense lattice: integers, and their differences from the rounded predictions.
 struct Grid {
     int64_t n[4], stride[3];
-    std::vector<int32_t> values, errors;
+    std::vector<int32_t> values, errors;  // with room on both sides, see `sum_narrow`
 
     // Give it these lengths, and zeros.
     void size(const int64_t* lengths) {
@@ -56,11 +69,11 @@ struct Grid {
         stride[2] = n[3];
         stride[1] = stride[2] * n[2];
         stride[0] = stride[1] * n[1];
-        values.assign((size_t)(stride[0] * n[0]), 0);
-        errors.assign((size_t)(stride[0] * n[0]), 0);
+        values.assign((size_t)(stride[0] * n[0] + 2 * ROOM), 0);
+        errors.assign((size_t)(stride[0] * n[0] + 2 * ROOM), 0);
     }
     FHASH_INLINE int64_t row(int64_t t, int64_t z, int64_t y) const {
-        return t * stride[0] + z * stride[1] + y * stride[2];
+        return ROOM + t * stride[0] + z * stride[1] + y * stride[2];
     }
     FHASH_INLINE bool has(int64_t t, int64_t z, int64_t y) const {
         return t >= 0 && z >= 0 && y >= 0 && t < n[0] && z < n[1] && y < n[2];
@@ -91,14 +104,16 @@ struct PassPlan {
     int axis, kind, count;
     const int32_t* taps;
     const int16_t* weights;
+    int64_t reach;  // the largest sum of taps, as a multiple of the largest value
 };
 
 // A row of N.
 struct Row {
     int64_t t, z, y;
     int32_t *values, *errors;           // of its vertices
-    int64_t own[MAX_ROW_TAPS][2];       // taps to the left in the row itself: offset, weight
+    int64_t own[MAX_ROW_TAPS][2];       // taps to the left in the row: offset, twice the weight
     int owned;                          // their number
+    bool narrow;                        // whether 32 bits hold the sums
     bool stepped;                       // whether `step` holds: there is a step before
     int weight;                         // sum of the weights of the known differences
 };
