@@ -135,7 +135,7 @@ def native(name: str, folder: Path, *, flags: tuple[str, ...] = ()) -> Extension
 setup(
     ext_modules=[
         native("fhash_formats.native._core", FORMATS),
-        native("fhash_codec.native._codec", CODEC),
+        native("fhash_codec.native._codec", CODEC, flags=("-pthread",)),
         native("fhash_codec.native.network._network", NETWORK, flags=NETWORK_FLAGS),
     ],
     cmdclass={"build_ext": BuildNative, "bdist_wheel": PlainWheel},

@@ -19,6 +19,7 @@ from fhash_codec.compact.step import EXACT, octave_gain
 from fhash_codec.compact.tiles import Coding, Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.progress import Parts, skip, stage
+from fhash_formats.support.threads import at_most, usable_threads
 from fhash_formats.transform.tile_format import TileSettings
 
 PERCEPTRON = Shape((12, 8), cross=False)
@@ -121,6 +122,8 @@ MAX_OF_TRIAL = 1.5
 """Largest gain of a perceptron as a multiple of that expected of the trial head."""
 LIKELY_OF_TRIAL = (0.85, 1.1)
 """Such multiples that nearly all gains of perceptrons lie between."""
+AT_ONCE = 2
+"""Heads that are trained side by side, at most."""
 WEIGHT_BYTES = 0.7
 """Bytes that each weight of a head adds to the file."""
 HEAD_BYTES = 60
@@ -357,12 +360,13 @@ def _side_by_side(
     train: Callable[[Shape, Callable[[float], None]], TrainedHead | None],
     parts: Parts,
 ) -> list[TrainedHead | None]:
-    """Train heads in threads: a training takes one processor.
+    """Train heads in threads, AT_ONCE at a time.
 
     train: trains a head and tells the share that is done to its second argument.
     parts: progress of the planning.
     """
     shares, stopped = dict.fromkeys(shapes, 0.0), Event()
+    threads = max(1, usable_threads() // min(len(shapes), AT_ONCE))
 
     def run(shape: Shape) -> TrainedHead | None:
         def tell(share: float) -> None:
@@ -370,11 +374,12 @@ def _side_by_side(
                 raise CancelledError  # ends this thread where the other or the user stopped it
             shares[shape] = share
 
-        trained = train(shape, tell)
+        with at_most(threads):
+            trained = train(shape, tell)
         tell(1.0)
         return trained
 
-    with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
+    with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fhash-head") as workers:
         works = [workers.submit(run, shape) for shape in shapes]
         try:
             parts.wait(works, "training", lambda: sum(shares.values()) / len(shares))

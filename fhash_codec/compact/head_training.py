@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.measure.errors import pointer
 from fhash_formats.support.arrays import Double, Single
+from fhash_formats.support.threads import usable_threads
 from fhash_formats.transform.coder import checked
 from fhash_formats.transform.head import (
     CROSS,
@@ -260,6 +261,7 @@ class Network:
         roots: Double,
         *,
         as_in_file: bool,
+        threads: int = 1,
     ) -> None:
         """Do some updates. Update u learns from batch u % batches.
 
@@ -267,6 +269,7 @@ class Network:
         rates, roots: `adam_factors` of these updates.
         as_in_file: whether weights and biases are rounded as in the file. Gradients pass through
             the rounding unchanged.
+        threads: number that work on a batch together; they change no bit.
         """
         factors = np.ascontiguousarray(rates), np.ascontiguousarray(roots)
         _check(
@@ -276,6 +279,7 @@ class Network:
                 first,
                 len(rates),
                 as_in_file,
+                threads,
             )
         )
 
@@ -488,6 +492,7 @@ def _optimise(
                 factors[done:pause],
                 roots[done:pause],
                 as_in_file=done >= unrounded,
+                threads=usable_threads(),
             )
         done = pause
         if done == chosen:

@@ -13,7 +13,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 7
+ABI_VERSION = 8
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -54,7 +54,7 @@ PROTOTYPES: Prototypes = {
         *(*(REAL,) * 4, ARRAY),
     ),
     # train_head.cpp
-    "fhash_head_learn": (*(ARRAY,) * 10, INTEGER, INTEGER, INTEGER),
+    "fhash_head_learn": (*(ARRAY,) * 10, *(INTEGER,) * 4),
     "fhash_head_errors": (*(ARRAY,) * 6, INTEGER, ARRAY),
 }
 """Functions of this package's library that Python calls."""

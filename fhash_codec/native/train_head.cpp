@@ -1,8 +1,12 @@
 // Training of the neighbourhood head: Adam on the squared errors of batches of voxels.
 // compact/head_training.py states the arithmetic.
-#include "train_head.hpp"
+#include <atomic>
+#include <memory>
+#include <system_error>
+#include <thread>
 
 #include "guard.hpp"
+#include "train_head.hpp"
 
 namespace {
 
@@ -148,10 +152,24 @@ public:
         }
     }
 
-    void forget() {
+    // Add up the slopes of some blocks.
+    void learn(const Voxels& voxels, int64_t first, int64_t end, bool as_in_file) {
+        prepare(as_in_file);
         for (Layer& layer : layers) {
             layer.weight_sums.clear();
             layer.bias_sums.clear();
+        }
+        for (int64_t block = first; block < end; ++block) {
+            forward(voxels, block);
+            backward(voxels, block);
+        }
+    }
+
+    // Add the sums that another network of the same parameters has found.
+    void add(const Network& other) {
+        for (int l = 0; l < LAYERS; ++l) {
+            layers[l].weight_sums.add(other.layers[l].weight_sums);
+            layers[l].bias_sums.add(other.layers[l].bias_sums);
         }
     }
 
@@ -209,6 +227,69 @@ private:
     Buffer input, activations[2], slopes[2], error, error_slopes, gradient;
 };
 
+// Threads that add up the slopes of a batch together: sums are exact in any order, so their number
+// changes nothing. Each has its share of the blocks, and a network of its own.
+class Team {
+public:
+    Team(double* parameters, const int64_t* sizes, const Voxels& of, int64_t threads, bool round)
+        : voxels(of), rounds(round) {
+        for (int64_t i = 0; i < std::max<int64_t>(threads, 1); ++i)
+            members.push_back(std::make_unique<Network>(parameters, sizes[3], sizes[4], sizes[5]));
+        helpers.reserve(members.size());
+        try {
+            for (size_t i = 1; i < members.size(); ++i)
+                helpers.emplace_back([this, i] { help(i); });
+        } catch (const std::system_error&) {  // no more threads can be started
+            members.resize(helpers.size() + 1);
+        }
+        share = (voxels.blocks + (int64_t)members.size() - 1) / (int64_t)members.size();
+    }
+    ~Team() {
+        ended = true;
+        ++turn;
+        for (std::thread& helper : helpers) helper.join();
+    }
+    Team(const Team&) = delete;
+    Team& operator=(const Team&) = delete;
+
+    // The sums of all blocks of a batch.
+    Network& learn(int64_t number) {
+        batch = number;
+        busy = (int)helpers.size();
+        ++turn;
+        work(0);
+        while (busy) std::this_thread::yield();
+        for (size_t i = 1; i < members.size(); ++i) members[0]->add(*members[i]);
+        return *members[0];
+    }
+
+private:
+    void work(size_t member) {
+        const int64_t first = std::min<int64_t>((int64_t)member * share, voxels.blocks);
+        const int64_t end = std::min<int64_t>(first + share, voxels.blocks);
+        const int64_t start = batch * voxels.blocks;
+        members[member]->learn(voxels, start + first, start + end, rounds);
+    }
+
+    // A turn takes a tenth of a millisecond: too little to sleep in between.
+    void help(size_t member) {
+        for (int done = 0;; ++done) {
+            while (turn == done) std::this_thread::yield();
+            if (ended) return;
+            work(member);
+            --busy;
+        }
+    }
+
+    const Voxels voxels;
+    const bool rounds;  // weights and biases as in the file
+    std::vector<std::unique_ptr<Network>> members;
+    int64_t share = 0, batch = 0;
+    std::atomic<int> turn{0}, busy{0};
+    std::atomic<bool> ended{false};
+    std::vector<std::thread> helpers;
+};
+
 bool fits(const int64_t* sizes) {
     return sizes[0] > 0 && sizes[1] > 0 && sizes[1] <= MAX_BLOCKS && sizes[2] == BLOCK &&
            sizes[3] > 0 && sizes[3] <= MAX_LOOKED_AT && sizes[4] > 0 && sizes[4] <= MAX_WIDTH &&
@@ -225,23 +306,19 @@ bool fits(const int64_t* sizes) {
 // rates, roots: of each update, the learning rate and the factor of the root of the mean square,
 // both corrected for Adam's start.
 // as_in_file: whether weights and biases are rounded as in the file.
+// threads: that may work on a batch together.
 FHASH_EXPORT int64_t fhash_head_learn(const int16_t* inputs, const int32_t* targets,
                                       const int32_t* lowest, const int32_t* highest,
                                       const int64_t* sizes, double* parameters, double* means,
                                       double* squares, const double* rates, const double* roots,
-                                      int64_t first, int64_t count, int64_t as_in_file) {
+                                      int64_t first, int64_t count, int64_t as_in_file,
+                                      int64_t threads) {
     if (!fits(sizes)) return BAD_ARGUMENT;
     return guarded([&]() -> int64_t {
         const Voxels voxels = {inputs, targets, lowest, highest, sizes[1], sizes[3]};
-        Network network(parameters, sizes[3], sizes[4], sizes[5]);
+        Team team(parameters, sizes, voxels, std::min(threads, sizes[1]), as_in_file != 0);
         for (int64_t update = 0; update < count; ++update) {
-            const int64_t batch = (first + update) % sizes[0] * voxels.blocks;
-            network.prepare(as_in_file != 0);
-            network.forget();
-            for (int64_t block = batch; block < batch + voxels.blocks; ++block) {
-                network.forward(voxels, block);
-                network.backward(voxels, block);
-            }
+            Network& network = team.learn((first + update) % sizes[0]);
             network.step(voxels.blocks * BLOCK, means, squares, rates[update], roots[update]);
         }
         return 0;

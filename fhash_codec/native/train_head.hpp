@@ -72,6 +72,9 @@ public:
     explicit Buffer(int64_t size = 0) : count(size), lines((size + LANES - 1) / LANES) {}
 
     void clear() { std::fill(data(), data() + count, 0.0); }
+    void add(const Buffer& other) {
+        for (int64_t i = 0; i < count; ++i) data()[i] += other[i];
+    }
     double* data() { return lines.empty() ? nullptr : lines[0].numbers; }
     const double* data() const { return lines.empty() ? nullptr : lines[0].numbers; }
     double& operator[](int64_t i) { return data()[i]; }

@@ -204,7 +204,7 @@ def test_chunks_of_any_numbers(values: Any, quality: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("scale", [1e2, 1e4, 1e6])
 def test_predicted_integers_of_any_size(scale: float) -> None:
-    """Where they are small, predictions are summed in 32 bits: here they grow from row to row."""
+    """Predictions are summed in 32 bits where values are small: here they grow from row to row."""
     shape = (3, 4, 5, 29)
     growing = np.linspace(0.0, 3 * scale, shape[1] * shape[2]).reshape(1, *shape[1:3], 1)
     integers = np.random.default_rng(2).normal(0, 1 + growing, shape).astype(np.int32)

@@ -153,12 +153,13 @@ def _loss(data: Batches, parameters: npt.NDArray[np.float64], widths: tuple[int,
     return float(np.mean((np.clip(values[0], low, high) - target) ** 2))
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("as_in_file", [False, True])
-def test_the_bits_of_training_are_fixed(as_in_file: bool) -> None:
+def test_the_bits_of_training_are_fixed(as_in_file: bool, threads: int) -> None:
     """So that the same series gives the same bytes on every machine."""
     data = voxels(2, 3, 9)
     trained = network(9)
-    trained.learn(data, 1, *factors(6), as_in_file=as_in_file)
+    trained.learn(data, 1, *factors(6), as_in_file=as_in_file, threads=threads)
     sums = trained.squared_errors(data, as_in_file=as_in_file)
     digest = hashlib.sha256(trained.parameters.tobytes() + repr(sums).encode()).hexdigest()
     assert digest[:16] == DIGESTS[as_in_file]
