@@ -19,7 +19,7 @@ from fhash_codec.measure.errors import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.series import Series, step_blocks
 from fhash_formats.support.arrays import Mask, Values
-from fhash_formats.support.threads import chunk_region, map_ahead, usable_threads
+from fhash_formats.support.threads import chunk_region, map_ahead, one_ahead, usable_threads
 from fhash_formats.transform import encoding
 from fhash_formats.transform.decoding import decode_tile
 from fhash_formats.transform.encoding import WEIGHT, CodedTile, encode_tile, exact_tile
@@ -264,14 +264,14 @@ class Blocks:
             values.flags.writeable = False  # it is the caller's
             return Tile(values, self._masks(steps))
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.source_dtype)
-        for place, block in step_blocks(steps, self._series.shape[1:]):
-            frames = self._series.block(block)[:, *self._extent.box.slices()]
+        for block, whole in one_ahead(self._series.blocks(steps)):
+            frames = whole[:, *self._extent.box.slices()]
             if frames.dtype.kind == "f" and self.dtype.kind != "f":
                 # Missing values are outside the coreset; any integer may stand there.
                 least = np.fmin.reduce(frames, axis=(1, 2, 3), keepdims=True, initial=np.inf)
                 frames = np.where(np.isfinite(frames), frames, least)
                 frames = cast(np.where(np.isfinite(frames), frames, 0.0), self.source_dtype)
-            values[place] = frames
+            values[block.start - steps.start :][: len(block)] = frames
         values = about_origin(values, self.origin) if self.origin else values
         return Tile(values, self._masks(steps))
 

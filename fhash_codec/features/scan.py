@@ -18,7 +18,7 @@ from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, Series, spans_text, warn_defaults
 from fhash_formats.support.arrays import Values
-from fhash_formats.support.threads import map_ahead, thread_pool
+from fhash_formats.support.threads import map_ahead, one_ahead, thread_pool
 from fhash_formats.support.values import exact_number
 
 HELD_BYTES = 1 << 28
@@ -286,7 +286,8 @@ def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan
         return block, frames, own, own.add(frames)
 
     with thread_pool() as workers:
-        looks = map_ahead(workers, look, series.blocks(range(steps)), BLOCKS_AHEAD)
+        blocks = one_ahead(series.blocks(range(steps)))
+        looks = map_ahead(workers, look, blocks, BLOCKS_AHEAD)
         for block, frames, own, finite in looks:
             figures.join(own)
             if finite < frames.size:
