@@ -360,7 +360,7 @@ def test_a_head_holds_where_it_gains_in_all_tiles() -> None:
     """One that was trained on the tiles saves more than it takes; one for noise does not."""
     series = ArraySeries(moving_sphere())
     config = EncodeConfig(psnr=38.0, effort=2, tile="2x24x32x32", without=("transform",))
-    aim = _Aim(psnr=38.0, data_range=2.0, quick=False)
+    aim = _Aim(psnr=38.0, data_range=2.0)
     with ThreadPoolExecutor(2) as workers:
         selection = select_features(series, config, silent)
         table = code_series(series, selection, config, silent)
