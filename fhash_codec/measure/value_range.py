@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.threads import in_threads
 from fhash_formats.support.values import exact_number, integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
 
@@ -232,6 +233,7 @@ class Ranks:
 
     def add(self, values: npt.NDArray[Any]) -> None:
         """Add the finite values of an array of any shape; all arrays are of one real type."""
+        full: list[npt.NDArray[Any]] = []
         for piece in pieces(values):
             finite = piece[np.isfinite(piece)] if piece.dtype.kind == "f" else piece
             self.count += finite.size
@@ -243,9 +245,12 @@ class Ranks:
                 self._held += taken.size
                 finite = finite[taken.size :]
                 if self._held == self._size:
-                    block, self._block = _sketched(self._block, self._blocks), None
-                    self._count_blocks(0)
-                    self._carry(block)
+                    full.append(self._block)
+                    self._block = None
+        numbered = zip(full, range(self._blocks, self._blocks + len(full)), strict=True)
+        for block in in_threads(lambda pair: _sketched(*pair), numbered):
+            self._count_blocks(0)
+            self._carry(block)
 
     def extend(self, span: RanksSpan) -> None:
         """Add the values of a span, which follow those added so far; nothing depends on the cut.
