@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from math import prod
+from operator import itemgetter
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from fhash_codec.compact.step import (
     QUICK,
     Precision,
     allows_trellis,
-    choose_quantiser,
     find_step,
     octave_gain,
     off_trellis,
@@ -34,6 +34,7 @@ from fhash_codec.compact.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.transform import (
     adapted_transform,
     basis_bytes,
+    cheaper_transform,
     choose_transform,
     chosen_by_prices,
     moved_transform,
@@ -409,7 +410,7 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        attempt = _with_coder(task, attempt) if attempt.quick else _with_quantiser(task, attempt)
+        attempt = _with_coder(task, attempt)
         if attempt.quick and task.goal.error is not None:
             attempt = _bounded_step(task, attempt, attempt.settings)
             settings = _with_new_mask(task, attempt.sample, attempt.settings, attempt.outcome)
@@ -421,84 +422,55 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     return attempt
 
 
-def _with_quantiser(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Return the attempt with coder and quantiser chosen on all tiles."""
-    on = allows_trellis(attempt.settings, task.goal, task.config.effort)
-    fast, tried = _has_fast_coder(task, attempt, on=on), attempt.coding.fast
-    attempt = replace(attempt, coding=replace(attempt.coding, fast=fast))
-    if not on:
-        return attempt
-    settings, coding, outcome = choose_quantiser(
-        attempt.sample, attempt.settings, attempt.coding, task.goal, fast=tried
-    )
-    return replace(attempt, settings=settings, coding=coding, outcome=outcome)
-
-
-def _has_fast_coder(task: PlanTask, attempt: Attempt, *, on: bool) -> bool:
-    """Whether the fast coder is used: where reading would be slow, and few bytes are lost by it.
-
-    on: whether on the trellis.
-    """
-    if not task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size):
-        return False
-    if task.config.effort == 1:
-        return True
-    part = attempt.sample.narrowed(COMPARED_VERTICES)
-    costs = [_trial(task, attempt, part, fast=fast, on=on) for fast in (True, False)]
-    return _is_fast_enough(task, costs, 0.0) is not False
-
-
 def _with_coder(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Return the attempt with coder and quantiser chosen on parts of few tiles.
+    """Return the attempt with coder and quantiser that take the fewest bytes of the sample.
 
-    Where these leave it open, the coders are compared once more on whole tiles.
+    Where seconds count, parts of few tiles tell, and whole tiles only where these leave it open.
     """
     settings, goal = attempt.settings, task.goal
     slow = task.is_slow(attempt.sample.blocks.tile, attempt.outcome.size)
     if task.config.effort == 1:
         return replace(attempt, coding=replace(attempt.coding, fast=slow))
-    part, moved = attempt.sample.narrowed(COMPARED_VERTICES), attempt
-    small = part
-    if not attempt.sharp:
-        _, small = _in_parts(task, attempt, COMPARED_QUICKLY, COMPARED_QUICKLY)
-        moved = replace(attempt, settings=moved_transform(small, settings))
-    quantisers = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
-    best = [
-        min(
-            (_trial(task, moved, small, fast=fast, on=on) * (1.0 if on else PLAIN_COSTS), not on)
-            for on in quantisers
-        )
-        for fast in ((True, False) if slow else (False,))
-    ]
+    part = attempt.sample.narrowed(COMPARED_VERTICES) if attempt.quick else attempt.sample
+    few, moved, open_by = part, attempt, 0.0
+    if attempt.quick and not attempt.sharp:
+        _, few = _in_parts(task, attempt, COMPARED_QUICKLY, COMPARED_QUICKLY)
+        moved, open_by = replace(attempt, settings=moved_transform(few, settings)), UNDECIDED
+    on_or_off = (True, False) if allows_trellis(settings, goal, task.config.effort) else (False,)
+    kinds = [(fast, on) for fast in ((True, False) if slow else (False,)) for on in on_or_off]
+    best: dict[bool, tuple[float, bool]] = {}
+    for (fast, on), cost in zip(kinds, _costs(task, moved, few, kinds), strict=True):
+        known = PLAIN_COSTS * cost if attempt.quick and not on else cost
+        best[fast] = min(best.get(fast, (math.inf, on)), (known, on), key=itemgetter(0))
     fast = slow
     if slow:
-        open_by = 0.0 if attempt.sharp else UNDECIDED
-        found = _is_fast_enough(task, [cost for cost, _ in best], open_by)
+        found = _is_fast_enough(task, [best[True][0], best[False][0]], open_by)
         if found is None:
-            costs = [
-                _trial(task, attempt, part, fast=fast, on=not plain)
-                for fast, (_, plain) in zip((True, False), best, strict=True)
-            ]
-            found = _is_fast_enough(task, costs, 0.0)
+            kinds = [(fast, best[fast][1]) for fast in (True, False)]
+            found = _is_fast_enough(task, _costs(task, attempt, part, kinds), 0.0)
         fast = found is not False
-    plain = best[0 if fast else -1][1]
     if goal.psnr is not None:
         settings = replace(
             settings, step=step_after(settings, attempt.outcome, goal, task.slope.slope)
         )
     coding = replace(attempt.coding, fast=fast)
-    settings, coding = (settings, coding) if plain else on_trellis(settings, coding)
+    settings, coding = on_trellis(settings, coding) if best[fast][1] else (settings, coding)
     return replace(attempt, settings=settings, coding=coding)
 
 
-def _trial(task: PlanTask, attempt: Attempt, part: Sample, *, fast: bool, on: bool) -> float:
-    """Return the bytes of a part by one of the coders, at equal quality.
+def _costs(
+    task: PlanTask, attempt: Attempt, part: Sample, kinds: Sequence[tuple[bool, bool]]
+) -> list[float]:
+    """Return the bytes of a part by some coders and quantisers, at equal quality.
 
-    on: whether on the trellis.
+    kinds: whether by the fast coder, and whether on the trellis.
     """
-    how = attempt.settings, replace(attempt.coding, fast=fast)
-    settings, coding = on_trellis(*how) if on else how
-    return _cost(part.run(settings, task.goal.bounded(coding)), task.goal)
+    trials = []
+    for fast, on in kinds:
+        how = attempt.settings, replace(attempt.coding, fast=fast)
+        settings, coding = on_trellis(*how) if on else how
+        trials.append((settings, task.goal.bounded(coding)))
+    return [_cost(outcome, task.goal) for outcome in part.run_all(trials)]
 
 
 def _is_fast_enough(task: PlanTask, costs: Sequence[float], undecided: float) -> bool | None:
@@ -762,9 +734,12 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
         settings, _ = choose_transform(
             trials, attempt.settings, goal.bounded(coding), coded=_is_coded(task, attempt)
         )
-    tiling = attempt.tiling
-    if attempt.quick and tiling is not None and tiling.found is not None:
+    found = None if attempt.tiling is None else attempt.tiling.found
+    if attempt.quick and found is not None:
         return replace(attempt, settings=settings)  # the step is that of all tiles already
+    if found is not None:
+        # Trials from the usual transform on miss it where bases pay along all axes alone.
+        settings = cheaper_transform(sample, settings, found[0].transform, goal.bounded(coding))
     tries, slope = (2, task.slope) if attempt.quick else (4, None)
     near = replace(NEAR, slope=slope)
     settings, outcome = find_step(sample, settings, coding, goal, tries=tries, precision=near)

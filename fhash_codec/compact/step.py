@@ -59,30 +59,6 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
     return effort >= MIN_EFFORT and not exact and not settings.double
 
 
-def choose_quantiser(
-    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, *, fast: bool
-) -> tuple[TileSettings, Coding, Outcome]:
-    """Return settings and coding with the trellis if that makes a sample smaller, and the outcome.
-
-    Otherwise those with the plain quantiser are returned. Either have a better step: the trial of
-    the plain quantiser tells where the search for the step begins.
-
-    fast: whether the plain quantiser is tried with the fast coder.
-    """
-    plain = sample.run(settings, goal.bounded(replace(coding, fast=fast)))
-    settings = replace(settings, step=step_after(settings, plain, goal))
-    other, other_coding = on_trellis(settings, coding)
-    outcome = sample.run(other, goal.bounded(other_coding))
-    tried = [outcome]
-    if goal.psnr is not None:
-        other = replace(other, step=step_after(other, outcome, goal))
-        outcome = sample.run(other, other_coding)
-        tried.append(outcome)
-    if is_smaller(outcome, plain, tried, goal):
-        return other, other_coding, outcome
-    return settings, coding, plain
-
-
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:
     """Return settings and coding with the trellis, at about the same error."""
     return with_trellis(settings), replace(coding, weight=TRELLIS_WEIGHT)
@@ -104,19 +80,6 @@ def step_after(settings: TileSettings, outcome: Outcome, goal: Goal, slope: floa
         return settings.step
     gain = min(max(psnr - goal.psnr, -SLOPE), SLOPE)
     return step_after_gain(settings.step, gain * SLOPE / slope)
-
-
-def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal: Goal) -> bool:
-    """Whether the trellis takes fewer bytes than the plain quantiser at the same quality.
-
-    outcome: with the trellis.
-    plain: with the plain quantiser, at about the same quality.
-    tried: outcomes with the trellis at several steps, which tell what a difference is worth.
-    """
-    better = plain.psnr(goal.data_range) - outcome.psnr(goal.data_range)
-    if goal.error is not None or not math.isfinite(better) or not plain.size:
-        return outcome.size < plain.size
-    return outcome.size < plain.size * 2 ** (-better / octave_gain(tried, goal.data_range))
 
 
 MAX_STEP_SHARE = 16.0

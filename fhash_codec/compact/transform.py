@@ -297,6 +297,14 @@ def choose_transform(
     return _along(settings, axes), lowest
 
 
+def cheaper_transform(
+    sample: TileSample, settings: TileSettings, other: TransformSpec, coding: Coding
+) -> TileSettings:
+    """Return settings with their transform or another one for tiles of the same shape."""
+    trials = [settings.transform.axes, other.axes]
+    return _along(settings, _cheapest(sample, settings, trials, coding)[1])
+
+
 def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding) -> TileSettings:
     """Return settings with what `choose_transform` is likely to find, by few trials.
 

@@ -211,7 +211,7 @@ class ValueRange:
 SIZE = 1 << 21
 """Values of a block. With 2^34 values the error is below 1/30,000 of them, in 40 MB."""
 STRIDE = 8
-"""Of so many values of a sorted block one is held: sorting is much faster than joining."""
+"""Values of a sorted block of which one is held, since sorting is much faster than joining."""
 
 
 class Ranks:

@@ -49,7 +49,6 @@ from fhash_codec.compact.stages import (
 )
 from fhash_codec.compact.step import (
     find_step,
-    is_smaller,
     off_trellis,
     on_trellis,
     with_step,
@@ -700,17 +699,6 @@ def test_the_way_to_the_trellis_and_back() -> None:
     back, plain = off_trellis(settings, coding)
     assert replace(back, step=0.1) == SETTINGS
     assert plain == Coding()
-
-
-def test_bytes_are_compared_at_the_same_quality() -> None:
-    # One dB is worth a tenth of the bytes, by what was tried.
-    tried = [outcome(1000, 40.0), outcome(1100, 41.0)]
-    assert is_smaller(outcome(1000, 40.0), outcome(1010, 40.0), tried, GOAL_GOAL)
-    assert not is_smaller(outcome(1000, 40.0), outcome(990, 40.0), tried, GOAL_GOAL)
-    assert not is_smaller(outcome(1000, 40.0), outcome(1050, 41.0), tried, GOAL_GOAL)
-    assert is_smaller(outcome(1000, 40.0), outcome(1150, 41.0), tried, GOAL_GOAL)
-    bound = Goal(error=0.1, data_range=1.0)
-    assert is_smaller(outcome(1000, 40.0), outcome(1050, 41.0), tried, bound)
 
 
 SHAPE = (2, 16, 32, 32)
