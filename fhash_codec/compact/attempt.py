@@ -160,8 +160,8 @@ FAST_BYTES = {"fast": 1.6, "balanced": 1.08, "small": 0.0}
 """Bytes that the fast coder may take, as a multiple of those of the other one."""
 LATE = 1.0
 """Share of the bytes that half the work for a region is worth where it takes longer than that."""
-DECODING_NS = {False: (25.0, 110.0), True: (10.0, 10.0)}
-"""Nanoseconds to decode a vertex, and more for each of its bits, by whether the coder is fast.
+DECODING_NS = {"mixing": (25.0, 110.0), "fast": (10.0, 10.0), "labels": (0.0, 220.0)}
+"""Nanoseconds to decode a vertex, and more for each of its bits, by the coder.
 
 These are counts of work rather than times, so that every machine makes the same choice: of one core
 of an EPYC of 2021.
@@ -240,21 +240,25 @@ def region_vertices(shape: Shape, tile: Shape) -> float:
     return mean
 
 
-def decoding_ns(bits: float, *, fast: bool) -> float:
-    """Return the nanoseconds in which a vertex of so many bits is decoded, by count."""
-    first, more = DECODING_NS[fast]
+def decoding_ns(bits: float, coder: str) -> float:
+    """Return the nanoseconds in which a vertex of so many bits is decoded, by count.
+
+    coder: a name of `DECODING_NS`.
+    """
+    first, more = DECODING_NS[coder]
     return TRANSFORM_NS + first + more * bits
 
 
-def burden(access: str, price: float, work: float, bits: float) -> float:
+def burden(access: str, price: float, work: float, bits: float, coder: str) -> float:
     """Return what tiles cost in bytes and in work for a region together, as a logarithm.
 
     access: the wish, a name of `WORTH`.
     price: bytes as a multiple of those of the best tiling.
     work: vertices that are decoded for a region.
     bits: of a vertex.
+    coder: a name of `DECODING_NS`.
     """
-    late = work * decoding_ns(bits, fast=True) * 1e-6 / REGION_MS[access]
+    late = work * decoding_ns(bits, coder) * 1e-6 / REGION_MS[access]
     return math.log(price) + WORTH[access] * math.log2(work) + LATE * math.log2(max(late, 1.0))
 
 
@@ -432,7 +436,7 @@ class PlanTask:
         tile: of the series. size: its bytes.
         """
         access, shape = self.config.access, self.blocks.shape
-        ns = decoding_ns(8 * size / prod(shape), fast=False)
+        ns = decoding_ns(8 * size / prod(shape), "mixing")
         in_region = 1e-6 * ns * region_vertices(shape, tile)
         slow = ns > NS_PER_BYTE[access] * self.blocks.dtype.itemsize
         return slow or in_region > REGION_MS[access]

@@ -302,6 +302,7 @@ class _Prices:
         base: trials on the series, or on its parts with all of space.
         sizes: bytes of the series by tiling that was tried, in the order of the trials.
         parts: shapes of the parts; none where the whole series is tried.
+        coder: that the tiles are likely to have, a name of `DECODING_NS`.
     """
 
     def __init__(
@@ -313,6 +314,8 @@ class _Prices:
         sharp: bool,
     ) -> None:
         self._task, self._coding, self._settings, self._sharp = task, coding, settings, sharp
+        # Beside a plateau the fast coder mostly takes too many bytes.
+        self.coder = "labels" if settings.labels else "mixing" if sharp else "fast"
         self._columns: list[Trials] = []
         self.sizes: dict[Shape, float] = {}
         self.parts: list[Shape] = []
@@ -409,7 +412,7 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
         return region_vertices(shape, tile)
 
     def burden_of(tile: Shape) -> float:
-        return burden(access, prices.price(tile), work(tile), bits)
+        return burden(access, prices.price(tile), work(tile), bits, prices.coder)
 
     def best() -> Shape:
         return min((tile for tile in prices.sizes if prices.price(tile) <= allowed), key=burden_of)
@@ -419,7 +422,7 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     while len(prices.sizes) < TRIALS:
         least, limit = burden_of(best()), FASTER * work(best())
         likely = [
-            (burden(access, prices.foretold(tile), work(tile), bits), tile)
+            (burden(access, prices.foretold(tile), work(tile), bits, prices.coder), tile)
             for tile in prices.candidates
             if tile not in prices.sizes and work(tile) < limit and prices.foretold(tile) <= allowed
         ]

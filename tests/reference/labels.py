@@ -2,7 +2,8 @@
 
 Labels around a vertex that are known are its *candidates*, those that occur more often first. A
 decision asks for each of the first three whether the vertex has it; a label that is none of them
-is spelled bit by bit. Rows have segments with flags, as masks have.
+is spelled bit by bit. Where all labels around are alike, one estimate tells whether the vertex has
+that label, too. Rows have segments with flags, as masks have.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ STARTS = [sum(SIZES[:i]) for i in range(9)]
 LANES = 16
 """Weights of a set."""
 CANDIDATE_SETS = 3 * 16 + 3 * 4
+ALIKE, RUNS = 11, 4
+"""First simple estimate of vertices amid equal labels; classes of how many had the label, too."""
 
 
 def unpack_labelled(
@@ -80,11 +83,12 @@ class LabelDecoder:
         self.bit_size = 256 << min((count - 1).bit_length(), 8)
         runs = [(3 * 16, 3072), (3 * 4, 0), (16, 4096), (4, 0)]
         weights = [weight for sets, weight in runs for _ in range(sets * LANES)]
-        self.adaptive = Adaptive(data, STARTS[8] + 4 * self.bit_size, weights, 11)
+        self.adaptive = Adaptive(data, STARTS[8] + 4 * self.bit_size, weights, ALIKE + 8 * RUNS)
         self.known = np.full([n + 2 * PAD for n in shape], NONE)
         segments = [*shape[:3], -(-shape[3] // SEGMENT)]
         self.states = np.full([n + 2 for n in segments], NOTHING)  # one more at each end
         self.highest = -1
+        self.run_length = 0  # of vertices amid equal labels that had the label, in this segment
 
     def run(self) -> Labels:
         """The labels (t, z, y, x)."""
@@ -97,6 +101,7 @@ class LabelDecoder:
                     row[s * SEGMENT : end] = same
                     state = same
                 else:
+                    self.run_length = 0
                     for x in range(s * SEGMENT, end):
                         row[x] = self.vertex(t, z, y, x)
                         self.highest = max(self.highest, int(row[x]))
@@ -119,23 +124,34 @@ class LabelDecoder:
             int(self.known[t + a + PAD, z + b + PAD, y + c + PAD, x + d + PAD])
             for a, b, c, d in AROUND
         ]
-        candidates: list[int] = []
-        votes: dict[int, int] = {}
-        for i, label in enumerate(around):
-            if label == NONE or (label not in votes and len(candidates) == 4):
-                continue
-            if label not in votes:
-                candidates.append(label)
-            votes[label] = votes.get(label, 0) + (3 if i < 4 else 1)
-            k = candidates.index(label)
-            while k and votes[label] > votes[candidates[k - 1]]:
-                candidates[k - 1 : k + 1] = label, candidates[k - 1]
-                k -= 1
+        if estimate := self.amid_equal(t, z, y, around):
+            if self.adaptive.simple(estimate):
+                self.run_length += 1
+                return around[0]
+            self.run_length = 0
+            return self.spelled(around[:1], around)
+        first = list(dict.fromkeys(label for label in around if label != NONE))[:4]
+        # The nearest four count threefold; of those that occur as often the first is the first.
+        candidates = sorted(first, key=lambda v: -around.count(v) - 2 * around[:4].count(v))
         tested = candidates[:3]
         for k, candidate in enumerate(tested):
             if k == self.count - 1 or self.has(k, candidates, around):
                 return candidate
         return self.spelled(tested, around)
+
+    def amid_equal(self, t: int, z: int, y: int, around: list[int]) -> int:
+        """The simple estimate of a vertex where all labels around are alike; 0 where they differ.
+
+        In a row that exists, a vertex beyond its ends differs from all others.
+        """
+        lengths = self.shape[:3]
+        rows = [(t + a, z + b, y + c) for a, b, c, _ in AROUND]
+        exists = [all(0 <= i < n for i, n in zip(row, lengths, strict=True)) for row in rows]
+        labels = {label for label, there in zip(around, exists, strict=True) if there}
+        before = (y > 0) + 2 * (z > 0) + 4 * (t > 0)
+        if self.count == 1 or not before or len(labels) > 1:
+            return 0
+        return ALIKE + before * RUNS + min(self.run_length, RUNS - 1)
 
     def has(self, k: int, candidates: list[int], around: list[int]) -> int:
         """Whether the vertex has candidate k."""

@@ -10,7 +10,7 @@
 
 // ABI number. Raise it whenever the signature or the meaning of an exported function changes;
 // native/__init__.py holds the same number and the table of prototypes.
-constexpr std::int64_t FHASH_ABI = 16;
+constexpr std::int64_t FHASH_ABI = 17;
 
 #if defined(_MSC_VER)
 #define FHASH_EXPORT extern "C" __declspec(dllexport)

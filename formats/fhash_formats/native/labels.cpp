@@ -9,10 +9,14 @@
 //
 // A label chooses its estimates by a hash. Before its bits, a flag says whether it is the one after
 // the highest so far.
+#include <cstring>
+
 #include "mixing.hpp"
 #include "rows.hpp"
 
 namespace {
+
+FHASH_INLINE int ones(int bits) { return __builtin_popcount((unsigned)bits); }
 
 const int CONTEXTS = 8;          // estimates that are mixed for a decision about a candidate
 const int BIT_CONTEXTS = 4;      // estimates that are mixed for a bit of a label
@@ -21,6 +25,7 @@ const int SET = padded(LANES);   // weights of a set as kept here
 const int TESTED = 3;            // candidates that are tested
 const int FOUND = 4;             // candidates that are looked for
 const int AROUND = 20;           // neighbours
+const int ROOM = 24;             // for them
 const int NEAR = 16;             // patterns of the four nearest neighbours
 const int ALONE = 256;           // stands for a second candidate where there is one only
 const int RATE = 2;              // LEARNING_RATE of labels
@@ -28,6 +33,7 @@ const int SIZES[CONTEXTS] = {3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288};
 const int CANDIDATE_SETS = TESTED * NEAR + TESTED * FOUND;  // sets of weights of candidates
 const int BIT_LEVELS = 16;       // sets of weights of bits
 const int NEXT = 10;             // simple estimate of the label after the highest so far
+const int ALIKE = 11, RUNS = 4;  // first one of vertices amid equal labels; classes of their runs
 const uint32_t SCATTER = 40503;  // multiplier of hashes: 2^16 over the golden ratio
 const int NONE = 65536;          // label of vertices that do not exist
 const int MIXED = NONE + 1;      // state of a segment of more than one label
@@ -42,8 +48,23 @@ State blank_state(int bit_size) {
     state.weights.assign((size_t)((CANDIDATE_SETS + BIT_LEVELS + TESTED + 1) * SET), 0);
     std::fill_n(state.weights.begin(), TESTED * NEAR * SET, (int16_t)3072);
     std::fill_n(state.weights.begin() + CANDIDATE_SETS * SET, BIT_LEVELS * SET, (int16_t)4096);
-    state.simples.assign(NEXT + 1, {32768, 0});
+    state.simples.assign(ALIKE + 8 * RUNS, {32768, 0});
     return state;
+}
+
+// Bits of the neighbours that have a label.
+FHASH_INLINE uint32_t which(const int* around, int label) {
+    typedef uint32_t Lanes __attribute__((vector_size(32)));
+    const Lanes one = {1, 2, 4, 8, 16, 32, 64, 128};
+    Lanes bits = {};
+    for (int i = 0; i < ROOM; i += 8) {
+        Lanes labels;
+        std::memcpy(&labels, around + i, sizeof labels);
+        bits |= (Lanes)(labels == (uint32_t)label) & one << i;
+    }
+    uint32_t all = 0;
+    for (int i = 0; i < 8; i++) all |= bits[i];
+    return all;
 }
 
 // One run over labels.
@@ -66,22 +87,20 @@ template <bool DECODES> struct LabelCoder {
         return (int)(((uint32_t)label * SCATTER + (uint32_t)node) & (uint32_t)(bit_size - 1));
     }
 
-    // Code whether a vertex has candidate k of `found`. around: the labels of the neighbours.
-    FHASH_INLINE int test(int bit, int k, const int* candidates, int found, const int* around) {
+    // Code whether a vertex has candidate k of `found`. have: bits of the neighbours that have it.
+    FHASH_INLINE int test(int bit, int k, const int* candidates, int found, uint32_t have) {
         const int other = found > 1 ? key(candidates[k ? 0 : 1]) : ALONE;
         const int c = key(candidates[k]);
-        int e[AROUND];
-        for (int i = 0; i < AROUND; i++) e[i] = around[i] == candidates[k];
-        const int near = e[0] | e[1] << 1 | e[2] << 2 | e[3] << 3;
-        const int plane = e[0] | e[1] << 1 | e[4] << 2 | e[5] << 3 | e[16] << 4 | e[17] << 5;
-        const int below = e[2] | e[6] << 1 | e[7] << 2 | e[8] << 3 | e[9] << 4;
-        const int before =
-            e[3] | e[10] << 1 | e[11] << 2 | e[12] << 3 | e[13] << 4 | e[14] << 5 | e[15] << 6;
-        const int second = e[16] | e[17] << 1 | e[18] << 2 | e[19] << 3;
-        const int sum_plane = e[0] + e[1] + e[4] + e[5] + e[16] + e[17];
-        const int sum_below = e[2] + e[6] + e[7] + e[8] + e[9];
-        const int sum_before = e[3] + e[10] + e[11] + e[12] + e[13] + e[14] + e[15];
-        const int mixed = e[2] << 6 | e[3] << 7 | e[6] << 8 | e[8] << 9 | e[10] << 10 | e[12] << 11;
+        const auto bits = [have](int first, int count) FHASH_LAMBDA {
+            return (int)(have >> first & ((1u << count) - 1));
+        };
+        const int near = bits(0, 4), second = bits(16, 4);
+        const int plane = bits(0, 2) | bits(4, 2) << 2 | bits(16, 2) << 4;
+        const int below = bits(2, 1) | bits(6, 4) << 1;
+        const int before = bits(3, 1) | bits(10, 6) << 1;
+        const int sum_plane = ones(plane), sum_below = ones(below), sum_before = ones(before);
+        const int mixed = bits(2, 2) << 6 | bits(6, 1) << 8 | bits(8, 1) << 9 | bits(10, 1) << 10 |
+                          bits(12, 1) << 11;
         const int context[CONTEXTS] = {
             ((k * FOUND + found - 1) * NEAR + near) * 16 + second,
             (k * 64 + plane) * 32 + below,
@@ -140,28 +159,42 @@ template <bool DECODES> struct LabelCoder {
     FHASH_INLINE int vertex(int label, const int* around) {
         // The first labels around, those that occur more often first; the nearest count threefold.
         int candidates[FOUND], votes[FOUND], found = 0;
-        for (int i = 0; i < AROUND; i++) {
-            const int v = around[i], weight = i < 4 ? 3 : 1;
-            if (v == NONE) continue;
-            int k = 0;
-            while (k < found && candidates[k] != v) k++;
-            if (k == FOUND) continue;
-            if (k == found) {
-                candidates[found] = v;
-                votes[found++] = 0;
+        uint32_t have[FOUND], rest = ~which(around, NONE) & ((1u << AROUND) - 1);
+        while (rest && found < FOUND) {
+            const int label = around[__builtin_ctz(rest)];
+            const uint32_t bits = which(around, label);
+            const int vote = ones((int)bits) + 2 * ones((int)bits & (NEAR - 1));
+            rest &= ~bits;
+            int k = found++;
+            for (; k > 0 && votes[k - 1] < vote; k--) {
+                candidates[k] = candidates[k - 1];
+                votes[k] = votes[k - 1];
+                have[k] = have[k - 1];
             }
-            votes[k] += weight;
-            for (; k > 0 && votes[k] > votes[k - 1]; k--) {
-                std::swap(votes[k], votes[k - 1]);
-                std::swap(candidates[k], candidates[k - 1]);
-            }
+            candidates[k] = label;
+            votes[k] = vote;
+            have[k] = bits;
         }
         const int tested = min(found, TESTED);
         for (int k = 0; k < tested; k++) {
             if (k == count - 1) return candidates[k];  // no other label is left
-            if (test(label == candidates[k], k, candidates, found, around)) return candidates[k];
+            if (test(label == candidates[k], k, candidates, found, have[k])) return candidates[k];
         }
         return spell(label, candidates, tested, around);
+    }
+
+    // Find out which vertices of a segment lie amid equal labels, as far as rows before this one
+    // tell: 0 for these. like: the nearest of the rows.
+    FHASH_INLINE static void find_alike(const Rows<int32_t>& of, const int32_t* none,
+                                        const int32_t* like, int x0, int x1, int32_t* alike) {
+        std::fill_n(alike, x1 - x0, 0);
+        const auto compare = [&](const int32_t* row, int reach) FHASH_LAMBDA {
+            for (int move = -reach; move <= reach && row != none; move++)
+                for (int x = x0; x < x1; x++) alike[x - x0] |= row[x + move] ^ like[x];
+        };
+        for (const int32_t* row : {of.N, of.P, of.B}) compare(row, 1);
+        for (const int32_t* row : {of.NN, of.PP, of.PN, of.PS, of.BB, of.BN, of.BS, of.BP, of.BF})
+            compare(row, 0);
     }
 
     // Code all labels (t, z, y, x), each below `count`.
@@ -182,7 +215,10 @@ template <bool DECODES> struct LabelCoder {
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
             const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
             uint16_t* const out = labels + t * S0 + z * S1 + y * S2;
-            const auto [K, N, NN, P, PP, PN, PS, B, BB, BN, BS, BP, BF] = known.around(t, z, y);
+            const Rows<int32_t> rows = known.around(t, z, y);
+            const auto [K, N, NN, P, PP, PN, PS, B, BB, BN, BS, BP, BF] = rows;
+            const int32_t* const like = has_y ? N : has_z ? P : B;
+            const int exist = count > 1 ? has_y + 2 * has_z + 4 * has_t : 0;
             // States of the segments of this row and of the rows before it.
             int32_t* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
             const int32_t* const no_state = no_states.data() + 1;
@@ -210,14 +246,24 @@ template <bool DECODES> struct LabelCoder {
                         continue;
                     }
                 }
-                int first = 0, differs = 0;
+                int first = 0, differs = 0, run = 0;
+                int32_t alike[SEGMENT];
+                if (exist) find_alike(rows, known.none(), like, x0, x1, alike);
                 for (int x = x0; x < x1; x++) {
-                    const int neighbours[AROUND] = {
+                    const int neighbours[ROOM] = {
                         K[x - 1], N[x],     P[x],     B[x],  N[x - 1], N[x + 1], P[x + 1],
                         P[x - 1], PS[x],    PN[x],    B[x + 1], B[x - 1], BS[x], BN[x],
                         BF[x],    BP[x],    K[x - 2], NN[x], PP[x],    BB[x],
+                        NONE,     NONE,     NONE,     NONE,
                     };
-                    const int label = vertex(DECODES ? 0 : out[x], neighbours);
+                    int label = DECODES ? 0 : out[x];
+                    if (exist && !(alike[x - x0] | (K[x - 1] ^ like[x]) | (K[x - 2] ^ like[x]))) {
+                        // By far the most vertices, for which one estimate does.
+                        Simple& estimate = state->simples[ALIKE + exist * RUNS + run];
+                        const bool same_again = code_simple(range, estimate, label == like[x]) != 0;
+                        run = same_again ? min(run + 1, RUNS - 1) : 0;
+                        label = same_again ? like[x] : spell(label, like + x, 1, neighbours);
+                    } else label = vertex(label, neighbours);
                     if (DECODES) out[x] = (uint16_t)label;
                     K[x] = label;
                     highest = max(highest, label);

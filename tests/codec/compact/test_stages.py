@@ -688,7 +688,6 @@ SETTINGS = TileSettings(
     high=1.0,
     offsets=OFFSETS,
 )
-GOAL_GOAL = Goal(psnr=40.0, data_range=1.0)
 
 
 def test_the_way_to_the_trellis_and_back() -> None:
