@@ -11,6 +11,8 @@ import zarr
 from zarr.storage import ZipStore
 
 import fhash_codec
+from fhash_formats.container.reader import Container
+from fhash_formats.transform.tile_format import LABELS, PREDICTED, TRANSFORMED, parse_stream
 
 HERE = Path(__file__).parent
 COMPACT = [
@@ -133,6 +135,17 @@ def test_variables_of_a_golden_share_coordinates_of_two_dimensions() -> None:
             assert found["lon"].values.dtype == np.float32
             assert found["lon"].attributes == {"units": "degrees_east"}
             assert volume.metadata.variable_attributes["grid_mapping"] == "crs"
+
+
+def test_goldens_have_tiles_of_every_coder() -> None:
+    found = set()
+    for path in HERE.glob("compact-*.fhz"):
+        with Container.open(path) as container:
+            for array in container.arrays.values():
+                if array.coding == "fhash.transform":
+                    streams = (array.coded(index) for index in np.ndindex(*array.grid))
+                    found |= {(s.kind, s.fast) for s in map(parse_stream, map(bytes, streams))}
+    assert found >= {(TRANSFORMED, False), (TRANSFORMED, True), (PREDICTED, False), (LABELS, False)}
 
 
 def test_a_golden_that_grew_goes_on(tmp_path: Path) -> None:
