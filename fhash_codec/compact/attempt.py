@@ -160,7 +160,7 @@ FAST_BYTES = {"fast": 1.6, "balanced": 1.08, "small": 0.0}
 """Bytes that the fast coder may take, as a multiple of those of the other one."""
 LATE = 1.0
 """Share of the bytes that half the work for a region is worth where it takes longer than that."""
-DECODING_NS = {"mixing": (25.0, 110.0), "fast": (10.0, 10.0), "labels": (0.0, 220.0)}
+DECODING_NS = {"mixing": (25.0, 110.0), "fast": (10.0, 10.0), "labels": (10.0, 65.0)}
 """Nanoseconds to decode a vertex, and more for each of its bits, by the coder.
 
 These are counts of work rather than times, so that every machine makes the same choice: of one core
@@ -249,16 +249,15 @@ def decoding_ns(bits: float, coder: str) -> float:
     return TRANSFORM_NS + first + more * bits
 
 
-def burden(access: str, price: float, work: float, bits: float, coder: str) -> float:
+def burden(access: str, price: float, work: float, ns: float) -> float:
     """Return what tiles cost in bytes and in work for a region together, as a logarithm.
 
     access: the wish, a name of `WORTH`.
     price: bytes as a multiple of those of the best tiling.
     work: vertices that are decoded for a region.
-    bits: of a vertex.
-    coder: a name of `DECODING_NS`.
+    ns: nanoseconds to decode a vertex.
     """
-    late = work * decoding_ns(bits, coder) * 1e-6 / REGION_MS[access]
+    late = work * ns * 1e-6 / REGION_MS[access]
     return math.log(price) + WORTH[access] * math.log2(work) + LATE * math.log2(max(late, 1.0))
 
 

@@ -17,6 +17,7 @@ from fhash_codec.compact.attempt import (
     Tiling,
     burden,
     cheap_tiling,
+    decoding_ns,
     is_small,
     region_vertices,
     tiles_to_try,
@@ -302,7 +303,7 @@ class _Prices:
         base: trials on the series, or on its parts with all of space.
         sizes: bytes of the series by tiling that was tried, in the order of the trials.
         parts: shapes of the parts; none where the whole series is tried.
-        coder: that the tiles are likely to have, a name of `DECODING_NS`.
+        coder: whose work counts: labels have their own, all else may be of the fast one.
     """
 
     def __init__(
@@ -314,8 +315,7 @@ class _Prices:
         sharp: bool,
     ) -> None:
         self._task, self._coding, self._settings, self._sharp = task, coding, settings, sharp
-        # Beside a plateau the fast coder mostly takes too many bytes.
-        self.coder = "labels" if settings.labels else "mixing" if sharp else "fast"
+        self.coder = "labels" if settings.labels else "fast"
         self._columns: list[Trials] = []
         self.sizes: dict[Shape, float] = {}
         self.parts: list[Shape] = []
@@ -407,12 +407,13 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     """Return the tile of the least burden among those tried whose price is allowed."""
     allowed = max(PRICES[access] - MARGIN, 1.0)
     bits = 8 * min(prices.sizes.values()) / prod(shape)
+    ns = decoding_ns(bits, prices.coder)
 
     def work(tile: Shape) -> float:
         return region_vertices(shape, tile)
 
     def burden_of(tile: Shape) -> float:
-        return burden(access, prices.price(tile), work(tile), bits, prices.coder)
+        return burden(access, prices.price(tile), work(tile), ns)
 
     def best() -> Shape:
         return min((tile for tile in prices.sizes if prices.price(tile) <= allowed), key=burden_of)
@@ -422,7 +423,7 @@ def _search(prices: _Prices, access: str, shape: Shape) -> Shape:
     while len(prices.sizes) < TRIALS:
         least, limit = burden_of(best()), FASTER * work(best())
         likely = [
-            (burden(access, prices.foretold(tile), work(tile), bits, prices.coder), tile)
+            (burden(access, prices.foretold(tile), work(tile), ns), tile)
             for tile in prices.candidates
             if tile not in prices.sizes and work(tile) < limit and prices.foretold(tile) <= allowed
         ]

@@ -1,9 +1,9 @@
 """Tiles of few distinct values: a palette, and for each vertex its number in it.
 
-Labels around a vertex that are known are its *candidates*, those that occur more often first. A
-decision asks for each of the first three whether the vertex has it; a label that is none of them
-is spelled bit by bit. Where all labels around are alike, one estimate tells whether the vertex has
-that label, too. Rows have segments with flags, as masks have.
+Where the rows before have one label around a vertex, and the vertex to the left has it, a flag says
+that it goes on. Elsewhere labels around a vertex are its *candidates*, those that occur more often
+first. A decision asks for each of the first three whether the vertex has it; a label that is none
+of them is spelled bit by bit.
 """
 
 from __future__ import annotations
@@ -16,31 +16,34 @@ import numpy as np
 import numpy.typing as npt
 
 from reference.adaptive import Adaptive
-from reference.masks import PAD, SEGMENT, common
 
 Labels = npt.NDArray[Any]
 
-NONE, MIXED, NOTHING = 65536, 65537, 65538
-"""Label of a vertex that does not exist; states of segments, as of masks."""
+PAD = 2
+"""Entries beside a row that stand for vertices that do not exist."""
 AROUND = (
-    *((0, 0, 0, -1), (0, 0, -1, 0), (0, -1, 0, 0), (-1, 0, 0, 0)),
-    *((0, 0, -1, -1), (0, 0, -1, 1)),
+    *((0, 0, -1, 0), (0, -1, 0, 0), (-1, 0, 0, 0), (0, 0, -1, -1), (0, 0, -1, 1)),
     *((0, -1, 0, 1), (0, -1, 0, -1), (0, -1, 1, 0), (0, -1, -1, 0)),
     *((-1, 0, 0, 1), (-1, 0, 0, -1), (-1, 0, 1, 0), (-1, 0, -1, 0), (-1, 1, 0, 0), (-1, -1, 0, 0)),
-    *((0, 0, 0, -2), (0, 0, -2, 0), (0, -2, 0, 0), (-2, 0, 0, 0)),
+    *((0, 0, -2, 0), (0, -2, 0, 0), (-2, 0, 0, 0), (0, 0, 0, -1), (0, 0, 0, -2)),
 )
-"""Offsets to the neighbours of a vertex; the first four are the nearest."""
-PLANE, BELOW, BEFORE = (0, 1, 4, 5, 16, 17), (2, 6, 7, 8, 9), (3, 10, 11, 12, 13, 14, 15)
-"""Numbers of the neighbours in the same layer, in the one below and in the step before."""
-DIAGONAL = (6, 8, 10, 12)
-SIZES = (3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288)
-"""Contexts of each of the eight estimates of a decision about a candidate."""
-STARTS = [sum(SIZES[:i]) for i in range(9)]
+"""Offsets to the neighbours of a vertex."""
+NEAREST = (0, 1, 2, 18)
+"""Numbers of the four nearest neighbours."""
+BESIDE = 15
+"""Number of the first neighbours, by which a run is known."""
+PLANE, BELOW, BEFORE = (0, 3, 4, 15, 18, 19), (1, 5, 6, 7, 8), (9, 10, 11, 12, 13, 14)
+"""Numbers of neighbours in the same layer, in the one below and in the step before."""
+RUN = 16
+"""Vertices of a run, at most."""
+SIZES = (6144, 49152, 12288, 65536, 65536)
+"""Contexts of each of the estimates of a decision about a candidate."""
+STARTS = [sum(SIZES[:i]) for i in range(6)]
 LANES = 16
 """Weights of a set."""
 CANDIDATE_SETS = 3 * 16 + 3 * 4
-ALIKE, RUNS = 11, 4
-"""First simple estimate of vertices amid equal labels; classes of how many had the label, too."""
+ENDS, NEXT = 10, 18
+"""Numbers of simple estimates: of the end of a run, and of the label after the highest so far."""
 
 
 def unpack_labelled(
@@ -76,107 +79,110 @@ def unpack_planes(data: memoryview, dtype: np.dtype[Any]) -> Labels:
 
 
 class LabelDecoder:
-    """The labels known so far."""
+    """The labels known so far.
+
+    A row that does not exist has the labels of the last row before the one that is decoded; the
+    first row of all finds zeros. Beside a row its first and its last label are repeated.
+    """
 
     def __init__(self, data: bytes | memoryview, count: int, shape: tuple[int, ...]) -> None:
         self.count, self.shape = count, shape
         self.bit_size = 256 << min((count - 1).bit_length(), 8)
-        runs = [(3 * 16, 3072), (3 * 4, 0), (16, 4096), (4, 0)]
+        runs = [(3 * 16, 4915), (3 * 4, 0), (16, 4096), (4, 0)]
         weights = [weight for sets, weight in runs for _ in range(sets * LANES)]
-        self.adaptive = Adaptive(data, STARTS[8] + 4 * self.bit_size, weights, ALIKE + 8 * RUNS)
-        self.known = np.full([n + 2 * PAD for n in shape], NONE)
-        segments = [*shape[:3], -(-shape[3] // SEGMENT)]
-        self.states = np.full([n + 2 for n in segments], NOTHING)  # one more at each end
-        self.highest = -1
-        self.run_length = 0  # of vertices amid equal labels that had the label, in this segment
+        self.adaptive = Adaptive(data, STARTS[5] + 4 * self.bit_size, weights, NEXT + 1)
+        self.known = np.zeros((*shape[:3], shape[3] + 2 * PAD), int)
+        self.highest, self.held = 0, 1
 
     def run(self) -> Labels:
         """The labels (t, z, y, x)."""
         for t, z, y in product(*map(range, self.shape[:3])):
-            row = self.known[t + PAD, z + PAD, y + PAD, PAD:]
-            for s in range(self.states.shape[3] - 2):
-                end = min((s + 1) * SEGMENT, self.shape[3])
-                same, flag = self.around_segment(t + 1, z + 1, y + 1, s + 1)
-                if same < NONE and self.adaptive.simple(flag):
-                    row[s * SEGMENT : end] = same
-                    state = same
-                else:
-                    self.run_length = 0
-                    for x in range(s * SEGMENT, end):
-                        row[x] = self.vertex(t, z, y, x)
-                        self.highest = max(self.highest, int(row[x]))
-                    found = set(row[s * SEGMENT : end].tolist())
-                    state = found.pop() if len(found) == 1 else MIXED
-                self.states[t + 1, z + 1, y + 1, s + 1] = state
-        return self.known[(slice(PAD, -PAD),) * 4]
+            row, rows = self.known[t, z, y], self.rows(t, z, y)
+            row[:PAD] = rows[0][PAD]
+            x = 0
+            while x < self.shape[3]:
+                label, length = int(rows[0][x + PAD]), 0
+                while row[x + PAD - 1] == label and length < min(RUN, self.shape[3] - x):
+                    if set(self.around(rows, x + length)[:BESIDE]) != {label}:
+                        break
+                    length += 1
+                end = x + self.same(length)
+                row[x + PAD : end + PAD] = label
+                x = end
+                if length and self.held:
+                    continue
+                around = self.around(rows, x)
+                found = self.spelled([label], around) if length else self.vertex(around)
+                row[x + PAD] = found
+                self.highest = max(self.highest, found)
+                x += 1
+            row[PAD - 1], row[-PAD] = row[PAD], row[-PAD - 1]
+        return self.known[..., PAD:-PAD]
 
-    def around_segment(self, t: int, z: int, y: int, s: int) -> tuple[int, int]:
-        """The state that all segments around one have, and the number of the flag's estimate."""
-        rows = [self.states[t, z, y - 1], self.states[t, z - 1, y], self.states[t - 1, z, y]]
-        near = [int(self.states[t, z, y, s - 1]), *(int(row[s]) for row in rows)]
-        same, existing = common(near, NOTHING, MIXED)
-        differing = any(row[s + 1] not in (NOTHING, same) for row in rows)
-        return same, existing * 2 + differing
+    def rows(self, t: int, z: int, y: int) -> list[Labels]:
+        """The row of each neighbour of a row."""
 
-    def vertex(self, t: int, z: int, y: int, x: int) -> int:
+        def row(a: int, b: int, c: int) -> Labels | None:
+            at = (t + a, z + b, y + c)
+            exists = all(0 <= i < n for i, n in zip(at, self.shape, strict=False))
+            return self.known[at] if exists else None
+
+        nearest = [row(0, 0, -1), row(0, -1, 0), row(-1, 0, 0), np.zeros_like(self.known[0, 0, 0])]
+        last = next(one for one in nearest if one is not None)
+        found = [row(*offset[:3]) for offset in AROUND]
+        return [last if one is None else one for one in found]
+
+    def around(self, rows: list[Labels], x: int) -> list[int]:
+        """The labels around a vertex."""
+        pairs = zip(rows, AROUND, strict=True)
+        return [int(row[x + offset[3] + PAD]) for row, offset in pairs]
+
+    def same(self, length: int) -> int:
+        """The number of vertices of a run that have the label of all around."""
+        if not length:
+            return 0
+        self.held = self.adaptive.simple(2 * (length - 1).bit_length() + self.held)
+        if self.held:
+            return length
+        for k in range(length - 1):
+            if self.adaptive.simple(ENDS + min(length - 1 - k, 7)):
+                return k
+        return length - 1
+
+    def vertex(self, around: list[int]) -> int:
         """Decode the label of a vertex."""
-        around = [
-            int(self.known[t + a + PAD, z + b + PAD, y + c + PAD, x + d + PAD])
-            for a, b, c, d in AROUND
-        ]
-        if estimate := self.amid_equal(t, z, y, around):
-            if self.adaptive.simple(estimate):
-                self.run_length += 1
-                return around[0]
-            self.run_length = 0
-            return self.spelled(around[:1], around)
-        first = list(dict.fromkeys(label for label in around if label != NONE))[:4]
-        # The nearest four count threefold; of those that occur as often the first is the first.
-        candidates = sorted(first, key=lambda v: -around.count(v) - 2 * around[:4].count(v))
+        others = [label for label in around[:BESIDE] if label != around[0]]
+        found = list(dict.fromkeys([around[0], *others[:1], around[18], *around]))[:4]
+        votes = {label: around.count(label) for label in found}
+        for number in NEAREST:
+            if around[number] in votes:
+                votes[around[number]] += 2
+        candidates = sorted(found, key=lambda label: -votes[label])
         tested = candidates[:3]
         for k, candidate in enumerate(tested):
             if k == self.count - 1 or self.has(k, candidates, around):
                 return candidate
         return self.spelled(tested, around)
 
-    def amid_equal(self, t: int, z: int, y: int, around: list[int]) -> int:
-        """The simple estimate of a vertex where all labels around are alike; 0 where they differ.
-
-        In a row that exists, a vertex beyond its ends differs from all others.
-        """
-        lengths = self.shape[:3]
-        rows = [(t + a, z + b, y + c) for a, b, c, _ in AROUND]
-        exists = [all(0 <= i < n for i, n in zip(row, lengths, strict=True)) for row in rows]
-        labels = {label for label, there in zip(around, exists, strict=True) if there}
-        before = (y > 0) + 2 * (z > 0) + 4 * (t > 0)
-        if self.count == 1 or not before or len(labels) > 1:
-            return 0
-        return ALIKE + before * RUNS + min(self.run_length, RUNS - 1)
-
     def has(self, k: int, candidates: list[int], around: list[int]) -> int:
         """Whether the vertex has candidate k."""
-        equal = [int(label == candidates[k]) for label in around]
 
-        def pattern(numbers: tuple[int, ...]) -> int:
-            return sum(equal[number] << i for i, number in enumerate(numbers))
+        def pattern(numbers: tuple[int, ...], label: int = candidates[k]) -> int:
+            return sum((around[number] == label) << i for i, number in enumerate(numbers))
 
-        c, found = self.key(candidates[k]), len(candidates)
-        other = self.key(candidates[0 if k else 1]) if found > 1 else 256
-        near, second = pattern((0, 1, 2, 3)), pattern((16, 17, 18, 19))
+        found, near = len(candidates), pattern(NEAREST)
         plane, below, before = pattern(PLANE), pattern(BELOW), pattern(BEFORE)
-        in_plane, in_below, in_before = (
-            sum(equal[number] for number in group) for group in (PLANE, BELOW, BEFORE)
-        )
-        mixed = (equal[2] << 6) | (equal[3] << 7) | pattern(DIAGONAL) << 8
+        rival, of_rival = 256, 0
+        if found > 1:
+            other = candidates[0 if k else 1]
+            rival, of_rival = self.key(other), pattern(NEAREST, other)
+        both = (self.key(candidates[k]) * 259 + rival) * 16 + near
         contexts = (
-            ((k * 4 + found - 1) * 16 + near) * 16 + second,
             (k * 64 + plane) * 32 + below,
-            (k * 128 + before) * 16 + near,
-            ((256 if k else 0) + c) * 16 + near,
-            (c * 259 + other & 4095) * 16 + near,
-            ((k * 7 + in_plane) * 6 + in_below) * 8 + in_before,
-            k << 12 | mixed | plane,
-            k << 12 | before << 5 | below,
+            ((k * 16 + near) * 16 + of_rival) * 64 + before,
+            ((k * 64 + before) * 2 + pattern((2,))) * 32 + below,
+            both & 65535,
+            (both + pattern((3, 4, 5, 6, 7, 8)) * 40503) & 65535,
         )
         slots = [start + context for start, context in zip(STARTS, contexts, strict=False)]
         sets = ((k * 16 + near) * LANES, (3 * 16 + k * 4 + found - 1) * LANES)
@@ -189,7 +195,7 @@ class LabelDecoder:
     def spelled(self, tested: list[int], around: list[int]) -> int:
         """A label that is none of the tested ones, from its highest bit on."""
         following = self.highest + 1
-        if following < self.count and self.adaptive.simple(10):
+        if following < self.count and self.adaptive.simple(NEXT):
             return following
         low, node = 0, 1
         for level in range((self.count - 1).bit_length() - 1, -1, -1):
@@ -200,9 +206,9 @@ class LabelDecoder:
                 bit = int(not lower)
             else:
                 contexts = [node]
-                for label in (tested[0] if tested else 0, around[3], around[2]):
+                for label in (tested[0], around[2], around[1]):
                     contexts.append((label * 40503 + node) & self.bit_size - 1)
-                slots = [STARTS[8] + i * self.bit_size + c for i, c in enumerate(contexts)]
+                slots = [STARTS[5] + i * self.bit_size + c for i, c in enumerate(contexts)]
                 sets = (CANDIDATE_SETS + level, CANDIDATE_SETS + 16 + len(tested))
                 bit = self.adaptive.mixed(slots, [number * LANES for number in sets], rate=2)
             low = middle if bit else low

@@ -20,6 +20,7 @@ const int SET = padded(LANES);   // weights of a set as kept here
 const int LEVELS = 32, EVEN = 16;  // levels of a vertex; from EVEN on it is more likely occupied
 const int NEAR = 16;               // patterns of the four nearest bits; each has a set of weights
 const int RATE = 2;                // LEARNING_RATE of masks
+const int SEGMENT = 16;            // vertices of a row that share a flag
 const int SIZES[CONTEXTS] = {512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048};
 
 // States of a segment: its bits are all 0, all 1, or both; or it does not exist.
@@ -30,6 +31,19 @@ const int QUIET = 12;
 // The bit of a vertex, and above it 1 for a 0 that the level spoke against, 2 for such a 1, else 0.
 FHASH_INLINE uint8_t mark(int bit, int level) {
     return (uint8_t)(bit ? (level < EVEN ? 5 : 1) : level < EVEN ? 0 : 2);
+}
+
+// The state that segments around have, as far as they exist: `nothing` where none exists, `mixed`
+// where they differ. existing: receives their number.
+FHASH_INLINE int common_state(const int* states, int count, int nothing, int mixed, int& existing) {
+    int same = nothing;
+    existing = 0;
+    for (int k = 0; k < count; k++) {
+        if (states[k] == nothing) continue;
+        existing++;
+        same = same == nothing || same == states[k] ? states[k] : mixed;
+    }
+    return same;
 }
 
 // One run over a mask.

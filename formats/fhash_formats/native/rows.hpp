@@ -8,8 +8,7 @@
 
 namespace {
 
-const int SEGMENT = 16;  // vertices of a row that share a flag
-const int PADDING = 2;   // entries beside a row that stand for vertices that do not exist
+const int PADDING = 2;  // entries beside a row that stand for vertices that do not exist
 
 // A row (K) and the rows before it: N along y, P along z, B along t, doubled for two before. A
 // second letter moves on: N and S by -1 and +1 along y, P and F by -1 and +1 along z.
@@ -30,42 +29,27 @@ template <class T> struct PaddedRows {
           z_stride(y_stride * n2), t_stride(z_stride * n1),
           entries((size_t)(t_stride * shape[0]), blank), nothing((size_t)y_stride, blank) {}
 
-    // The row that stands for rows that do not exist.
-    const T* none() const { return nothing.data() + PADDING; }
-
     FHASH_INLINE Rows<T> around(int t, int z, int y) {
         const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
         const bool more_y = y + 1 < n2, more_z = z + 1 < n1;
         T* const K = entries.data() + t * t_stride + z * z_stride + y * y_stride + PADDING;
+        const T* const none = nothing.data() + PADDING;
         return {
             K,
-            has_y ? K - y_stride : none(),
-            y > 1 ? K - 2 * y_stride : none(),
-            has_z ? K - z_stride : none(),
-            z > 1 ? K - 2 * z_stride : none(),
-            has_z && has_y ? K - z_stride - y_stride : none(),
-            has_z && more_y ? K - z_stride + y_stride : none(),
-            has_t ? K - t_stride : none(),
-            t > 1 ? K - 2 * t_stride : none(),
-            has_t && has_y ? K - t_stride - y_stride : none(),
-            has_t && more_y ? K - t_stride + y_stride : none(),
-            has_t && has_z ? K - t_stride - z_stride : none(),
-            has_t && more_z ? K - t_stride + z_stride : none(),
+            has_y ? K - y_stride : none,
+            y > 1 ? K - 2 * y_stride : none,
+            has_z ? K - z_stride : none,
+            z > 1 ? K - 2 * z_stride : none,
+            has_z && has_y ? K - z_stride - y_stride : none,
+            has_z && more_y ? K - z_stride + y_stride : none,
+            has_t ? K - t_stride : none,
+            t > 1 ? K - 2 * t_stride : none,
+            has_t && has_y ? K - t_stride - y_stride : none,
+            has_t && more_y ? K - t_stride + y_stride : none,
+            has_t && has_z ? K - t_stride - z_stride : none,
+            has_t && more_z ? K - t_stride + z_stride : none,
         };
     }
 };
-
-// The state that segments around have, as far as they exist: `nothing` where none exists, `mixed`
-// where they differ. existing: receives their number.
-FHASH_INLINE int common_state(const int* states, int count, int nothing, int mixed, int& existing) {
-    int same = nothing;
-    existing = 0;
-    for (int k = 0; k < count; k++) {
-        if (states[k] == nothing) continue;
-        existing++;
-        same = same == nothing || same == states[k] ? states[k] : mixed;
-    }
-    return same;
-}
 
 }  // namespace
