@@ -152,16 +152,12 @@ public:
         }
     }
 
-    // Add up the slopes of some blocks.
-    void learn(const Voxels& voxels, int64_t first, int64_t end, bool as_in_file) {
+    // Begin to add up slopes.
+    void begin(bool as_in_file) {
         prepare(as_in_file);
         for (Layer& layer : layers) {
             layer.weight_sums.clear();
             layer.bias_sums.clear();
-        }
-        for (int64_t block = first; block < end; ++block) {
-            forward(voxels, block);
-            backward(voxels, block);
         }
     }
 
@@ -228,25 +224,24 @@ private:
 };
 
 // Threads that add up the slopes of a batch together: sums are exact in any order, so their number
-// changes nothing. Each has its share of the blocks, and a network of its own.
+// changes nothing. Each takes the next block, so that none waits for one that has no processor.
 class Team {
 public:
     Team(double* parameters, const int64_t* sizes, const Voxels& of, int64_t threads, bool round)
-        : voxels(of), rounds(round) {
-        for (int64_t i = 0; i < std::max<int64_t>(threads, 1); ++i)
-            members.push_back(std::make_unique<Network>(parameters, sizes[3], sizes[4], sizes[5]));
+        : voxels(of), rounds(round), next(voxels.blocks) {
+        for (int64_t i = 0; i < std::max<int64_t>(threads, 1); ++i) {
+            auto network = std::make_unique<Network>(parameters, sizes[3], sizes[4], sizes[5]);
+            members.push_back({std::move(network)});
+        }
         helpers.reserve(members.size());
         try {
             for (size_t i = 1; i < members.size(); ++i)
-                helpers.emplace_back([this, i] { help(i); });
+                helpers.emplace_back([this, i] { help(members[i]); });
         } catch (const std::system_error&) {  // no more threads can be started
-            members.resize(helpers.size() + 1);
         }
-        share = (voxels.blocks + (int64_t)members.size() - 1) / (int64_t)members.size();
     }
     ~Team() {
         ended = true;
-        ++turn;
         for (std::thread& helper : helpers) helper.join();
     }
     Team(const Team&) = delete;
@@ -255,37 +250,51 @@ public:
     // The sums of all blocks of a batch.
     Network& learn(int64_t number) {
         batch = number;
-        busy = (int)helpers.size();
-        ++turn;
-        work(0);
-        while (busy) std::this_thread::yield();
-        for (size_t i = 1; i < members.size(); ++i) members[0]->add(*members[i]);
-        return *members[0];
+        done = 0;
+        next = ++turn << TURN_BITS;
+        while (work(members[0])) {}
+        while (done < voxels.blocks) std::this_thread::yield();
+        Network& sums = *members[0].network;
+        if (members[0].turn != turn) sums.begin(rounds);
+        for (size_t i = 1; i < members.size(); ++i)
+            if (members[i].turn == turn) sums.add(*members[i].network);
+        return sums;
     }
 
 private:
-    void work(size_t member) {
-        const int64_t first = std::min<int64_t>((int64_t)member * share, voxels.blocks);
-        const int64_t end = std::min<int64_t>(first + share, voxels.blocks);
-        const int64_t start = batch * voxels.blocks;
-        members[member]->learn(voxels, start + first, start + end, rounds);
+    static const int TURN_BITS = 16;  // of the number of a block
+    struct Member {
+        std::unique_ptr<Network> network;
+        int64_t turn = 0;  // the last one in which it took a block
+    };
+
+    // Take a block of the turn, and add its slopes; false where none is left.
+    bool work(Member& member) {
+        int64_t place = next;
+        do {
+            if ((place & ((1 << TURN_BITS) - 1)) >= voxels.blocks) return false;
+        } while (!next.compare_exchange_weak(place, place + 1));
+        // Nothing of the turn changes until this block is done.
+        if (member.turn != place >> TURN_BITS) member.network->begin(rounds);
+        member.turn = place >> TURN_BITS;
+        const int64_t block = batch * voxels.blocks + (place & ((1 << TURN_BITS) - 1));
+        member.network->forward(voxels, block);
+        member.network->backward(voxels, block);
+        ++done;
+        return true;
     }
 
     // A turn takes a tenth of a millisecond: too little to sleep in between.
-    void help(size_t member) {
-        for (int done = 0;; ++done) {
-            while (turn == done) std::this_thread::yield();
-            if (ended) return;
-            work(member);
-            --busy;
-        }
+    void help(Member& member) {
+        while (!ended)
+            if (!work(member)) std::this_thread::yield();
     }
 
     const Voxels voxels;
     const bool rounds;  // weights and biases as in the file
-    std::vector<std::unique_ptr<Network>> members;
-    int64_t share = 0, batch = 0;
-    std::atomic<int> turn{0}, busy{0};
+    std::vector<Member> members;
+    int64_t turn = 0, batch = 0;
+    std::atomic<int64_t> next, done{0};  // next: the turn, and the block that is taken next
     std::atomic<bool> ended{false};
     std::vector<std::thread> helpers;
 };
