@@ -66,6 +66,13 @@ class EncodeConfig(Record):
         "or a list such as 0,4,9",
         profile="paper",
     )
+    samples: str = limits(
+        "all",
+        "paper: train on 'all' steps from the first key frame to the last, each at its place in "
+        "time, or on the 'keys' alone, as published",
+        choices=("all", "keys"),
+        profile="paper",
+    )
     fringe: str = limits(
         "trained",
         "paper: a vertex in the coreset of one of two neighbouring key frames only is 'trained' at "

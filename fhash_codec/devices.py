@@ -1,8 +1,10 @@
-"""Devices and threads with which torch computes. Import this module before torch."""
+"""Devices, and threads of a training. Import this module before torch, which few things need."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +12,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+from fhash_formats.support.threads import at_most, usable_threads
 
 if TYPE_CHECKING:
     import torch
@@ -27,42 +30,45 @@ _PROCESS = os.getpid()
 
 
 def leave_threads_of_parent() -> None:
-    """Let torch compute in one thread in a process forked since the import of this module.
+    """Let torch, where it is loaded, compute in one thread in a process forked since this import.
 
     OpenMP believes there that it still has the threads of the parent, and waits for them for ever.
     """
-    if os.getpid() != _PROCESS:
-        import torch
-
+    torch = sys.modules.get("torch")
+    if os.getpid() != _PROCESS and torch is not None:
         torch.set_num_threads(1)
 
 
 @contextmanager
-def torch_threads(threads: int) -> Iterator[None]:
-    """Let torch compute in a number of threads while the context lasts."""
-    import torch
+def computing_threads(threads: int) -> Iterator[None]:
+    """Compute in at most a number of threads while the context lasts.
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    torch does, too, where it is loaded.
+    """
+    torch = sys.modules.get("torch")
+    with at_most(threads):
+        if torch is None:
+            yield
+            return
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
 
 
 @contextmanager
 def threads_for(vertices: int) -> Iterator[int]:
-    """Limit torch's threads, while the context lasts, to those that pay for a training.
+    """Limit the threads, while the context lasts, to those that pay for a training.
 
-    The number never exceeds the number before. The context yields it.
+    They are at most those that may be used. The context yields their number.
 
     Args:
         vertices: vertices of a training step.
     """
-    import torch
-
-    threads = max(1, min(torch.get_num_threads(), vertices // VERTICES_A_THREAD))
-    with torch_threads(threads):
+    threads = max(1, min(usable_threads(), vertices // VERTICES_A_THREAD))
+    with computing_threads(threads):
         yield threads
 
 
@@ -75,6 +81,21 @@ CUDA_PAYS = 4.0
 
 A guess until `make device` has measured the start.
 """
+
+
+DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+"""File name of the driver of CUDA."""
+
+
+def may_have_cuda() -> bool:
+    """Return whether there are torch and CUDA's driver, without importing torch, which is slow."""
+    if not has_torch():
+        return False
+    try:
+        ctypes.CDLL(DRIVER)
+    except OSError:
+        return False
+    return True
 
 
 def has_torch() -> bool:
@@ -90,7 +111,7 @@ def need_torch(what: str) -> None:
         absent = isinstance(error, ModuleNotFoundError) and error.name == "torch"
         reason = "" if absent else f" (the torch that is installed fails: {error})"
         raise MissingDependencyError(
-            f"{what} needs torch: pip install 'fhash[train]'{reason}"
+            f"{what} needs torch: pip install 'fhash[cuda]'{reason}"
         ) from error
 
 
@@ -115,8 +136,10 @@ def first_line(error: Exception) -> str:
     return str(error).strip().split("\n")[0]
 
 
-def training_device(name: str, cpu_seconds: float, needed_bytes: int) -> tuple[torch.device, str]:
-    """Return the torch device for a training, and why; auto is CUDA where that pays and fits.
+def training_device(name: str, cpu_seconds: float, needed_bytes: int) -> tuple[str, str]:
+    """Return the device for a training, 'cpu' or 'cuda', and why.
+
+    auto is CUDA where that pays and fits. torch is imported only where CUDA may be the answer.
 
     Args:
         name: cpu, cuda or auto.
@@ -125,35 +148,40 @@ def training_device(name: str, cpu_seconds: float, needed_bytes: int) -> tuple[t
 
     Raises:
         InputError: cuda has no device, or one with too little free memory.
-        MissingDependencyError: torch is not installed.
+        MissingDependencyError: cuda is asked for, and torch is not installed.
     """
+    pays = f"the CPU takes about {cpu_seconds:.1f} s, and CUDA pays from {CUDA_PAYS:g} s on"
+    if name == "cpu":
+        return "cpu", "on the CPU, as --device says"
+    if name == "auto":
+        if not may_have_cuda():
+            return "cpu", "on the CPU, as there is no CUDA device, or no torch"
+        if cpu_seconds < CUDA_PAYS:
+            return "cpu", f"on the CPU, as {pays}"
+        if choose_device(name).type == "cpu":
+            return "cpu", "on the CPU, as torch finds no CUDA device"
     device = choose_device(name)
     import torch
 
-    if name != "auto":
-        why = "as --device says"
-    elif device.type == "cpu":
-        why = "as torch finds no CUDA device"
-    else:
-        why = f"as the CPU takes about {cpu_seconds:.1f} s, and CUDA pays from {CUDA_PAYS:g} s on"
-    if device.type == "cpu" or (name == "auto" and cpu_seconds < CUDA_PAYS):
-        return torch.device("cpu"), f"on the CPU, {why}"
     free, _ = torch.cuda.mem_get_info(device)
     if needed_bytes <= free:
-        return device, f"on CUDA, {why}"
+        return "cuda", f"on CUDA, as {pays if name == 'auto' else '--device says'}"
     lack = (
         f"training needs about {needed_bytes / 2**30:.1f} GiB on the CUDA device,"
         f" of which {free / 2**30:.1f} GiB are free"
     )
     if name == "auto":
         warnings.warn(f"{lack}; it takes the CPU", FhashWarning, stacklevel=2)
-        return torch.device("cpu"), f"on the CPU, as {lack}"
+        return "cpu", f"on the CPU, as {lack}"
     raise InputError(f"{lack}; use --device cpu, or a feature or key frames that select less")
 
 
 @contextmanager
-def enough_memory(device: torch.device) -> Iterator[None]:
+def enough_memory(device: str) -> Iterator[None]:
     """Raise InputError where the memory of a CUDA device runs out while the context lasts."""
+    if device == "cpu":
+        yield
+        return
     import torch
 
     try:
@@ -166,17 +194,17 @@ def enough_memory(device: torch.device) -> Iterator[None]:
 
 
 @contextmanager
-def same_bits(device: torch.device, wanted: bool) -> Iterator[None]:
+def same_bits(device: str, wanted: bool) -> Iterator[None]:
     """Let torch compute the same bits in every run on a CUDA device while the context lasts.
 
     Sums are then sorted instead of added by atomic operations in any order. An operation that has
     no such way is a RuntimeError. On a CPU nothing changes.
     """
-    import torch
-
-    if device.type == "cpu" or not wanted:
+    if device == "cpu" or not wanted:
         yield
         return
+    import torch
+
     before = torch.are_deterministic_algorithms_enabled()
     only_warns = torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fhash_codec.devices import torch_threads
+from fhash_codec.devices import computing_threads
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.native import network as native
 from fhash_codec.paper.engines import Engine, make_engine
@@ -138,7 +138,7 @@ class Peaks:
 
     def measure(self) -> None:
         """Measure every rate once more, in one thread; the best counts."""
-        with torch_threads(1):
+        with computing_threads(1):
             for number, path in enumerate(self._paths):
                 self._raise(number, "gflops", self._fma(path))
             if self.device.type == "cuda":
@@ -246,10 +246,8 @@ class Variant:
     ) -> Engine:
         """Return a new engine; arguments as in `make_engine`."""
         if self.path is not None:
-            return NativeEngine(
-                architecture, coreset, rates, seed=seed, device=device, path=self.path
-            )
-        return make_engine(self.engine, architecture, coreset, rates, seed=seed, device=device)
+            return NativeEngine(architecture, coreset, rates, seed=seed, path=self.path)
+        return make_engine(self.engine, architecture, coreset, rates, seed=seed, device=device.type)
 
 
 @dataclass
@@ -318,7 +316,7 @@ class EngineRun:
         """
         first = engine(np.full(WARM_UP_STEPS + 1, rate))
         taken = []
-        with torch_threads(self.variant.threads):
+        with computing_threads(self.variant.threads):
             for chosen in self.plan.order(0)[:WARM_UP_STEPS]:
                 begun = now()
                 first.train(chosen)
@@ -329,7 +327,7 @@ class EngineRun:
     def train(self, seconds: float) -> None:
         """Go on with the training for some seconds, and measure the quality then."""
         samples, begun, spent = 0, now(), Spent()
-        with torch_threads(self.variant.threads):
+        with computing_threads(self.variant.threads):
             while spent.on(self.device.type) < seconds and self.engine.step < self._last:
                 epoch, batch = divmod(self.engine.step, self.plan.batches)
                 if batch == 0 or samples == 0:
@@ -353,7 +351,7 @@ class EngineRun:
         self.engine.settle()
         batches = self.plan.order(0)
         samples, number, begun, spent = 0, 0, now(), Spent()
-        with torch_threads(self.variant.threads):
+        with computing_threads(self.variant.threads):
             while spent.on(self.device.type) < seconds or number == 0:
                 chosen = batches[number % len(batches)]
                 self.engine.infer(chosen)

@@ -287,7 +287,6 @@ def _measured(
         results = [run.result(architecture, peaks) for run in runs]
     _compare(results)
     _, layers = runs[0].engine.parameters().dense(architecture)
-    numpy_layers = [(weight.numpy(), bias.numpy()) for weight, bias in layers]
     return {
         "series": f"{series.source} {series.name}",
         "features": [str(feature) for feature in selected.features],
@@ -299,8 +298,8 @@ def _measured(
         "parameters": architecture.parameters,
         "float16_bytes": 2 * architecture.parameters,
         "engines": results,
-        "points": bench_points(architecture, numpy_layers, threads),
-        **bench_decode(architecture, coreset, numpy_layers),
+        "points": bench_points(architecture, layers, threads),
+        **bench_decode(architecture, coreset, layers),
     }
 
 
@@ -314,7 +313,7 @@ def _variants(
     unknown = sorted(set(engines) - set(ENGINES))
     if unknown:
         raise InputError(f"unknown engine '{unknown[0]}'; known: {', '.join(ENGINES)}")
-    reason = refusal(architecture, device)
+    reason = refusal(architecture) if device.type == "cpu" else f"the device is '{device}'"
     if reason is not None and "native" in engines:
         raise InputError(f"the engine 'native' does not take this model: {reason}")
     variants = []

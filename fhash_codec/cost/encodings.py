@@ -14,14 +14,12 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.plan import EPOCHS, Allowance, Wish, paper_config
 from fhash_codec.cost.prediction import Prediction
 from fhash_codec.cost.results import Curve, Encoded
-from fhash_codec.devices import need_torch
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
 from fhash_formats.errors import (
     FhashError,
     FhashWarning,
     InterruptedEncodingError,
-    MissingDependencyError,
     QualityError,
 )
 from fhash_formats.series import Series
@@ -125,11 +123,6 @@ class OwnEncodings:
 
     def _measure_paper(self, wish: Wish) -> None:
         """Train one epoch, then as many as fit; the course of the longer training is a curve."""
-        try:
-            need_torch("profile paper")
-        except MissingDependencyError as error:
-            self._allowance.leave_out(wish.name, str(error))
-            return
         if any(point.codec == "paper" and point.measured for point in self.points):
             return
         first = self._measure(replace(wish, config=paper_config(1)))

@@ -406,8 +406,7 @@ class Predictor:
     def predict(self, config: EncodeConfig) -> Prediction:
         """Predict the encoding with some settings; at least a part of the series is read.
 
-        Raises InputError for settings that do not fit the series, and MissingDependencyError for
-        the profile paper without torch.
+        Raises InputError for settings that do not fit the series.
         """
         with warnings.catch_warnings():
             # The encoding itself will say them.

@@ -46,6 +46,7 @@ from fhash_codec.features.bricks import BRICK_BITS
 from fhash_codec.features.selection import select_features
 from fhash_codec.measure.errors import find_bulk
 from fhash_codec.measure.metrics import BUDGET, Comparer, measure_quality, ssim_steps
+from fhash_codec.paper.train import HISTORY_POINTS, usual_batches, usual_epochs
 from fhash_codec.progress import recording, silent
 from fhash_formats.errors import FhashWarning, QualityError
 from fhash_formats.series import ArraySeries, Series
@@ -457,9 +458,6 @@ class PaperProbe:
 
     def stage_seconds(self, config: EncodeConfig) -> dict[str, float]:
         """Return the predicted seconds of each stage, for settings that differ in epochs alone."""
-        # torch takes seconds to import, and only a training needs it.
-        from fhash_codec.paper.train import HISTORY_POINTS, usual_batches, usual_epochs
-
         batches = usual_batches(self.samples, self.bricks, config.batch)
         epochs = config.epochs or usual_epochs(batches)
         points = len(range(0, epochs, -(-epochs // HISTORY_POINTS)))
@@ -474,8 +472,6 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     """Encode a part of a series for two epochs, with batches of the size for the whole.
 
     share: share of the series that the part is.
-
-    Raises MissingDependencyError without torch.
     """
     report = _encoded(part, replace(config, epochs=EPOCHS, psnr=None, psnr_bulk=None, timings=True))
     stages = {entry["stage"]: entry["seconds"] for entry in report["stages"]}
@@ -486,8 +482,6 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
     domain = prod(part.shape[1:]) * len(report["key_frames"])
     samples = max(1, round(report["coreset_fraction"] * domain / share))
     first, last = (point["seconds"] for point in (report["curve"][0], report["curve"][-1]))
-    from fhash_codec.paper.train import usual_batches
-
     bricks = max(1, round(vertices / share) >> sum(BRICK_BITS))
     batches_here = usual_batches(
         round(samples * share), max(1, round(bricks * share)), config.batch

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from math import prod
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,9 @@ import numpy.typing as npt
 from fhash_codec.boxes import Box, Sizes
 from fhash_codec.features import occupancy
 from fhash_codec.features.features import Extent, FeatureChoice, find_extent
+from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.scan import Scan
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
@@ -35,7 +38,7 @@ class Coreset:
         brick_shape: vertices of a brick (z, y, x), at most 1024 in all by default.
         brick_grid: bricks along each axis of the box (z, y, x). The last brick of an axis may reach
             beyond the box.
-        bricks: int32 (n, 4), one row (key index, z, y, x) in the brick grid for each brick that
+        bricks: int32 (n, 4), one row (step, z, y, x) in the brick grid for each brick that
             holds a sample, ascending.
         mask_bits: uint8 (n, ceil(vertices of a brick / 8)), np.packbits of each brick in C order,
             1 = sample. Samples are the vertices of the coreset, and of its fringe if that is asked.
@@ -47,6 +50,10 @@ class Coreset:
             units; the mean of all values if none is outside.
         apart: `occupancy` of each feature alone; empty if there is only one.
         fringe: bool (samples,), which samples are of the fringe; None if none was asked for.
+        key_places: place of each step of the samples among the key frames, float64 (steps,);
+            brick coordinates count these steps. Fractional for steps between two key frames.
+        lattice: the samples at the key frames alone, which the finest table has, where the others
+            are those of more steps; None where there are no others.
     """
 
     box: Box
@@ -57,11 +64,13 @@ class Coreset:
     mask_bits: npt.NDArray[np.uint8]
     values: npt.NDArray[np.float32]
     offsets: npt.NDArray[np.int64]
+    key_places: npt.NDArray[np.float64]
     occupancy: tuple[npt.NDArray[np.uint8], ...]
     fraction: float
     background: float
     apart: tuple[tuple[npt.NDArray[np.uint8], ...], ...] = ()
     fringe: npt.NDArray[np.bool_] | None = None
+    lattice: Coreset | None = None
 
     @property
     def grids(self) -> tuple[tuple[npt.NDArray[np.uint8], ...], ...]:
@@ -108,10 +117,10 @@ def build_coreset(
     box, size = extent.box, extent.box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
-    samples = extent.samples_with_fringe() if fringe else extent.samples
-    values = np.empty(samples, dtype=np.float32)
-    in_fringe = np.zeros(samples, dtype=np.bool_) if fringe else None
-    grids, layers, end = [], [], 0
+    samples = _Samples(
+        extent.samples_with_fringe() if fringe else extent.samples, shape, grid, fringe=fringe
+    )
+    grids = []
     for key, step in enumerate(key_frames):
         mask = of_key = extent.mask(key)
         grids.append(occupancy.pack(mask))
@@ -119,27 +128,15 @@ def build_coreset(
         if fringe:
             mask = extent.with_fringe(key)
             frame = _finite_at(mask, frame, series, extent, key)
-        for layer in range(grid[0]):
-            rows = slice(layer * shape[0], (layer + 1) * shape[0])
-            in_coreset = tile(mask[rows], shape)
-            # Boolean indexing walks brick by brick, in C order within a brick.
-            samples_of_layer = scan.value_range.to_unit(tile(frame[rows], shape)[in_coreset])
-            start, end = end, end + samples_of_layer.size
-            values[start:end] = samples_of_layer
-            if in_fringe is not None:
-                in_fringe[start:end] = ~tile(of_key[rows], shape)[in_coreset]
-            layers.append(_layer_bricks(in_coreset, key, layer))
+        samples.add(key, frame, mask, scan.value_range, of_key)
         progress("gathering", key + 1, len(key_frames), "")
-    bricks, mask_bits, counts = (np.concatenate(arrays) for arrays in zip(*layers, strict=True))
     return Coreset(
         box=box,
         key_frames=tuple(key_frames),
         brick_shape=shape,
         brick_grid=grid,
-        bricks=bricks,
-        mask_bits=mask_bits,
-        values=values,
-        offsets=np.cumsum(np.concatenate([np.zeros(1, dtype=np.int64), counts])),
+        **samples.arrays()._asdict(),
+        key_places=np.arange(len(key_frames), dtype=np.float64),
         occupancy=tuple(grids),
         fraction=extent.fraction,
         background=extent.background,
@@ -147,7 +144,107 @@ def build_coreset(
             tuple(occupancy.pack(extent.mask_of(number, key)) for key in range(len(key_frames)))
             for number in range(len(extent.apart))
         ),
-        fringe=in_fringe,
+    )
+
+
+class _Arrays(NamedTuple):
+    """Arrays of a `Coreset`."""
+
+    bricks: npt.NDArray[np.int32]
+    mask_bits: npt.NDArray[np.uint8]
+    values: npt.NDArray[np.float32]
+    offsets: npt.NDArray[np.int64]
+    fringe: npt.NDArray[np.bool_] | None
+
+
+class _Samples:
+    """Samples that are gathered step by step, as the arrays of a `Coreset`."""
+
+    def __init__(self, most: int, shape: Sizes, grid: Sizes, *, fringe: bool = False) -> None:
+        """Make room. most: samples at most. shape, grid: vertices of a brick, and bricks."""
+        self._values, self._end = np.empty(most, np.float32), 0
+        self._fringe = np.zeros(most, np.bool_) if fringe else None
+        self._shape, self._grid = shape, grid
+        self._layers: list[tuple[npt.NDArray[Any], ...]] = []
+
+    def add(
+        self,
+        number: int,
+        frame: npt.NDArray[Any],
+        mask: npt.NDArray[np.bool_],
+        value_range: ValueRange,
+        of_key: npt.NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Add the samples of a step.
+
+        Args:
+            number: number of the step among those of the samples.
+            frame: values (z, y, x) of the box.
+            mask: which vertices are samples.
+            value_range: range of the series.
+            of_key: which of them are no fringe; None for all.
+        """
+        height = self._shape[0]
+        for layer in range(self._grid[0]):
+            rows = slice(layer * height, (layer + 1) * height)
+            in_coreset = tile(mask[rows], self._shape)
+            # Boolean indexing walks brick by brick, in C order within a brick.
+            samples = value_range.to_unit(tile(frame[rows], self._shape)[in_coreset])
+            start, self._end = self._end, self._end + samples.size
+            self._values[start : self._end] = samples
+            if self._fringe is not None and of_key is not None:
+                of_layer = tile(of_key[rows], self._shape)[in_coreset]
+                self._fringe[start : self._end] = ~of_layer
+            self._layers.append(_layer_bricks(in_coreset, number, layer))
+
+    def arrays(self) -> _Arrays:
+        """Return what was gathered, fringe where that was asked for."""
+        bricks, bits, counts = (np.concatenate(all_) for all_ in zip(*self._layers, strict=True))
+        return _Arrays(
+            bricks=bricks,
+            mask_bits=bits,
+            values=self._values[: self._end],
+            offsets=np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)]),
+            fringe=None if self._fringe is None else self._fringe[: self._end],
+        )
+
+
+def with_steps_between(
+    coreset: Coreset, series: Series, value_range: ValueRange, times: KeyTimes, progress: Progress
+) -> Coreset:
+    """Return a coreset with samples of the steps between its key frames, too.
+
+    Such a sample is a vertex with a finite value that both key frames around the step have
+    embeddings of: one that is in the coreset of either, or of both where there is no fringe.
+    """
+    keys, box = coreset.key_frames, coreset.box
+    steps = [step for step in range(keys[0], keys[-1] + 1) if step not in set(keys)]
+    if not steps:
+        return coreset
+    masks = [occupancy.unpack(grid, box.shape) for grid in coreset.occupancy]
+    join = np.logical_and if coreset.fringe is None else np.logical_or
+    between = [join(mask, after) for mask, after in itertools.pairwise(masks)]
+    places = times.key_indices(steps)
+    most = sum(int(between[int(place)].sum()) for place in places)
+    samples = _Samples(most, coreset.brick_shape, coreset.brick_grid)
+    for number, (step, place) in enumerate(zip(steps, places, strict=True)):
+        frame = series.frame(step)[box.slices()]
+        mask = between[int(place)] & np.isfinite(frame)
+        samples.add(len(keys) + number, frame, mask, value_range)
+        progress("gathering", number + 1, len(steps), "between key frames")
+    more = samples.arrays()
+    fringe = coreset.fringe
+    if fringe is not None:
+        fringe = np.concatenate([fringe, np.zeros(len(more.values), np.bool_)])
+    return replace(
+        coreset,
+        bricks=np.concatenate([coreset.bricks, more.bricks]),
+        mask_bits=np.concatenate([coreset.mask_bits, more.mask_bits]),
+        values=np.concatenate([coreset.values, more.values]),
+        offsets=np.concatenate([coreset.offsets, coreset.offsets[-1] + more.offsets[1:]]),
+        fringe=fringe,
+        key_places=np.concatenate([coreset.key_places, places]),
+        lattice=coreset,
     )
 
 

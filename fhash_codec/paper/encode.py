@@ -10,8 +10,9 @@ from typing import Any
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick
+from fhash_codec.features.bricks import Coreset, build_coreset, parse_brick, with_steps_between
 from fhash_codec.features.features import Feature, FeatureChoice
+from fhash_codec.features.key_frames import KeyTimes, time_axis
 from fhash_codec.features.scan import Scan
 from fhash_codec.features.selection import resolve_selection
 from fhash_codec.header import brief_history, describe_source, write_series
@@ -32,12 +33,14 @@ class Selection:
         scanned: value range and missing values of the series.
         features: the features of interest.
         coreset: the samples at the key frames.
+        samples: those of the training: the same, or with those of the steps between.
         architecture: the sizes of the model.
     """
 
     scanned: Scan
     features: tuple[Feature, ...]
     coreset: Coreset
+    samples: Coreset
     architecture: Architecture
 
 
@@ -67,6 +70,13 @@ def select(
             fringe=config.fringe == "trained",
             brick=brick,
         )
+        samples = coreset
+        if config.samples == "all":
+            times = KeyTimes(
+                times=time_axis(series.coords["t"].values), key_frames=coreset.key_frames
+            )
+            value_range = scanned.value_range
+            samples = with_steps_between(coreset, series, value_range, times, progress)
     architecture = Architecture.for_box(
         coreset.box.shape,
         len(key_frames),
@@ -75,7 +85,13 @@ def select(
         hidden_layers=config.hidden_layers,
         width=config.model_width,
     )
-    return Selection(scanned=scanned, features=features, coreset=coreset, architecture=architecture)
+    return Selection(
+        scanned=scanned,
+        features=features,
+        coreset=coreset,
+        samples=samples,
+        architecture=architecture,
+    )
 
 
 SPARSE_BELOW = 0.5
@@ -116,7 +132,7 @@ def encode_paper(
     selection = select(series, config, progress, mask)
     coreset, architecture = selection.coreset, selection.architecture
     goal = _goal(selection, series, config)
-    trained = train_model(coreset, architecture, config, path, progress, goal)
+    trained = train_model(selection.samples, architecture, config, path, progress, goal)
     with stage("writing", "coordinates, masks, tables, network and header"):
         described = write_series(writer, series, selection.scanned, coreset.key_frames)
     loss, vertices = None, parameter_count(architecture.levels, 1)

@@ -8,15 +8,38 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.devices import enough_memory, same_bits, training_device
+from fhash_codec.devices import (
+    enough_memory,
+    leave_threads_of_parent,
+    same_bits,
+    threads_for,
+    training_device,
+)
 from fhash_codec.features.bricks import Coreset
+from fhash_codec.paper.engines import Engine, describe_engine, make_engine
+from fhash_codec.paper.engines.native import cpu_seconds
+from fhash_codec.paper.engines.parameters import needed_bytes
 from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.train import (
+    MAX_RESTARTS,
+    Breaks,
+    Diverged,
+    Probe,
+    TrainingPlan,
+    TrainingProgress,
+    checkpoint_path,
+    load_checkpoint,
+    plan_training,
+    save_checkpoint,
+    train,
+    usual_batches,
+    usual_epochs,
+)
 from fhash_codec.progress import Progress, silent, stage, tell
 from fhash_formats.errors import (
     FhashWarning,
@@ -26,14 +49,6 @@ from fhash_formats.errors import (
     TrainingError,
 )
 from fhash_formats.support.files import StopRequest, deferred_interrupts
-
-if TYPE_CHECKING:
-    import torch
-
-    from fhash_codec.paper.engines import Engine
-    from fhash_codec.paper.train import TrainingPlan, TrainingProgress
-
-# torch takes seconds to import. The plan alone is needed here, and its type only.
 
 LOWER_START = 0.5
 """Learning rate at the start of a round, as a share of that of the training."""
@@ -151,10 +166,6 @@ def extended(plan: TrainingPlan, epochs: int, schedule: str) -> TrainingPlan:
     return replace(plan, epochs=plan.epochs + epochs, rates=np.concatenate([plan.rates, rates]))
 
 
-# torch takes seconds to import, and nothing before the training needs it. Functions below import
-# the modules that load it.
-
-
 KEEP_SECONDS = 5.0
 """Seconds of training from which on its checkpoint is kept until the output file is complete."""
 
@@ -221,8 +232,6 @@ def train_model(
             or the memory of the device is not enough.
     """
     with stage("engine", "tables and network at their random start"):
-        from fhash_codec.paper.train import Diverged
-
         fitting = _Fitting(coreset, architecture, config, path, progress, goal)
     while True:
         try:
@@ -246,8 +255,6 @@ class _Fitting:
         goal: Goal | None,
     ) -> None:
         """Read the checkpoint if there is one."""
-        from fhash_codec.paper.train import TrainingProgress, checkpoint_path, load_checkpoint
-
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress, self._goal = progress, goal
         self._limited, self._threads = False, 1
@@ -259,8 +266,6 @@ class _Fitting:
 
     def run(self) -> TrainedModel:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
-        from fhash_codec.devices import leave_threads_of_parent
-
         leave_threads_of_parent()
         # With --no-timings the same input gives the same file, on CUDA, too.
         wanted = self._config.deterministic or not self._config.timings
@@ -268,8 +273,6 @@ class _Fitting:
             return self._run()
 
     def _run(self) -> TrainedModel:
-        from fhash_codec.devices import threads_for
-
         with stage("engine", "tables and network at their random start"):
             plan = self._plan()
             engine = self._engine(plan)
@@ -293,8 +296,6 @@ class _Fitting:
 
     def _trained_to_end(self, engine: Engine, plan: TrainingPlan, stop: StopRequest) -> bool:
         """Train to the end of a plan; return whether it was reached."""
-        from fhash_codec.paper.train import Breaks, train
-
         finished_before = self._reached.epoch == plan.epochs
         save = partial(self._save, engine, stop)
         breaks = Breaks(stop=stop, save=save)
@@ -311,8 +312,6 @@ class _Fitting:
 
         The whole coreset is measured, once for each round. What follows is told in a warning.
         """
-        from fhash_codec.paper.train import Probe
-
         if self._goal is None:
             return None
         psnr = Probe(self._coreset).psnr(engine)
@@ -338,8 +337,6 @@ class _Fitting:
 
         Raises TrainingError after MAX_RESTARTS.
         """
-        from fhash_codec.paper.train import MAX_RESTARTS
-
         configured = self._config.learning_rate
         if self._reached.restarts == MAX_RESTARTS:
             rate = self._reached.rate(configured)
@@ -353,8 +350,6 @@ class _Fitting:
         )
 
     def _plan(self) -> TrainingPlan:
-        from fhash_codec.paper.train import plan_training
-
         plan = plan_training(
             self._coreset,
             epochs=self._config.epochs,
@@ -367,12 +362,8 @@ class _Fitting:
             plan = extended(plan, int(earlier["epochs"]), self._config.schedule)
         return plan
 
-    def _choose_device(self) -> torch.device:
+    def _choose_device(self) -> str:
         """Return the device, by the plan without further rounds: the same at each continuation."""
-        from fhash_codec.paper.engines.native import cpu_seconds
-        from fhash_codec.paper.engines.slab import needed_bytes
-        from fhash_codec.paper.train import usual_batches, usual_epochs
-
         samples, bricks = len(self._coreset.values), len(self._coreset.bricks)
         batches = usual_batches(samples, bricks, self._config.batch)
         epochs = self._config.epochs or usual_epochs(batches)
@@ -386,8 +377,6 @@ class _Fitting:
 
     def _engine(self, plan: TrainingPlan) -> Engine:
         """Return a new engine, in the state of the checkpoint if there is one."""
-        from fhash_codec.paper.engines import make_engine
-
         engine = make_engine(
             self._config.engine,
             self._architecture,
@@ -407,8 +396,6 @@ class _Fitting:
 
     def _save(self, engine: Engine, stop: StopRequest, reached: TrainingProgress) -> None:
         """Write a checkpoint. A failure is only a warning, unless the training is asked to end."""
-        from fhash_codec.paper.train import save_checkpoint
-
         try:
             save_checkpoint(self._checkpoint, engine.state(), reached)
         except OutputError as error:
@@ -419,23 +406,21 @@ class _Fitting:
 
     def _trained(self, engine: Engine, plan: TrainingPlan) -> TrainedModel:
         """Return the numbers of the engine. Raises TrainingError if they are not finite."""
-        from fhash_codec.paper.engines import describe_engine
-
         parameters = engine.parameters()
         if not all(
-            bool(vector.isfinite().all())
+            bool(np.isfinite(vector).all())
             for vector in (parameters.fine, parameters.coarse, parameters.network)
         ):
             raise TrainingError("the trained numbers are not finite; set a lower --learning-rate")
         tables, layers = parameters.dense(self._architecture)
         return TrainedModel(
-            fine=parameters.fine.numpy(),
-            tables=[table.numpy() for table in tables],
-            layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
+            fine=parameters.fine,
+            tables=tables,
+            layers=layers,
             epochs=plan.epochs,
             steps=plan.epochs * plan.batches,
             history=self._reached.history,
-            device=self._device.type,
+            device=self._device,
             engine=describe_engine(engine, self._threads),
             checkpoint=self._checkpoint,
             restarts=self._reached.restarts,

@@ -136,6 +136,11 @@ class Architecture:
         return [(outputs, inputs) for inputs, outputs in itertools.pairwise(widths)]
 
     @property
+    def parameters_of_finest(self) -> int:
+        """Number of trained numbers in the finest table."""
+        return parameter_count(self.levels[:1], self.embedding_size)
+
+    @property
     def coarse_numbers(self) -> int:
         """Number of trained numbers in the tables of all levels but the finest."""
         return parameter_count(self.levels[1:], self.embedding_size)

@@ -9,13 +9,12 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from math import log10
+from math import inf, isfinite, log10
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.bricks import Coreset
@@ -59,7 +58,7 @@ class Probe:
         for chosen in np.array_split(self.bricks, -(-len(self.bricks) // AT_ONCE)):
             places, counted = self._sample_indices(chosen)
             values = self._coreset.values[places[counted]]
-            inferred = engine.infer(chosen).double().cpu().numpy()[counted]
+            inferred = engine.infer(chosen)[counted].astype(np.float64)
             # A reader clips values to their range. Clipping must not hide an infinite one.
             decoded = np.where(np.isinf(inferred), np.nan, np.clip(inferred, 0.0, 1.0))
             error += float(np.square(decoded - values).sum())
@@ -332,27 +331,28 @@ class _Loop:
         self._samples = np.diff(coreset.offsets)
         self._probe = Probe(coreset, PROBE_BRICKS, plan.seed)
         self._epochs_a_point = -(-plan.epochs // HISTORY_POINTS)
-        self._largest_error: Tensor | None = None
+        self._errors: list[SupportsFloat] = []
+        self._counts: list[int] = []
         self._seconds_before, self._begun = reached.seconds, time.perf_counter()
 
     def train_batch(self, chosen: npt.NDArray[np.int64]) -> None:
-        """Train on a batch of bricks and keep the largest error since the last check."""
-        error = self._engine.train(chosen) / max(int(self._samples[chosen].sum()), 1)
-        largest = self._largest_error
-        self._largest_error = error if largest is None else largest.maximum(error)
+        """Train on a batch of bricks and keep its error until the next check."""
+        self._errors.append(self._engine.train(chosen))
+        self._counts.append(max(int(self._samples[chosen].sum()), 1))
         self._reached.batch += 1
         self._count_seconds()
 
     def check_errors(self) -> None:
         """Raise Diverged if a mean squared error since the last check is too large."""
-        error = 0.0 if self._largest_error is None else float(self._largest_error)
+        errors = [float(e) / n for e, n in zip(self._errors, self._counts, strict=True)]
+        self._errors, self._counts = [], []
         # A comparison that NaN fails, too.
-        if not error <= DIVERGED:
+        if not all(error <= DIVERGED for error in errors):
+            error = max(errors) if all(map(isfinite, errors)) else inf
             raise Diverged(
                 f"training diverged in epoch {self._reached.epoch + 1}: "
                 f"the error reached {error**0.5:.3g} times the range of the values"
             )
-        self._largest_error = None
 
     def end_epoch(self) -> None:
         """Count the epoch and, where one is due, add a point to the history."""

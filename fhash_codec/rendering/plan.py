@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import MAX_LOD, Box
-from fhash_codec.devices import choose_device, has_torch
+from fhash_codec.devices import choose_device, may_have_cuda
 from fhash_codec.rendering.cameras import Rays
 from fhash_codec.rendering.colours import parse_colour
 from fhash_codec.rendering.grid import Grid
@@ -34,9 +32,6 @@ from fhash_codec.volume import Volume, feature_names
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.support.arrays import Double
 
-DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-"""File name of the driver of CUDA."""
-
 
 def arrays_on(device: str) -> Arrays:
     """The arrays of a device.
@@ -48,7 +43,7 @@ def arrays_on(device: str) -> Arrays:
     """
     if device not in DEVICES:
         raise InputError(f"device is '{device}'; allowed: {', '.join(DEVICES)}")
-    if device == "cpu" or (device == "auto" and not (_driver_exists() and has_torch())):
+    if device == "cpu" or (device == "auto" and not may_have_cuda()):
         return NUMPY
     chosen = choose_device(device)
     if chosen.type == "cpu":
@@ -56,15 +51,6 @@ def arrays_on(device: str) -> Arrays:
     from fhash_codec.rendering.torch_arrays import TorchArrays
 
     return TorchArrays(chosen)
-
-
-def _driver_exists() -> bool:
-    """Whether the driver of CUDA can be loaded. Importing torch to ask it would take seconds."""
-    try:
-        ctypes.CDLL(DRIVER)
-    except OSError:
-        return False
-    return True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

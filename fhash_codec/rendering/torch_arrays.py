@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from fhash_codec.paper.engines.parameters import true_positions
+from fhash_codec.paper.engines.slab import true_positions
 from fhash_codec.rendering.march_task import Array, Arrays
 from fhash_formats.errors import InputError
 

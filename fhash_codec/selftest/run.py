@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.devices import has_torch
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress, silent
 from fhash_codec.selftest.case import RUN_THREADS, Case, Check, Finding, Run, environment
@@ -59,7 +58,6 @@ class CaseResult:
         under: names of the settings that were tried.
         findings: the findings under all settings, each with the name of its settings in `under`.
         errors: one line for each error that kept the case, or a check of it, from finishing.
-        left_out: names of settings that were not tried, since they need torch.
     """
 
     name: str
@@ -68,7 +66,6 @@ class CaseResult:
     under: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     errors: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -121,11 +118,6 @@ class Summary:
     def failures(self) -> list[str]:
         """One line for each failure, beginning with the name of the case."""
         return [f"{result.name}: {line}" for result in self.results for line in result.failures]
-
-    @property
-    def left_out(self) -> int:
-        """The number of settings that were not tried, since they need torch."""
-        return sum(len(result.left_out) for result in self.results)
 
     def worst(self) -> dict[str, tuple[CaseResult, Finding]]:
         """The finding nearest to its limit for each property, by name, with its case."""
@@ -293,9 +285,6 @@ def run_case(
         checks: the checks of every run, in addition to the checks of the case.
     """
     settings: Mapping[str, EncodeConfig] = {**case.settings, **(case.more if everything else {})}
-    torch = has_torch()  # which the profile paper needs
-    left_out = [name for name, each in settings.items() if each.profile == "paper" and not torch]
-    settings = {name: config for name, config in settings.items() if name not in left_out}
     findings: list[Finding] = []
     errors: list[str] = []
     with warnings.catch_warnings():
@@ -329,7 +318,6 @@ def run_case(
         under=tuple(settings),
         findings=tuple(findings),
         errors=tuple(errors),
-        left_out=tuple(left_out),
     )
 
 

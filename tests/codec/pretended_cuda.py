@@ -24,6 +24,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
+from fhash_codec import devices
+
 CUDA = torch.device("cuda", 0)
 CPU = torch.device("cpu")
 
@@ -274,6 +276,7 @@ def pretended_cuda() -> Iterator[Pretended]:
     }
     with ExitStack() as stack:
         stack.enter_context(patch.object(torch, "from_numpy", from_numpy))
+        stack.enter_context(patch.object(devices, "may_have_cuda", lambda: True))
         for name, function in replaced.items():
             stack.enter_context(patch.object(torch.cuda, name, function))
         stack.enter_context(_Kernels(pretended))

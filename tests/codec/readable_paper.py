@@ -157,17 +157,25 @@ class NaiveEngine:
     ) -> None:
         """Start from the same parameters as every engine; arguments as in `make_engine`."""
         self.coreset, self.rates, self.step = coreset, rates, 0
-        start = initial_parameters(architecture, coreset, seed)
+        start = initial_parameters(architecture, coreset, seed).as_stored(architecture, coreset)
+        lattice = coreset.lattice or coreset
         self.in_coreset = np.unpackbits(
             coreset.mask_bits, axis=1, count=prod(coreset.brick_shape)
         ).astype(bool)
-        vertices = _vertices(coreset, np.arange(len(coreset.bricks)))[self.in_coreset]
+        on_lattice = np.unpackbits(
+            lattice.mask_bits, axis=1, count=prod(lattice.brick_shape)
+        ).astype(bool)
+        vertices = _vertices(lattice, np.arange(len(lattice.bricks)))[on_lattice]
         self.buckets = bucket_index(torch.from_numpy(vertices), architecture.levels[0])
         # Finest embeddings outside the coreset are 0.
         finest = torch.zeros(prod(architecture.levels[0]), architecture.embedding_size)
-        finest[self.buckets] = start.fine.T
+        finest[self.buckets] = torch.from_numpy(start.fine.T)
         tables, layers = start.dense(architecture)
-        self.model = FHash(architecture, [finest, *tables], layers).double()
+        self.model = FHash(
+            architecture,
+            [finest, *map(torch.tensor, tables)],
+            [(torch.tensor(weight), torch.tensor(bias)) for weight, bias in layers],
+        ).double()
         self.adam = torch.optim.Adam(
             self.model.parameters(), betas=(BETA1, BETA2), eps=EPSILON, fused=True
         )
@@ -184,9 +192,9 @@ class NaiveEngine:
         return error.detach()
 
     @torch.no_grad()
-    def infer(self, chosen: Chosen) -> Tensor:
+    def infer(self, chosen: Chosen) -> npt.NDArray[np.float64]:
         """Return the values (n,) at the samples of some bricks."""
-        return torch.as_tensor(self.model(self._samples(chosen)[0]))
+        return np.asarray(self.model(self._samples(chosen)[0]).numpy())
 
     def parameters(self) -> Parameters:
         """Return the trained numbers in float32; embeddings outside the coreset are left out."""
@@ -200,12 +208,15 @@ class NaiveEngine:
             for group in (coarse, layers)
         )
         return Parameters(
-            fine=finest[self.buckets].T.float().contiguous(), coarse=coarse_vector, network=network
+            fine=finest[self.buckets].T.float().contiguous().numpy(),
+            coarse=coarse_vector.numpy(),
+            network=network.numpy(),
         )
 
     def _samples(self, chosen: Chosen) -> tuple[Tensor, Tensor]:
         """Return points (n, 4) and normalised values (n,) of the coreset vertices of bricks."""
-        points = _vertices(self.coreset, chosen)[self.in_coreset[chosen]]
+        points = _vertices(self.coreset, chosen)[self.in_coreset[chosen]].astype(np.float64)
+        points[:, 0] = self.coreset.key_places[points[:, 0].astype(np.int64)]
         values = self.coreset.values[self.coreset.sample_indices(chosen)]
         return torch.from_numpy(points).double(), torch.from_numpy(values).double()
 

@@ -82,11 +82,10 @@ class Run:
             np.save(path, np.stack([series.read(step) for step in range(self.shape[0])]))
         return path
 
-    def device_of(self, engine: str) -> Any:
-        """Return the torch device of an engine: the native one computes on the CPU."""
-        import torch
+    def device_of(self, engine: str) -> str:
+        """Return the device of an engine: the native one computes on the CPU."""
 
-        return torch.device("cpu" if engine == "native" else self.device)
+        return "cpu" if engine == "native" else self.device
 
     def wait(self) -> None:
         """Wait until the device has done its work."""
@@ -304,10 +303,10 @@ def oracle(run: Run) -> Iterator[Result]:
                 expected = torch.cat([tables[used], *layer_gradients]).numpy()
                 apart = np.abs(10 * engine.flat_mean.cpu().numpy() - expected)
                 apart /= np.abs(expected).max()
-                values = np.abs(engine.infer(every).cpu().numpy() - naive.infer(every).numpy())
+                values = np.abs(engine.infer(every) - naive.infer(every))
                 trained = []
                 for _ in range(2):
-                    with same_bits(torch.device(run.device), True):
+                    with same_bits(run.device, True):
                         engine = make()
                         for _ in range(4):
                             engine.train(every)
@@ -390,7 +389,7 @@ def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Resu
                 engine.settle()
                 result["train"][plan.batch_samples] = trained
                 result["infer"][plan.batch_samples] = rate(engine.infer, batches, run.seconds / 2)
-            if device.type == "cuda" and "device_mb" not in result:
+            if device == "cuda" and "device_mb" not in result:
                 result["device_mb"] = torch.cuda.max_memory_allocated() / 1e6
                 result["expected_mb"] = needed_bytes(architecture, coreset, plan.batches) / 1e6
                 if result["device_mb"] > result["expected_mb"]:

@@ -115,18 +115,22 @@ def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_pa
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_default_encode_needs_no_torch(site: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("profile", ["compact", "paper"])
+def test_no_encode_needs_torch(site: Path, tmp_path: Path, profile: str) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (20, 24, 28)], indexing="ij")
     frames = [np.tanh(6 * (x - 0.1 * t) * y + 3 * z) for t in range(6)]
     np.save(tmp_path / "run.npy", np.array(frames, np.float32))
-    fhash(site, tmp_path, "encode", "run.npy", "-o", "run.fhz")
+    fhash(site, tmp_path, "encode", "run.npy", "-o", "run.fhz", "--profile", profile)
     assert '"psnr"' in fhash(site, tmp_path, "info", "run.fhz", "--json")
 
 
 @pytest.mark.parametrize(
     ("arguments", "extra"),
     [
-        (("encode", "run.npy", "-o", "paper.fhz", "--profile", "paper"), "fhash[train]"),
+        (
+            ("encode", "run.npy", "-o", "paper.fhz", "--profile", "paper", "--device", "cuda"),
+            "fhash[cuda]",
+        ),
         (("bench", "rate", "run.npy"), "fhash[bench]"),
         (("decode", "run.fhz", "--isosurface", "0.5", "-o", "surface.ply"), "fhash[mesh]"),
     ],

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from fhash_bench.paper.data import EMBEDDING_SIZE, WIDTH
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines.parameters import SPREAD, adam_step
-from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_codec.paper.engines.parameters import SPREAD
+from fhash_codec.paper.engines.slab import SlabEngine, adam_step
 from fhash_codec.paper.network import Architecture, Resolution, parameter_count
 
 
@@ -546,7 +546,7 @@ class LatticeModel:
         bricks = max(1, CHUNK // prod(self.coreset.brick_shape))
         for start in range(int(first), int(end), bricks):
             chosen = np.arange(start, min(start + bricks, int(end)))
-            values.append(self.engine.infer(chosen).cpu().numpy())
+            values.append(self.engine.infer(chosen))
         return np.concatenate(values)
 
     @torch.no_grad()
@@ -585,7 +585,7 @@ class LatticeModel:
         """The tables (buckets, E), 0 where no gradient moved them, then weights and biases."""
         numbers = self.engine.parameters()
         tables, layers = numbers.dense(self.engine.architecture)
-        finest = torch.zeros(self.levels[0].size, EMBEDDING_SIZE)
-        finest[self.levels[0].buckets(self.places)] = numbers.fine.T
+        finest = np.zeros((self.levels[0].size, EMBEDDING_SIZE), np.float32)
+        finest[self.levels[0].buckets(self.places).numpy()] = numbers.fine.T
         rest = [number for layer in layers for number in layer]
-        return [number.numpy().copy() for number in (finest, *tables, *rest)]
+        return [number.copy() for number in (finest, *tables, *rest)]

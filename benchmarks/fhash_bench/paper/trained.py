@@ -41,7 +41,7 @@ from fhash_bench.paper.encodings import (
 )
 from fhash_codec.boxes import Sizes
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.engines.parameters import adam_step
+from fhash_codec.paper.engines.slab import adam_step
 from fhash_codec.paper.network import ceil_log, level_resolutions
 from fhash_codec.paper.train import TrainingPlan
 from fhash_formats.errors import MissingDependencyError

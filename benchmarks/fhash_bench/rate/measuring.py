@@ -31,12 +31,11 @@ from fhash_bench.rate.peers import (
 from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.peers import EXACT, UNIFORM, Search, Trial, Variant, filled, trial_of
-from fhash_codec.devices import need_torch
 from fhash_codec.measure.errors import Errors
 from fhash_codec.progress import Progress
 from fhash_codec.volume import decoded_type
 from fhash_codec.volume import open as open_volume
-from fhash_formats.errors import InputError, MissingDependencyError, QualityError
+from fhash_formats.errors import InputError, QualityError
 from fhash_formats.series import ArraySeries, Series
 
 PEERS = ("SZ3", "SPERR", "ZFP", "BitRound", "Blosc")
@@ -471,13 +470,7 @@ class Bench:
         return Search(measure, step=variant.step, fixed=variant.lossless)
 
     def search_profile(self, settings: Mapping[str, Any], profile: str) -> None:
-        """Encode with a profile for every goal; one that lacks a package is refused."""
-        if profile == "paper":
-            try:
-                need_torch("profile paper")
-            except MissingDependencyError as error:
-                self.refused[f"{OWN}{profile}"] = str(error)
-                return
+        """Encode with a profile for every goal."""
         for goal, asked in self.goals:
             config = promised(settings, profile, goal, asked)
             self.done += 1

@@ -56,8 +56,7 @@ def command(
 
     The most telling measurements come first, until the budget is spent; the report says what was
     left out. Ctrl-C ends the measurements, and the report of what there is by then is written.
-    SZ3, SPERR and ZFP come with pip install 'fhash[bench]', as does what the page needs; the
-    profile paper with 'fhash[train]'.
+    SZ3, SPERR and ZFP come with pip install 'fhash[bench]', as does what the page needs.
     """
     folder = Path(output) if output is not None else Path(Path(data).stem + ".cost")
     check_report_folder(folder, force, data)

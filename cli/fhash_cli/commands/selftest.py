@@ -111,20 +111,10 @@ def _text(summary: Summary) -> str:
             )
     failures = summary.failures
     last = (
-        [f"everything holds{_left_out(summary)}"]
+        ["everything holds"]
         if summary.holds
-        else [f"what does not hold ({len(failures)}){_left_out(summary)}:", *failures]
+        else [f"what does not hold ({len(failures)}):", *failures]
     )
     return "\n".join(
         [table(groups), "", *([table(figures), ""] if len(figures) > 1 else []), *last]
-    )
-
-
-def _left_out(summary: Summary) -> str:
-    """Words on the settings that were left out without torch; empty where there are none."""
-    if not summary.left_out:
-        return ""
-    return (
-        f"; {summary.left_out} settings of the profile paper are left out, since they need torch"
-        " (pip install 'fhash[train]')"
     )

@@ -13,7 +13,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PATHS", "PROTOTYPES", "best_path", "library", "machine_paths"]
 
-ABI_VERSION = 4
+ABI_VERSION = 5
 """Number that `fhash_network_abi_version()` must return, and `FHASH_NETWORK_ABI` in network.cpp."""
 
 PROTOTYPES: Prototypes = {

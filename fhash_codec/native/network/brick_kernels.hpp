@@ -14,6 +14,9 @@
 
 namespace {
 
+// Inputs of the MLP.
+inline std::int64_t input_rows(const FhashBricks& b) { return b.own + b.levels * b.embedding; }
+
 // Memory of a thread.
 struct Work {
     std::int64_t row;      // numbers from one row of inputs to the next
@@ -33,7 +36,7 @@ struct Work {
             w.size += (numbers + FHASH_PAD + 15) / 16 * 16;
             return taken;
         };
-        const std::int64_t count = (b.levels + 1) * b.embedding + 1;
+        const std::int64_t count = input_rows(b) + 1;
         const std::int64_t plane = b.shape[1] * b.shape[2];
         std::int64_t nx = 0, lines = 0, planes = 0, rows = 0;
         for (std::int64_t l = 0; l < b.levels; l++) {
@@ -66,7 +69,7 @@ template <class P> struct Thread {
 
 template <class P>
 FHASH_INLINE Thread<P> thread_of(const FhashBricks& b, std::int64_t thread, const float* flat) {
-    const std::int64_t inputs = (b.levels + 1) * b.embedding;
+    const std::int64_t inputs = input_rows(b);
     Thread<P> t{b, Work::of<P>(b, b.work + thread * b.work_size),
                 Mlp{inputs, b.hidden, b.width, {}, {}, {}, {}, nullptr}, inputs, vertices_of(b)};
     t.mlp.template lay_out<P>(flat + b.coarse, t.w.mlp);
@@ -146,7 +149,7 @@ FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap&
     const std::int64_t row = t.w.row;
     const bool whole = samples == t.vertices;
     float* const rows = whole ? t.w.inputs : t.w.picked;
-    for (std::int64_t e = 0; e < b.embedding; e++) {
+    for (std::int64_t e = 0; e < b.own; e++) {
         const std::int64_t at = fine_at(b, brick, e);
         float* const to = rows + e * row;
         if (gap.factor != 0)
@@ -162,12 +165,12 @@ FHASH_INLINE float* inputs_of(const Thread<P>& t, std::int64_t brick, const Gap&
         std::int64_t* row_of_corners = corner_rows;
         for_rows(b, level, place, [&](std::int64_t at) { *row_of_corners++ = at; });
         interpolate<P>(Place(b, level, place, corner_rows), flat, t.w.planes,
-                       t.w.inputs + (l + 1) * b.embedding * row, row);
+                       t.w.inputs + (b.own + l * b.embedding) * row, row);
         corner_rows += level.corners[0] * level.corners[1] * level.corners[2];
     }
     if (whole) return rows;
     *run_count = runs_of(t, brick);
-    for (std::int64_t n = b.embedding; n < t.inputs; n++)
+    for (std::int64_t n = b.own; n < t.inputs; n++)
         pick(t, *run_count, t.w.inputs + n * row, rows + n * row);
     return rows;
 }
@@ -224,21 +227,22 @@ template <class P> FHASH_INLINE void train(const FhashBricks& b, std::int64_t th
         std::int64_t runs = 0;
         float* rows = inputs_of(t, brick, gap, b.flat, samples, &runs);
         if (gap.factor != 0)
-            for (std::int64_t e = 0; e < b.embedding; e++)
+            for (std::int64_t e = 0; e < b.own; e++)
                 std::memcpy(b.fine + fine_at(b, brick, e), rows + e * row,
                             samples * sizeof(float));
         error += backpropagate(t, rows, b.values + b.offsets[brick], samples);
         if (rows == t.w.picked)
-            for (std::int64_t k = b.embedding; k < t.inputs; k++)
+            for (std::int64_t k = b.own; k < t.inputs; k++)
                 put_back(t, runs, t.w.picked + k * row, t.w.inputs + k * row);
         const std::int64_t* level_rows = t.w.rows;
         for (std::int64_t l = 0; l < b.levels; l++) {
             const FhashLevel& level = b.level[l];
-            add_transposed<P>(Place(b, level, b.bricks + 4 * brick, level_rows),
-                              t.w.inputs + (l + 1) * b.embedding * row, row, t.w.planes, gradient);
+            const float* const by_level = t.w.inputs + (b.own + l * b.embedding) * row;
+            add_transposed<P>(Place(b, level, b.bricks + 4 * brick, level_rows), by_level, row,
+                              t.w.planes, gradient);
             level_rows += level.corners[0] * level.corners[1] * level.corners[2];
         }
-        for (std::int64_t e = 0; e < b.embedding; e++) {
+        for (std::int64_t e = 0; e < b.own; e++) {
             const std::int64_t at = fine_at(b, brick, e);
             adam<P>(b.fine + at, b.fine_mean + at, b.fine_square + at, rows + e * row, samples,
                     gap, step);

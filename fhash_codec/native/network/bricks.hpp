@@ -3,7 +3,9 @@
 //
 // A brick is a box of vertices of one key frame. Its inputs of the MLP are rows over its samples:
 // first the finest embeddings, which are stored for the samples alone, then those of each coarse
-// level, interpolated at all vertices from a small sub-lattice of that level's table.
+// level, interpolated at all vertices from a small sub-lattice of that level's table. Samples
+// between key frames lie on no vertex of the finest table: it is then one more coarse level, and no
+// embedding is stored for the samples.
 #pragma once
 
 #include "vector.hpp"
@@ -43,6 +45,7 @@ extern "C" struct FhashBricks {
     // Sizes.
     std::int64_t path;            // instructions: FHASH_PATH_...
     std::int64_t embedding;       // numbers of an embedding
+    std::int64_t own;             // those of the finest one, stored for the samples: all, or none
     std::int64_t levels;          // coarse levels
     std::int64_t hidden, width;   // hidden layers and their neurons
     std::int64_t shape[3];        // vertices of a brick, z, y, x
@@ -55,7 +58,7 @@ extern "C" struct FhashBricks {
     const std::int64_t* offsets;  // (bricks + 1,)
     // The model and its moments.
     std::int64_t samples;         // of all bricks
-    float* fine;                  // (embedding, samples): those of a brick from its offset on
+    float* fine;                  // (own, samples): those of a brick from its offset on
     float* fine_mean;
     float* fine_square;
     std::int64_t* visited;        // (bricks,): last step with a gradient

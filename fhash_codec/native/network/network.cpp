@@ -8,6 +8,6 @@
 
 // Raise it whenever an exported signature or its meaning changes; __init__.py holds the same
 // number.
-constexpr std::int64_t FHASH_NETWORK_ABI = 4;
+constexpr std::int64_t FHASH_NETWORK_ABI = 5;
 
 FHASH_EXPORT std::int64_t fhash_network_abi_version() { return FHASH_NETWORK_ABI; }

@@ -12,7 +12,8 @@
 namespace {
 
 bool is_sound(const FhashBricks& b) {
-    return b.embedding > 0 && b.levels >= 0 && b.hidden >= 0 && b.hidden <= 2 && b.threads > 0 &&
+    return b.embedding > 0 && (b.own == 0 || b.own == b.embedding) && b.levels >= 0 &&
+           b.hidden >= 0 && b.hidden <= 2 && b.threads > 0 &&
            (!b.hidden || (b.width > 0 && b.width <= FHASH_WIDEST)) && vertices_of(b) > 0;
 }
 

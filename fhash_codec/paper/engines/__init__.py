@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.config import ENGINES
+from fhash_codec.devices import need_torch
 from fhash_formats.errors import InputError
+from fhash_formats.support.arrays import Single
 
 if TYPE_CHECKING:
-    import torch
-
     from fhash_codec.features.bricks import Coreset
     from fhash_codec.paper.engines.parameters import Chosen, Parameters
     from fhash_codec.paper.network import Architecture
@@ -35,23 +35,23 @@ class Engine(Protocol):
     rates: npt.NDArray[np.float64]
     step: int
 
-    def train(self, chosen: Chosen) -> torch.Tensor:
+    def train(self, chosen: Chosen) -> SupportsFloat:
         """Do one training step on a batch of bricks.
 
-        Returns the sum of squared errors before the step, a scalar on the device.
+        Returns the sum of squared errors before the step. Of a device, a number to wait for.
         """
 
     def settle(self) -> None:
         """Finish work that training put off: evaluation is then faster until the next step."""
 
-    def infer(self, chosen: Chosen) -> torch.Tensor:
+    def infer(self, chosen: Chosen) -> Single:
         """Return the normalised values (n,) at the samples of some bricks.
 
         They come brick by brick, in C order in a brick, as `Coreset.values` has them.
         """
 
     def parameters(self) -> Parameters:
-        """Return the trained numbers, on the CPU."""
+        """Return the trained numbers."""
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return everything that the next step depends on, as arrays for a checkpoint."""
@@ -67,7 +67,7 @@ def make_engine(
     rates: npt.NDArray[np.float64],
     *,
     seed: int,
-    device: torch.device,
+    device: str,
 ) -> Engine:
     """Return a new engine.
 
@@ -78,12 +78,13 @@ def make_engine(
         coreset: the training samples.
         rates: learning rate of every training step, counted from 1.
         seed: seed of the initial parameters.
-        device: where the engine computes.
+        device: 'cpu' or 'cuda', where the engine computes.
 
     Raises:
         InputError: the name is unknown, or the engine cannot be had or does not take the model.
     """
-    if name == "fused" or (name == "auto" and device.type == "cuda"):
+    if name == "fused" or (name == "auto" and device == "cuda"):
+        need_torch(f"device '{device}'" if name == "auto" else "engine 'fused'")
         from fhash_codec.paper.engines.fused.engine import start_fused
 
         fused = start_fused(
@@ -93,11 +94,15 @@ def make_engine(
             return fused
     from fhash_codec.paper.engines.native import NativeEngine, refusal
 
+    reason = refusal(architecture) if device == "cpu" else f"the device is '{device}'"
     if name == "auto":
-        name = "slab" if refusal(architecture, device) else "native"
+        name = "slab" if reason else "native"
     if name == "native":
-        return NativeEngine(architecture, coreset, rates, seed=seed, device=device)
+        if reason:
+            raise InputError(f"the engine 'native' does not take this model: {reason}")
+        return NativeEngine(architecture, coreset, rates, seed=seed)
     if name == "slab":
+        need_torch(f"engine 'slab' ({reason})" if reason else "engine 'slab'")
         from fhash_codec.paper.engines.slab import SlabEngine
 
         return SlabEngine(architecture, coreset, rates, seed=seed, device=device)

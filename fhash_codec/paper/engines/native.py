@@ -12,14 +12,12 @@ threads and instructions of the processor give the same bits.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.native.network import PATHS, library, machine_paths
@@ -27,15 +25,18 @@ from fhash_codec.paper.engines.parameters import (
     BETA1,
     BETA2,
     Chosen,
+    LevelAxes,
     Parameters,
-    Upsampling,
     check_state,
+    coarse_axes,
+    coarse_levels,
     initial_parameters,
-    level_matrices,
+    used_numbers,
 )
-from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.network import Architecture, parameter_count
 from fhash_formats.errors import InputError
-from fhash_formats.support.arrays import Single
+from fhash_formats.support.arrays import Double, Longs, Single
+from fhash_formats.support.threads import usable_threads
 
 GROUP = 16
 """Vertices along x that are interpolated together; FHASH_GROUP in bricks.hpp."""
@@ -97,7 +98,7 @@ class Bricks(ctypes.Structure):
     """`FhashBricks`: a model in training on a coreset."""
 
     _fields_ = (
-        *((name, _INTEGER) for name in ("path", "embedding", "levels", "hidden", "width")),
+        *((name, _INTEGER) for name in ("path", "embedding", "own", "levels", "hidden", "width")),
         ("shape", _INTEGER * 3),
         ("threads", _INTEGER),
         ("bricks", _POINTER),
@@ -146,32 +147,35 @@ class LevelTables:
         arrays: everything that the structures point to.
     """
 
-    def __init__(self, architecture: Architecture, coreset: Coreset) -> None:
-        """Make the tables for every coordinate of a brick, axis by axis."""
+    def __init__(self, architecture: Architecture, coarse: Sequence[LevelAxes]) -> None:
+        """Make the tables for every coordinate of a brick, axis by axis.
+
+        coarse: the coarse levels (`coarse_axes`).
+        """
         self.arrays: list[npt.NDArray[Any]] = []
-        coarse = architecture.levels[1:]
         self.levels = (Level * max(len(coarse), 1))()
-        numbers = 0
-        for level, resolution in zip(self.levels, coarse, strict=False):
-            self._fill(level, architecture, coreset, resolution, numbers)
-            numbers += prod(resolution) * architecture.embedding_size
+        numbers, size = 0, architecture.embedding_size
+        for level, axes, resolution in zip(
+            self.levels, coarse, architecture.levels[-len(coarse) :], strict=False
+        ):
+            stride = [prod(resolution[axis + 1 :]) * size for axis in range(4)]
+            self._fill(level, axes.axes, stride, numbers)
+            numbers += prod(resolution) * size
 
     def _fill(
         self,
         level: Level,
-        architecture: Architecture,
-        coreset: Coreset,
-        resolution: tuple[int, ...],
+        axes: Sequence[tuple[Longs, Double]],
+        stride: Sequence[int],
         numbers: int,
     ) -> None:
         """Fill the structure of a level, whose table begins behind some numbers."""
-        stride = [prod(resolution[axis + 1 :]) * architecture.embedding_size for axis in range(4)]
         weights = []
-        for axis, (start, weight) in enumerate(level_matrices(architecture, coreset, resolution)):
+        for axis, (start, weight) in enumerate(axes):
             weights.append(weight)
             level.corners[axis], level.stride[axis] = weight.shape[2], stride[axis]
             level.start[axis] = self._address(start * stride[axis] + (numbers if axis == 0 else 0))
-        of_time = np.zeros((architecture.key_frames, 2), np.float32)
+        of_time = np.zeros((len(weights[0]), 2), np.float32)
         of_time[:, : weights[0].shape[2]] = weights[0][:, 0]
         level.time = self._address(of_time)
         for number, weight in enumerate(weights[1:3]):
@@ -241,10 +245,6 @@ FLUSH = 1024
 """Bricks that are brought up to date at a time."""
 PAD = 64
 """Numbers behind the flat ones that a vector may read or rewrite; FHASH_PAD in bricks.hpp."""
-CPU = torch.device("cpu")
-"""The device of the engine."""
-
-
 RATES = {"x86-64-v4": 65e9, "x86-64-v3": 50e9, "baseline": 25e9}
 """Operations a second of a training in one thread, by the instructions (docs/results.md).
 
@@ -254,7 +254,7 @@ not depend on the load of the machine, since each device has bits of its own.
 
 
 def cpu_seconds(architecture: Architecture, samples: int) -> float:
-    """Return about how long a training takes on the CPU in torch's threads.
+    """Return about how long a training takes on the CPU in the threads there are.
 
     Args:
         architecture: the sizes of the model.
@@ -262,14 +262,12 @@ def cpu_seconds(architecture: Architecture, samples: int) -> float:
     """
     # Forward, and backward to the inputs and to the weights: three products of 2 operations each.
     operations = 6 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
-    rate = RATES[(machine_paths() or ["baseline"])[0]] * torch.get_num_threads()
+    rate = RATES[(machine_paths() or ["baseline"])[0]] * usable_threads()
     return samples * operations / rate
 
 
-def refusal(architecture: Architecture, device: torch.device) -> str | None:
+def refusal(architecture: Architecture) -> str | None:
     """Return why a model cannot be trained by the native engine here; None if it can."""
-    if device.type != "cpu":
-        return f"it computes on a CPU, and the device is '{device.type}'"
     if not machine_paths():
         return "the native library was built for none of this machine's instructions"
     if architecture.hidden_layers > MOST_HIDDEN:
@@ -301,7 +299,6 @@ class NativeEngine:
         rates: npt.NDArray[np.float64],
         *,
         seed: int,
-        device: torch.device = CPU,
         path: str = "auto",
     ) -> None:
         """Start from fresh parameters; arguments as in `make_engine`.
@@ -312,7 +309,7 @@ class NativeEngine:
         Raises:
             InputError: the engine does not take the model, or the machine lacks the instructions.
         """
-        reason = refusal(architecture, device)
+        reason = refusal(architecture)
         if reason is not None:
             raise InputError(f"the engine 'native' does not take this model: {reason}")
         if path not in ("auto", *machine_paths()):
@@ -320,10 +317,11 @@ class NativeEngine:
         self.architecture, self.coreset, self.rates = architecture, coreset, rates
         self.path = machine_paths()[0] if path == "auto" else path
         self._native = library()
-        upsampling = Upsampling(architecture, coreset, CPU)
-        self._used = upsampling.used.numpy()
-        self._rank = None if upsampling.rank is None else upsampling.rank.numpy()
-        self._tables = LevelTables(architecture, coreset)
+        levels = coarse_axes(architecture, coreset)
+        interpolated = coarse_levels(architecture, coreset)
+        self._numbers = parameter_count(interpolated, architecture.embedding_size)
+        self._used, self._rank = used_numbers(levels, coreset, self._numbers)
+        self._tables = LevelTables(architecture, levels)
         self._coreset_arrays: dict[str, npt.NDArray[Any]] = {
             "bricks": np.ascontiguousarray(coreset.bricks, np.int32),
             "mask": np.ascontiguousarray(coreset.mask_bits),
@@ -331,17 +329,15 @@ class NativeEngine:
             "offsets": np.ascontiguousarray(coreset.offsets, np.int64),
         }
         start = initial_parameters(architecture, coreset, seed)
-        self.fine = start.fine.numpy()
+        self.fine = start.fine
         self.fine_mean, self.fine_square = np.zeros_like(self.fine), np.zeros_like(self.fine)
         self.visited = np.zeros(len(coreset.bricks), np.int64)
         self.step = 0
         self.coarse = len(self._used)
-        self.flat = _padded(
-            np.concatenate([start.coarse.numpy()[self._used], start.network.numpy()])
-        )
+        self.flat = _padded(np.concatenate([start.coarse[self._used], start.network]))
         self.flat_mean, self.flat_square = np.zeros_like(self.flat), np.zeros_like(self.flat)
-        largest = prod(architecture.levels[1]) if len(architecture.levels) > 1 else 0
-        self.lazy = int(np.searchsorted(self._used, largest * architecture.embedding_size))
+        largest = parameter_count(interpolated[:1], architecture.embedding_size)
+        self.lazy = int(np.searchsorted(self._used, largest))
         self.blocks = np.zeros(-(-self.lazy // BLOCK), np.int64)
         self._stamps, self._touched = np.zeros_like(self.blocks), np.zeros_like(self.blocks)
         self._gaps: _GapTables | None = None
@@ -349,7 +345,7 @@ class NativeEngine:
         self._memory: dict[str, npt.NDArray[Any]] = {}
         self._task = self._new_task()
 
-    def train(self, chosen: Chosen) -> Tensor:
+    def train(self, chosen: Chosen) -> float:
         """Do one training step on a batch; return the sum of squared errors before it."""
         self._catch_up_gaps()
         self._current = None
@@ -366,9 +362,9 @@ class NativeEngine:
         assert self._native is not None
         task.touches = self._native.fhash_bricks_touch(ctypes.byref(task))
         self._run(CATCH_UP, ADAM)
-        return torch.tensor(errors.sum())
+        return float(errors.sum())
 
-    def infer(self, chosen: Chosen) -> Tensor:
+    def infer(self, chosen: Chosen) -> Single:
         """Return the values (n,) at the samples of some bricks."""
         self._catch_up_gaps()
         offsets = self.coreset.offsets
@@ -380,7 +376,7 @@ class NativeEngine:
         task.out, task.places = values.ctypes.data, places.ctypes.data
         task.current = self._settled_flat()[0].ctypes.data
         self._run(INFER, INFER)
-        return torch.from_numpy(values)
+        return values
 
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
@@ -407,13 +403,10 @@ class NativeEngine:
         flat, mean, square = self._settled_flat()
         moved = (mean != 0) | (square != 0)
         used = (np.where(moved, flat, np.float32(0)) if self.step else flat)[: self.coarse]
-        coarse = np.zeros(self.architecture.coarse_numbers, np.float32)
+        coarse = np.zeros(self._numbers, np.float32)
         coarse[self._used] = used
-        return Parameters(
-            fine=torch.from_numpy(self.fine),
-            coarse=torch.from_numpy(coarse),
-            network=torch.from_numpy(flat[self.coarse :].copy()),
-        )
+        trained = Parameters(fine=self.fine, coarse=coarse, network=flat[self.coarse :].copy())
+        return trained.as_stored(self.architecture, self.coreset)
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return parameters, Adam's moments and the step number as arrays.
@@ -450,7 +443,8 @@ class NativeEngine:
         task = Bricks(
             path=PATHS[self.path],
             embedding=architecture.embedding_size,
-            levels=len(architecture.levels) - 1,
+            own=len(self.fine),
+            levels=len(coarse_levels(architecture, coreset)),
             hidden=architecture.hidden_layers,
             width=architecture.width,
             shape=coreset.brick_shape,
@@ -474,8 +468,8 @@ class NativeEngine:
         return task
 
     def _threads(self, bricks: int) -> int:
-        """Return the threads for some bricks, those of torch at most; their memory is there."""
-        threads = max(1, min(torch.get_num_threads(), bricks))
+        """Return the threads for some bricks; their memory is there."""
+        threads = max(1, min(usable_threads(), bricks))
         if len(self._memory.get("gradient", ())) < threads:
             self._memory["gradient"] = _padded(np.zeros((threads, len(self.flat)), np.float32))
             # A cache line more, so that the memory can begin with one.

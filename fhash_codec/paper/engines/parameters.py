@@ -1,19 +1,17 @@
-"""Parameters of an engine: initial values, upsampling of coarse levels, and Adam."""
+"""Parameters of an engine: initial values, places in the coarse tables, and Adam's constants."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
-from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.network import Architecture, Resolution
 from fhash_formats.support.arrays import Double, Longs, Single
 
 BETA1 = 0.9
@@ -57,28 +55,6 @@ def corrections(step: int, rate: float) -> tuple[float, float]:
     return 1 / (1 - BETA2**step) ** 0.5, rate / (1 - BETA1**step)
 
 
-def adam_step(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
-) -> None:
-    """Do one step of Adam in place, on tensors of one shape.
-
-    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long
-    as loading torch itself.
-
-    Args:
-        parameter: the numbers to move.
-        gradient: their gradient.
-        mean: mean of the gradients.
-        square: mean of the squared gradients.
-        step: number of the step, from 1 on.
-        rate: learning rate.
-    """
-    correction, pace = corrections(step, rate)
-    mean.lerp_(gradient, 1 - BETA1)
-    square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
-    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
-
-
 def catch_up(visited: Longs, step: int, rates: Double) -> CatchUp:
     """Return the effect of the steps visited + 1 .. step, all with a gradient of zero.
 
@@ -114,38 +90,16 @@ def catch_up(visited: Longs, step: int, rates: Double) -> CatchUp:
     )
 
 
-def catch_up_numbers(numbers: Tensor, effect: Tensor) -> None:
-    """Let parameters and their moments catch up on missed steps, in place.
-
-    Args:
-        numbers: the parameters, their mean and their mean square, (3, E, n).
-        effect: the columns of a `CatchUp`, (4, n).
-    """
-    parameter, mean, square = numbers
-    factor, epsilon = effect[:2]
-    parameter.addcdiv_(mean * factor, square.sqrt().add_(epsilon), value=-1.0)
-    numbers[1:].mul_(effect[2:].unsqueeze(1))
-
-
-def true_positions(mask: Tensor, count: int) -> Tensor:
-    """Return where a mask (n,) is not 0, int64 (count,), ascending.
-
-    `Tensor.nonzero` makes the host wait until the device has counted them.
-
-    Args:
-        mask: booleans, or 0 and 1 of an integer type.
-        count: number of entries that are not 0.
-    """
-    if mask.device.type == "cpu":
-        return mask.nonzero().squeeze(1)
-    # Entry number k is the first at which k have been counted.
-    return torch.searchsorted(mask.cumsum(0), torch.arange(1, count + 1, device=mask.device))
-
-
 SPREAD = 1e-4
 """Bound of the initial embeddings, uniform in -SPREAD .. SPREAD (Müller et al. 2022, section 4)."""
 BRICKS_AT_A_TIME = 1024
 """Bricks whose vertices draw their embeddings at a time."""
+DRAWN_AT_A_TIME = 1 << 15
+"""Numbers that are drawn at a time: they stay in a core's cache."""
+
+
+Numbers = TypeVar("Numbers", bound=Any)
+"""A vector of numpy or of torch."""
 
 
 @dataclass(frozen=True)
@@ -160,66 +114,122 @@ class Parameters:
             vector.
     """
 
-    fine: Tensor
-    coarse: Tensor
-    network: Tensor
+    fine: Single
+    coarse: Single
+    network: Single
 
-    def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
+    def dense(self, architecture: Architecture) -> tuple[list[Single], list[tuple[Single, Single]]]:
         """Return views of the coarse tables and of the layers.
 
         Returns:
             The tables (buckets, E), and weight (out, in) and bias (out,) of each layer.
         """
         size = architecture.embedding_size
-        tables = (
-            torch.split(self.coarse, [prod(level) * size for level in architecture.levels[1:]])
-            if len(self.coarse)
-            else ()
-        )
+        shapes = [(prod(level), size) for level in architecture.levels[1:]]
         layers = layer_matrices(architecture, self.network)
-        return [table.view(-1, size) for table in tables], [
-            (layer[:, :-1], layer[:, -1]) for layer in layers
-        ]
+        return matrices_of(self.coarse, shapes), [(each[:, :-1], each[:, -1]) for each in layers]
+
+    def as_trained(self, architecture: Architecture, coreset: Coreset) -> Parameters:
+        """Return these of an engine that interpolates `coarse_levels`, the finest with them."""
+        lattice = coreset.lattice
+        if lattice is None:
+            return self
+        size = architecture.embedding_size
+        finest = np.zeros((prod(architecture.levels[0]), size), np.float32)
+        finest[sample_places(lattice)] = self.fine.T
+        coarse = np.concatenate([finest.reshape(-1), self.coarse])
+        return Parameters(np.empty((0, len(coreset.values)), np.float32), coarse, self.network)
+
+    def as_stored(self, architecture: Architecture, coreset: Coreset) -> Parameters:
+        """Return them with the finest embeddings at the samples, from `as_trained`."""
+        lattice = coreset.lattice
+        if lattice is None:
+            return self
+        finest, coarse = np.split(self.coarse, [architecture.parameters_of_finest])
+        fine = finest.reshape(-1, architecture.embedding_size)[sample_places(lattice)]
+        return Parameters(np.ascontiguousarray(fine.T), coarse, self.network)
 
 
-def layer_matrices(architecture: Architecture, network: Tensor) -> list[Tensor]:
+def sample_places(coreset: Coreset) -> Longs:
+    """Return the vertices (samples,) of a lattice (key frames, z, y, x) where its samples lie."""
+    places = [np.zeros(0, np.int64)]
+    _, y, x = coreset.box.shape
+    inside = np.stack(np.meshgrid(*map(np.arange, coreset.brick_shape), indexing="ij"), axis=-1)
+    inside = inside.reshape(-1, 3)
+    for first in range(0, len(coreset.bricks), BRICKS_AT_A_TIME):
+        bits = coreset.mask_bits[first : first + BRICKS_AT_A_TIME]
+        brick, vertex = np.unpackbits(bits, axis=1, count=len(inside)).nonzero()
+        key, *corner = coreset.bricks[first : first + BRICKS_AT_A_TIME].astype(np.int64)[brick].T
+        at_z, at_y, at_x = (
+            np.stack(corner) * np.array(coreset.brick_shape)[:, None] + inside[vertex].T
+        )
+        places.append(((key * coreset.box.shape[0] + at_z) * y + at_y) * x + at_x)
+    return np.concatenate(places)
+
+
+def matrices_of(vector: Numbers, shapes: Sequence[tuple[int, int]]) -> list[Numbers]:
+    """Return views of the matrices that follow each other inside a vector."""
+    ends = np.cumsum([0, *map(prod, shapes)])
+    parts = zip(ends, ends[1:], shapes, strict=False)
+    return [vector[first:end].reshape(shape) for first, end, shape in parts]
+
+
+def layer_matrices(architecture: Architecture, network: Numbers) -> list[Numbers]:
     """Return views of the layers (out, in + 1) inside one vector."""
     shapes = [(outputs, inputs + 1) for outputs, inputs in architecture.layer_shapes]
-    vectors = torch.split(network, [prod(shape) for shape in shapes])
-    return [vector.view(shape) for vector, shape in zip(vectors, shapes, strict=True)]
+    return matrices_of(network, shapes)
+
+
+class _Uniform:
+    """Uniform random numbers, the same bits as those of a generator of torch on a CPU."""
+
+    def __init__(self, seed: int) -> None:
+        # Both are the Mersenne twister of one seed; newer generators of numpy have other streams.
+        self._random = np.random.RandomState(seed & 0xFFFFFFFF)
+
+    def draw(self, count: int, bound: float) -> Single:
+        """Return numbers in -bound .. bound, float32 (count,)."""
+        numbers, limit = np.empty(count, np.float32), float(np.float32(bound))
+        for first in range(0, count, DRAWN_AT_A_TIME):
+            part = numbers[first : first + DRAWN_AT_A_TIME]
+            share = self._random.randint(0, 1 << 32, len(part), np.uint32) & 0xFFFFFF
+            # One rounding to float32, as by a fused multiply-add.
+            part[:] = share * (2 * limit / (1 << 24)) - limit
+        return numbers
 
 
 def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:
-    """Return random parameters that depend on the seed alone, float32 on the CPU.
+    """Return random parameters that depend on the seed alone, as an engine trains them.
 
     Embeddings are uniform in +-SPREAD (paper, section 3.2.4: uniform initialization). Layers are
     uniform in +-1/sqrt(inputs), as torch.nn.Linear starts them.
     """
-    random = torch.Generator().manual_seed(seed)
-    fine = _initial_fine(architecture.embedding_size, coreset, random)
-    coarse = torch.empty(architecture.coarse_numbers).uniform_(-SPREAD, SPREAD, generator=random)
-    layers = []
-    for outputs, inputs in architecture.layer_shapes:
-        bound = inputs**-0.5
-        layers.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
-    return Parameters(fine=fine, coarse=coarse, network=torch.cat(layers))
+    random = _Uniform(seed)
+    fine = _initial_fine(architecture.embedding_size, coreset.lattice or coreset, random)
+    coarse = random.draw(architecture.coarse_numbers, SPREAD)
+    layers = [
+        random.draw(outputs * (inputs + 1), inputs**-0.5)
+        for outputs, inputs in architecture.layer_shapes
+    ]
+    start = Parameters(fine=fine, coarse=coarse, network=np.concatenate(layers))
+    return start.as_trained(architecture, coreset)
 
 
-def _initial_fine(size: int, coreset: Coreset, random: torch.Generator) -> Tensor:
+def _initial_fine(size: int, coreset: Coreset, random: _Uniform) -> Single:
     """Return the finest embeddings (E, samples) at the start.
 
     All vertices of a brick draw a number, samples or not: where a vertex starts depends on its
     brick alone.
     """
-    fine = torch.empty(size, len(coreset.values))
+    fine = np.empty((size, len(coreset.values)), np.float32)
     vertices = prod(coreset.brick_shape)
     for first in range(0, len(coreset.bricks), BRICKS_AT_A_TIME):
         bits = coreset.mask_bits[first : first + BRICKS_AT_A_TIME]
-        drawn = torch.empty(len(bits), size, vertices)
-        drawn.uniform_(-SPREAD, SPREAD, generator=random)
-        in_coreset = torch.from_numpy(np.unpackbits(bits, axis=1, count=vertices)).bool()
+        drawn = random.draw(len(bits) * size * vertices, SPREAD).reshape(-1, size, vertices)
+        in_coreset = np.unpackbits(bits, axis=1, count=vertices).view(np.bool_)
         span = slice(*coreset.offsets[[first, first + len(bits)]].tolist())
-        fine[:, span] = drawn.transpose(0, 1)[:, in_coreset]
+        for number in range(size):
+            fine[number, span] = drawn[:, number][in_coreset]
     return fine
 
 
@@ -243,157 +253,17 @@ def check_state(
 class LevelAxes:
     """The sub-lattices of one coarse level for every coordinate of a brick, axis by axis.
 
-    The axes are (key frame, z) together, y, and x.
-
     Attributes:
-        starts: for each axis, the start of the sub-lattice in the flat tables, int64
-            (coordinates,).
-        matrices: for each axis, the flattened interpolation matrices (coordinates, vertices *
-            corners), float64.
-        shapes: for each axis, the shape (vertices, corners) of one of these matrices.
+        starts: for (key frame, z) together, for y and for x, the start of the sub-lattice in the
+            flat tables, int64 (coordinates,).
         offsets: positions of the numbers of a sub-lattice relative to its start, in the order
             (corners t z x y, E), int64.
+        axes: `axis_matrices` along t, z, y and x.
     """
 
     starts: tuple[Longs, ...]
-    matrices: tuple[Double, ...]
-    shapes: tuple[tuple[int, ...], ...]
     offsets: Longs
-
-
-class Upsampling:
-    """The tables of starts and matrices that all bricks of a coreset share.
-
-    The coarse tables lie level by level in a flat vector.
-
-    Attributes:
-        used: positions in that vector, ascending, of the numbers that some brick needs. Training
-            holds only these: around a sparse feature most of the coarse tables is out of reach.
-        rank: for each position in that vector its place among `used`; None if all are used.
-    """
-
-    used: Tensor
-
-    def __init__(self, architecture: Architecture, coreset: Coreset, device: torch.device) -> None:
-        """Make the tables by brick coordinate: (key frame, z) together, y, and x."""
-        self.size, self.layers = architecture.embedding_size, coreset.brick_grid[0]
-        numbers, levels = 0, []
-        for resolution in architecture.levels[1:]:
-            levels.append(_level_axes(architecture, coreset, resolution, numbers))
-            numbers += prod(resolution) * self.size
-        self.shapes = [level.shapes for level in levels]
-        self.starts = [
-            torch.from_numpy(np.stack(starts, axis=1)).to(device)
-            for starts in zip(*(level.starts for level in levels), strict=True)
-        ]
-        self.matrices = [
-            torch.from_numpy(np.concatenate(matrices, axis=1).astype(np.float32)).to(device)
-            for matrices in zip(*(level.matrices for level in levels), strict=True)
-        ]
-        offsets = [level.offsets for level in levels]
-        self.counts = [len(offset) for offset in offsets]
-        self.offset = torch.from_numpy(np.concatenate([*offsets, np.zeros(0, dtype=np.int64)])).to(
-            device
-        )
-        self.level = torch.from_numpy(np.repeat(np.arange(len(offsets)), self.counts)).to(device)
-        in_use = self._in_use(torch.from_numpy(coreset.bricks.astype(np.int64)).to(device), numbers)
-        self.used = in_use.nonzero().squeeze(1)
-        self.rank = (in_use.cumsum(0, dtype=torch.int32) - 1) if len(self.used) < numbers else None
-
-    def _in_use(self, bricks: Tensor, numbers: int) -> Tensor:
-        """Return which numbers of the flat tables some brick needs, bool (numbers,)."""
-        in_use = torch.zeros(numbers, dtype=torch.bool, device=bricks.device)
-        for batch in torch.split(bricks, BRICKS_AT_A_TIME):
-            in_use[self._positions(self._coordinates(batch))] = True
-        return in_use
-
-    def _coordinates(self, bricks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the coordinates (key frame, z) together, y and x of bricks (n, 4)."""
-        t, z, y, x = bricks.unbind(1)
-        return t * self.layers + z, y, x
-
-    def _positions(self, coordinates: tuple[Tensor, ...]) -> Tensor:
-        """Return where the sub-lattices of bricks lie in the flat tables, (bricks, numbers)."""
-        if not self.shapes:
-            return self.offset.expand(len(coordinates[0]), 0)
-        base = sum(
-            (start[c] for start, c in zip(self.starts, coordinates, strict=True)),
-            torch.zeros((), dtype=torch.int64),
-        )
-        return base[:, self.level] + self.offset
-
-    def lattices(self, bricks: Tensor) -> Lattices:
-        """Return the sub-lattices of bricks (n, 4), coordinates (key frame, z, y, x) int64."""
-        coordinates = self._coordinates(bricks)
-        index = self._positions(coordinates)
-        if self.rank is not None:
-            index = self.rank[index].long()
-        if not self.shapes:
-            return Lattices(index=index, counts=[], matrices=[], size=self.size)
-        rows = [
-            torch.split(matrices[c], [prod(shape[axis]) for shape in self.shapes], dim=1)
-            for axis, (matrices, c) in enumerate(zip(self.matrices, coordinates, strict=True))
-        ]
-        levels = [
-            tuple(row[level].view(-1, *shape[axis]) for axis, row in enumerate(rows))
-            for level, shape in enumerate(self.shapes)
-        ]
-        return Lattices(index=index, counts=self.counts, matrices=levels, size=self.size)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lattices:
-    """The sub-lattices of the coarse tables that some bricks need, and how to interpolate in them.
-
-    Attributes:
-        index: positions (bricks, numbers) among the used numbers of the flat tables.
-        counts: numbers of each level. They come in the order (corners t z x y, E); in this order
-            each axis is one batched product, without a copy in between.
-        matrices: per level, the matrices along (t, z), y and x, each (bricks, vertices, corners).
-        size: numbers E of an embedding.
-    """
-
-    index: Tensor
-    counts: list[int]
-    matrices: list[tuple[Tensor, ...]]
-    size: int
-
-    def interpolate(self, flat: Tensor, out: Tensor) -> None:
-        """Write the embeddings (levels, E, bricks, z, y, x) at all vertices into `out`."""
-        levels = torch.split(flat[self.index], self.counts, dim=1) if self.counts else ()
-        for level, (numbers, (wtz, wy, wx)) in enumerate(zip(levels, self.matrices, strict=True)):
-            bricks = len(wtz)
-            # Capitals are vertices, small letters corners. The products are (bricks, x y E, t z)
-            # by (t z, Z), then (y E Z, x) by (x, X), then (Y, y) by (y, E Z X).
-            values = torch.bmm(
-                numbers.reshape(bricks, wtz.shape[2], -1).transpose(1, 2), wtz.transpose(1, 2)
-            )
-            values = torch.bmm(
-                values.view(bricks, wx.shape[2], -1).transpose(1, 2), wx.transpose(1, 2)
-            )
-            values = torch.bmm(wy, values.view(bricks, wy.shape[2], -1))
-            out[level].copy_(
-                values.view(bricks, wy.shape[1], self.size, wtz.shape[1], -1).permute(2, 0, 3, 1, 4)
-            )
-
-    def add_transposed(self, flat_gradient: Tensor, gradient: Tensor) -> None:
-        """Add the gradient by the embeddings to the gradient by the flat tables.
-
-        Args:
-            flat_gradient: gradient by the used numbers of the flat tables, changed in place.
-            gradient: gradient by the embeddings (levels, E, bricks, z, y, x).
-        """
-        levels = []
-        for level, (wtz, wy, wx) in enumerate(self.matrices):
-            bricks = len(wtz)
-            values = gradient[level].permute(1, 3, 0, 2, 4).reshape(bricks, wy.shape[1], -1)
-            values = torch.bmm(wy.transpose(1, 2), values).view(bricks, -1, wx.shape[1])
-            values = torch.bmm(wx.transpose(1, 2), values.transpose(1, 2)).view(
-                bricks, -1, wtz.shape[1]
-            )
-            levels.append(torch.bmm(wtz.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1))
-        if levels:
-            flat_gradient.index_add_(0, self.index.reshape(-1), torch.cat(levels, dim=1).view(-1))
+    axes: tuple[tuple[Longs, Double], ...]
 
 
 def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Longs, Double]:
@@ -413,7 +283,12 @@ def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Lon
         sub-lattice).
     """
     vertex = np.minimum(np.arange(count * length), size - 1).reshape(count, length)
-    position = vertex * (corners - 1) / max(size - 1, 1)
+    return weights_at(vertex * (corners - 1) / max(size - 1, 1), corners)
+
+
+def weights_at(position: Double, corners: int) -> tuple[Longs, Double]:
+    """Return what `axis_matrices` does of runs of positions (runs, vertices), in corners."""
+    count, length = position.shape
     before = np.minimum(position.astype(np.int64), max(corners - 2, 0))
     after_weight = position - before
     sub_corners = min(int((before[:, -1] - before[:, 0]).max()) + 2, corners)
@@ -426,36 +301,118 @@ def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[Lon
     return start, weights
 
 
-def level_matrices(
-    architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...]
-) -> list[tuple[Longs, Double]]:
-    """Return `axis_matrices` of a level along t, z, y and x; a key frame is a run along time."""
-    lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
-    return [
-        axis_matrices(*along_axis)
-        for along_axis in zip(architecture.sizes, resolution, lengths, counts, strict=True)
-    ]
+def coarse_levels(architecture: Architecture, coreset: Coreset) -> tuple[Resolution, ...]:
+    """Return the levels that are interpolated.
+
+    They are all but the finest, and that one, too, where some samples lie between key frames.
+    """
+    return architecture.levels[coreset.lattice is None :]
+
+
+def coarse_axes(architecture: Architecture, coreset: Coreset) -> list[LevelAxes]:
+    """Return the sub-lattices of the coarse levels, whose flat tables follow each other."""
+    levels, numbers = [], 0
+    for resolution in coarse_levels(architecture, coreset):
+        levels.append(_level_axes(architecture, coreset, resolution, numbers))
+        numbers += prod(resolution) * architecture.embedding_size
+    return levels
 
 
 def _level_axes(
     architecture: Architecture, coreset: Coreset, resolution: tuple[int, ...], numbers: int
 ) -> LevelAxes:
-    """Return the sub-lattices of one coarse level; `numbers` precede its flat table."""
-    size, axes = architecture.embedding_size, level_matrices(architecture, coreset, resolution)
-    stride = [prod(resolution[axis + 1 :]) * size for axis in range(4)]
-    (start_t, wt), (start_z, wz), (start_y, wy), (start_x, wx) = axes
-    start_tz = (start_t[:, None] * stride[0] + start_z * stride[1]).reshape(-1) + numbers
-    # (key frames, coordinates z, vertices z, corners t, corners z)
-    wtz = wt[:, None, :, :, None] * wz[None, :, :, None, :]
-    corners = [np.arange(w.shape[2]) * s for (_, w), s in zip(axes, stride, strict=True)]
-    t, z, x, y, e = np.ix_(corners[0], corners[1], corners[3], corners[2], np.arange(size))
-    return LevelAxes(
-        starts=(start_tz, start_y * stride[2], start_x * stride[3]),
-        matrices=(
-            wtz.reshape(len(start_tz), -1),
-            wy.reshape(len(wy), -1),
-            wx.reshape(len(wx), -1),
+    """Return the sub-lattices of one coarse level; `numbers` precede its flat table.
+
+    A step of the samples is a run along time.
+    """
+    size, places = architecture.embedding_size, coreset.key_places
+    corners_of_time = places[:, None] * (resolution[0] - 1) / max(architecture.key_frames - 1, 1)
+    axes = (
+        weights_at(corners_of_time, resolution[0]),
+        *(
+            axis_matrices(*along_axis)
+            for along_axis in zip(
+                *(architecture.box_size, resolution[1:], coreset.brick_shape, coreset.brick_grid),
+                strict=True,
+            )
         ),
-        shapes=((wz.shape[1], wt.shape[2] * wz.shape[2]), wy.shape[1:], wx.shape[1:]),
-        offsets=(t + z + x + y + e).reshape(-1),
     )
+    stride = [prod(resolution[axis + 1 :]) * size for axis in range(4)]
+    t, z, y, x = (start * step for (start, _), step in zip(axes, stride, strict=True))
+    corners = [np.arange(w.shape[2]) * step for (_, w), step in zip(axes, stride, strict=True)]
+    ct, cz, cx, cy, e = np.ix_(corners[0], corners[1], corners[3], corners[2], np.arange(size))
+    return LevelAxes(
+        starts=((t[:, None] + z).reshape(-1) + numbers, y, x),
+        offsets=(ct + cz + cx + cy + e).reshape(-1),
+        axes=axes,
+    )
+
+
+def used_numbers(
+    levels: Sequence[LevelAxes], coreset: Coreset, numbers: int
+) -> tuple[Longs, npt.NDArray[np.int32] | None]:
+    """Return the numbers of the flat coarse tables that some brick needs.
+
+    Training holds only these: around a sparse feature most of the coarse tables is out of reach.
+
+    Args:
+        levels: the coarse levels (`coarse_axes`).
+        coreset: the training samples.
+        numbers: numbers of all coarse tables.
+
+    Returns:
+        Their positions, ascending, and for each position its place among them; None if all are
+        used.
+    """
+    in_use = np.zeros(numbers, np.bool_)
+    for first in range(0, len(coreset.bricks), BRICKS_AT_A_TIME):
+        t, z, y, x = coreset.bricks[first : first + BRICKS_AT_A_TIME].astype(np.int64).T
+        along = (t * coreset.brick_grid[0] + z, y, x)
+        for level in levels:
+            starts = (start[c] for start, c in zip(level.starts, along, strict=True))
+            in_use[np.unique(sum(starts, np.int64(0)))[:, None] + level.offsets] = True
+    used = np.flatnonzero(in_use)
+    if len(used) == numbers:
+        return used, None
+    return used, np.cumsum(in_use, dtype=np.int32) - np.int32(1)
+
+
+LIBRARIES = 1 << 28
+"""Bytes for the libraries of CUDA: their code and the workspaces of matrix products."""
+UNEVEN = 2
+"""Largest number of bricks of a batch, as a multiple of the mean: batches have as many samples."""
+
+
+def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> int:
+    """Return about how many bytes a training takes, rather too many than too few.
+
+    Args:
+        architecture: the sizes of the model.
+        coreset: the training samples.
+        batches: batches of an epoch.
+    """
+    bricks, vertices = len(coreset.bricks), prod(coreset.brick_shape)
+    samples = len(coreset.values) + 1
+    size = architecture.embedding_size
+    coarse = architecture.coarse_numbers
+    network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
+    # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
+    held = 12 * size * samples + 4 * samples + coreset.mask_bits.nbytes
+    held += bricks * (8 + 4 * 8)
+    # Four vectors of the numbers in use, their places, rank, mask, and the initial tables.
+    held += coarse * (4 * 4 + 8 + 4 + 1 + 4) + 16 * network
+    batch = min(UNEVEN * -(-bricks // batches), bricks)
+    return LIBRARIES + held + batch * vertices * _bytes_a_vertex(architecture)
+
+
+def _bytes_a_vertex(architecture: Architecture) -> int:
+    """Return the bytes that a training step holds for each vertex of its bricks."""
+    inputs = architecture.inputs
+    hidden = sum(outputs + 1 for outputs, _ in architecture.layer_shapes[:-1])
+    # Inputs and their gradients, each also for samples alone; activations and their gradients.
+    numbers = 4 * (inputs + 1) + 2 * hidden
+    # Rows of the finest level, what Adam makes of them and the effect of missed steps, products of
+    # the interpolation, target, residual and its square.
+    numbers += 7 * architecture.embedding_size + 4 + 3 * architecture.embedding_size + 4
+    # Mask, its bits and sums, ranks, places of the samples and their bricks.
+    return 4 * numbers + 2 + 5 * 8

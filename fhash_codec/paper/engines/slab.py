@@ -14,6 +14,7 @@ missing steps, whose gradient is zero, in closed form before it is used (`parame
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import prod
 from typing import NamedTuple
 
@@ -24,19 +25,212 @@ from torch import Tensor
 
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.paper.engines.parameters import (
+    BETA1,
+    BETA2,
+    EPSILON,
     Chosen,
-    Lattices,
+    LevelAxes,
     Parameters,
-    Upsampling,
-    adam_step,
     catch_up,
-    catch_up_numbers,
     check_state,
+    coarse_axes,
+    coarse_levels,
+    corrections,
     initial_parameters,
     layer_matrices,
-    true_positions,
+    used_numbers,
 )
-from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.network import Architecture, parameter_count
+from fhash_formats.support.arrays import Single
+
+
+class Upsampling:
+    """The tables of starts and matrices that all bricks of a coreset share.
+
+    The coarse tables lie level by level in a flat vector.
+
+    Attributes:
+        used: positions in that vector, ascending, of the numbers that some brick needs. Training
+            holds only these: around a sparse feature most of the coarse tables is out of reach.
+        rank: for each position in that vector its place among `used`; None if all are used.
+    """
+
+    used: Tensor
+
+    def __init__(self, architecture: Architecture, coreset: Coreset, device: torch.device) -> None:
+        """Make the tables by brick coordinate: (key frame, z) together, y, and x."""
+        self.size, self.layers = architecture.embedding_size, coreset.brick_grid[0]
+        interpolated = coarse_levels(architecture, coreset)
+        self.numbers = parameter_count(interpolated, self.size)
+        levels = coarse_axes(architecture, coreset)
+        self.starts = [
+            torch.from_numpy(np.stack(starts, axis=1)).to(device)
+            for starts in zip(*(level.starts for level in levels), strict=True)
+        ]
+        weights = [_weights(level) for level in levels]
+        self.shapes = [tuple(weight.shape[1:] for weight in level) for level in weights]
+        self.matrices = [
+            torch.from_numpy(
+                np.concatenate([each.reshape(len(each), -1) for each in along], axis=1)
+            ).to(device)
+            for along in zip(*weights, strict=True)
+        ]
+        offsets = [level.offsets for level in levels]
+        self.counts = [len(offset) for offset in offsets]
+        self.offset = torch.from_numpy(np.concatenate([*offsets, np.zeros(0, dtype=np.int64)])).to(
+            device
+        )
+        self.level = torch.from_numpy(np.repeat(np.arange(len(offsets)), self.counts)).to(device)
+        used, rank = used_numbers(levels, coreset, self.numbers)
+        self.used = torch.from_numpy(used).to(device)
+        self.rank = None if rank is None else torch.from_numpy(rank).to(device)
+
+    def _coordinates(self, bricks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the coordinates (key frame, z) together, y and x of bricks (n, 4)."""
+        t, z, y, x = bricks.unbind(1)
+        return t * self.layers + z, y, x
+
+    def _positions(self, coordinates: tuple[Tensor, ...]) -> Tensor:
+        """Return where the sub-lattices of bricks lie in the flat tables, (bricks, numbers)."""
+        if not self.shapes:
+            return self.offset.expand(len(coordinates[0]), 0)
+        base = sum(
+            (start[c] for start, c in zip(self.starts, coordinates, strict=True)),
+            torch.zeros((), dtype=torch.int64),
+        )
+        return base[:, self.level] + self.offset
+
+    def lattices(self, bricks: Tensor) -> Lattices:
+        """Return the sub-lattices of bricks (n, 4), coordinates (key frame, z, y, x) int64."""
+        coordinates = self._coordinates(bricks)
+        index = self._positions(coordinates)
+        if self.rank is not None:
+            index = self.rank[index].long()
+        if not self.shapes:
+            return Lattices(index=index, counts=[], matrices=[], size=self.size)
+        rows = [
+            torch.split(matrices[c], [prod(shape[axis]) for shape in self.shapes], dim=1)
+            for axis, (matrices, c) in enumerate(zip(self.matrices, coordinates, strict=True))
+        ]
+        levels = [
+            tuple(row[level].view(-1, *shape[axis]) for axis, row in enumerate(rows))
+            for level, shape in enumerate(self.shapes)
+        ]
+        return Lattices(index=index, counts=self.counts, matrices=levels, size=self.size)
+
+
+def _weights(level: LevelAxes) -> list[Single]:
+    """Return the weights (coordinates, vertices, corners) along (key frame, z), y and x."""
+    wt, wz, wy, wx = (weight for _, weight in level.axes)
+    # (key frames, coordinates z, vertices z, corners t, corners z)
+    wtz = wt[:, None, :, :, None] * wz[None, :, :, None, :]
+    wtz = wtz.reshape(wt.shape[0] * wz.shape[0], wz.shape[1], -1)
+    return [weight.astype(np.float32) for weight in (wtz, wy, wx)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lattices:
+    """The sub-lattices of the coarse tables that some bricks need, and how to interpolate in them.
+
+    Attributes:
+        index: positions (bricks, numbers) among the used numbers of the flat tables.
+        counts: numbers of each level. They come in the order (corners t z x y, E); in this order
+            each axis is one batched product, without a copy in between.
+        matrices: per level, the matrices along (t, z), y and x, each (bricks, vertices, corners).
+        size: numbers E of an embedding.
+    """
+
+    index: Tensor
+    counts: list[int]
+    matrices: list[tuple[Tensor, ...]]
+    size: int
+
+    def interpolate(self, flat: Tensor, out: Tensor) -> None:
+        """Write the embeddings (levels, E, bricks, z, y, x) at all vertices into `out`."""
+        levels = torch.split(flat[self.index], self.counts, dim=1) if self.counts else ()
+        for level, (numbers, (wtz, wy, wx)) in enumerate(zip(levels, self.matrices, strict=True)):
+            bricks = len(wtz)
+            # Capitals are vertices, small letters corners. The products are (bricks, x y E, t z)
+            # by (t z, Z), then (y E Z, x) by (x, X), then (Y, y) by (y, E Z X).
+            values = torch.bmm(
+                numbers.reshape(bricks, wtz.shape[2], -1).transpose(1, 2), wtz.transpose(1, 2)
+            )
+            values = torch.bmm(
+                values.view(bricks, wx.shape[2], -1).transpose(1, 2), wx.transpose(1, 2)
+            )
+            values = torch.bmm(wy, values.view(bricks, wy.shape[2], -1))
+            out[level].copy_(
+                values.view(bricks, wy.shape[1], self.size, wtz.shape[1], -1).permute(2, 0, 3, 1, 4)
+            )
+
+    def add_transposed(self, flat_gradient: Tensor, gradient: Tensor) -> None:
+        """Add the gradient by the embeddings to the gradient by the flat tables.
+
+        Args:
+            flat_gradient: gradient by the used numbers of the flat tables, changed in place.
+            gradient: gradient by the embeddings (levels, E, bricks, z, y, x).
+        """
+        levels = []
+        for level, (wtz, wy, wx) in enumerate(self.matrices):
+            bricks = len(wtz)
+            values = gradient[level].permute(1, 3, 0, 2, 4).reshape(bricks, wy.shape[1], -1)
+            values = torch.bmm(wy.transpose(1, 2), values).view(bricks, -1, wx.shape[1])
+            values = torch.bmm(wx.transpose(1, 2), values.transpose(1, 2)).view(
+                bricks, -1, wtz.shape[1]
+            )
+            levels.append(torch.bmm(wtz.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1))
+        if levels:
+            flat_gradient.index_add_(0, self.index.reshape(-1), torch.cat(levels, dim=1).view(-1))
+
+
+def adam_step(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
+) -> None:
+    """Do one step of Adam in place, on tensors of one shape.
+
+    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long
+    as loading torch itself.
+
+    Args:
+        parameter: the numbers to move.
+        gradient: their gradient.
+        mean: mean of the gradients.
+        square: mean of the squared gradients.
+        step: number of the step, from 1 on.
+        rate: learning rate.
+    """
+    correction, pace = corrections(step, rate)
+    mean.lerp_(gradient, 1 - BETA1)
+    square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    parameter.addcdiv_(mean, square.sqrt().mul_(correction).add_(EPSILON), value=-pace)
+
+
+def catch_up_numbers(numbers: Tensor, effect: Tensor) -> None:
+    """Let parameters and their moments catch up on missed steps, in place.
+
+    Args:
+        numbers: the parameters, their mean and their mean square, (3, E, n).
+        effect: the columns of a `CatchUp`, (4, n).
+    """
+    parameter, mean, square = numbers
+    factor, epsilon = effect[:2]
+    parameter.addcdiv_(mean * factor, square.sqrt().add_(epsilon), value=-1.0)
+    numbers[1:].mul_(effect[2:].unsqueeze(1))
+
+
+def true_positions(mask: Tensor, count: int) -> Tensor:
+    """Return where a mask (n,) is not 0, int64 (count,), ascending.
+
+    `Tensor.nonzero` makes the host wait until the device has counted them.
+
+    Args:
+        mask: booleans, or 0 and 1 of an integer type.
+        count: number of entries that are not 0.
+    """
+    if mask.device.type == "cpu":
+        return mask.nonzero().squeeze(1)
+    # Entry number k is the first at which k have been counted.
+    return torch.searchsorted(mask.cumsum(0), torch.arange(1, count + 1, device=mask.device))
 
 
 class Columns(NamedTuple):
@@ -75,47 +269,6 @@ def columns_of(in_coreset: Tensor, offsets: Tensor, none: int, alone: int | None
         return Columns(bricks, ranks.masked_fill_(mask == 0, none), None, mask)
     vertices = true_positions(mask, alone)
     return Columns(bricks, ranks[vertices], vertices, None)
-
-
-LIBRARIES = 1 << 28
-"""Bytes for the libraries of CUDA: their code and the workspaces of matrix products."""
-UNEVEN = 2
-"""Largest number of bricks of a batch, as a multiple of the mean: batches have as many samples."""
-
-
-def needed_bytes(architecture: Architecture, coreset: Coreset, batches: int) -> int:
-    """Return about how many bytes a training takes, rather too many than too few.
-
-    Args:
-        architecture: the sizes of the model.
-        coreset: the training samples.
-        batches: batches of an epoch.
-    """
-    bricks, vertices = len(coreset.bricks), prod(coreset.brick_shape)
-    samples = len(coreset.values) + 1
-    size = architecture.embedding_size
-    coarse = architecture.coarse_numbers
-    network = sum(outputs * (inputs + 1) for outputs, inputs in architecture.layer_shapes)
-    # Embeddings, mean and square of the finest level; values, masks, offsets and coordinates.
-    held = 12 * size * samples + 4 * samples + coreset.mask_bits.nbytes
-    held += bricks * (8 + 4 * 8)
-    # Four vectors of the numbers in use, their places, rank, mask, and the initial tables.
-    held += coarse * (4 * 4 + 8 + 4 + 1 + 4) + 16 * network
-    batch = min(UNEVEN * -(-bricks // batches), bricks)
-    return LIBRARIES + held + batch * vertices * _bytes_a_vertex(architecture)
-
-
-def _bytes_a_vertex(architecture: Architecture) -> int:
-    """Return the bytes that a training step holds for each vertex of its bricks."""
-    inputs = architecture.inputs
-    hidden = sum(outputs + 1 for outputs, _ in architecture.layer_shapes[:-1])
-    # Inputs and their gradients, each also for samples alone; activations and their gradients.
-    numbers = 4 * (inputs + 1) + 2 * hidden
-    # Rows of the finest level, what Adam makes of them and the effect of missed steps, products of
-    # the interpolation, target, residual and its square.
-    numbers += 7 * architecture.embedding_size + 4 + 3 * architecture.embedding_size + 4
-    # Mask, its bits and sums, ranks, places of the samples and their bricks.
-    return 4 * numbers + 2 + 5 * 8
 
 
 CHUNK = 1 << 13
@@ -161,12 +314,13 @@ class SlabEngine:
         rates: npt.NDArray[np.float64],
         *,
         seed: int,
-        device: torch.device,
+        device: torch.device | str,
     ) -> None:
         """Start from fresh parameters; arguments as in `make_engine`.
 
         The coreset is copied to the device.
         """
+        device = torch.device(device)
         self.architecture, self.coreset = architecture, coreset
         self.rates, self.device = rates, device
         self.on_cpu = device.type == "cpu"
@@ -185,12 +339,15 @@ class SlabEngine:
         # Embeddings and both moments. They stay 0 for the sample that stands for no sample.
         self._numbers = torch.zeros(3, len(start.fine), len(self.values), device=device)
         self.fine, self.fine_mean, self.fine_square = self._numbers[..., :-1].unbind()
-        self.fine.copy_(start.fine)
+        self.fine.copy_(torch.from_numpy(start.fine))
         self.visited = np.zeros(len(self.bricks), dtype=np.int64)
         self.step = self.settled = 0
         self.coarse = len(self.upsampling.used)
         self.flat = torch.cat(
-            [start.coarse.to(device)[self.upsampling.used], start.network.to(device)]
+            [
+                torch.from_numpy(start.coarse).to(device)[self.upsampling.used],
+                torch.from_numpy(start.network).to(device),
+            ]
         )
         self.flat_mean, self.flat_square, self.gradient = (
             torch.zeros_like(self.flat) for _ in range(3)
@@ -225,7 +382,7 @@ class SlabEngine:
         return error
 
     @torch.no_grad()
-    def infer(self, chosen: Chosen) -> Tensor:
+    def infer(self, chosen: Chosen) -> Single:
         """Return the values (n,) at the samples of some bricks."""
         count = int(self.counts[chosen].sum())
         ids, effect = self._sent(chosen)
@@ -236,9 +393,9 @@ class SlabEngine:
             fine = self._caught_up(effect, columns)[0]
         lattices = self.upsampling.lattices(self.bricks[ids])
         values = self._value(self._inputs(lattices, fine, columns))
-        if columns.in_coreset is None:
-            return values
-        return values[true_positions(columns.in_coreset, count)]
+        if columns.in_coreset is not None:
+            values = values[true_positions(columns.in_coreset, count)]
+        return values.cpu().numpy()
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -259,13 +416,16 @@ class SlabEngine:
         On a CPU the finest embeddings are the engine's own memory, not a copy.
         """
         self.settle()
-        coarse = torch.zeros(self.architecture.coarse_numbers)
+        coarse = torch.zeros(self.upsampling.numbers)
         moved = (self.flat_mean != 0) | (self.flat_square != 0)
         used = torch.where(moved, self.flat, 0.0) if self.step else self.flat
         coarse[self.upsampling.used.cpu()] = used[: self.coarse].cpu()
-        return Parameters(
-            fine=self.fine.cpu(), coarse=coarse, network=self.flat[self.coarse :].cpu().clone()
+        trained = Parameters(
+            fine=self.fine.cpu().numpy(),
+            coarse=coarse.numpy(),
+            network=self.flat[self.coarse :].cpu().clone().numpy(),
         )
+        return trained.as_stored(self.architecture, self.coreset)
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return parameters, Adam's moments and the step number as arrays."""
@@ -344,7 +504,7 @@ class SlabEngine:
 
     def _by_level(self, rows: Tensor) -> Tensor:
         """Return rows (coarse levels * E, vertices) as (coarse levels, E, bricks, z, y, x)."""
-        levels, size = len(self.architecture.levels) - 1, self.architecture.embedding_size
+        levels, size = len(self.upsampling.shapes), self.architecture.embedding_size
         bricks = rows.shape[1] // self.vertices
         return rows.view(levels, size, bricks, *self.coreset.brick_shape)
 

@@ -51,7 +51,7 @@ from fhash_codec.cost.prediction import (
 from fhash_codec.cost.probe import PaperProbe, look_at, probe_rates, updates_of
 from fhash_codec.cost.results import CostReport, Encoded, advise, bytes_text, told
 from fhash_codec.progress import silent
-from fhash_formats.errors import InterruptedEncodingError, MissingDependencyError, RegionError
+from fhash_formats.errors import InterruptedEncodingError, RegionError
 from fhash_formats.series import ArraySeries, Series, StepsSeries
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.tile_format import TileSettings
@@ -610,20 +610,6 @@ def test_an_encoding_that_overruns_is_no_point(series: ArraySeries, tmp_path: Pa
     assert not any(point.measured for point in encodings.points)
     assert "took longer" in allowance.left_out[0].why
     assert list(tmp_path.iterdir()) == []
-
-
-def test_paper_needs_torch(
-    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def missing(what: str) -> None:
-        raise MissingDependencyError(f"{what} needs torch")
-
-    monkeypatch.setattr(own, "need_torch", missing)
-    allowance = Allowance(1000.0)
-    encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
-    encodings.measure(Wish(codec="paper", group="paper"))
-    assert encodings.points == []
-    assert allowance.left_out[0].why == "profile paper needs torch"
 
 
 def test_paper_trains_one_epoch_and_then_as_many_as_fit(

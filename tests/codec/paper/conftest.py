@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-import torch
 
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.boxes import Box
-from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.bricks import Coreset, build_coreset, with_steps_between
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
+from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.encode import Selection, select
 from fhash_codec.paper.engines import make_engine
@@ -167,13 +167,19 @@ def network(request: pytest.FixtureRequest) -> Network:
 
 
 def _noise_coreset(
-    shape: tuple[int, int, int, int], low: float = 0.3, fringe: bool = False
+    shape: tuple[int, int, int, int],
+    low: float = 0.3,
+    fringe: bool = False,
+    keys: Sequence[int] = (),
 ) -> Coreset:
     series = ArraySeries(np.random.default_rng(3).random(shape, dtype=np.float32))
     scanned = scan(series, silent)
-    return build_coreset(
-        series, scanned, FeatureChoice(range(shape[0]), [Interval(low, 1.0)]), silent, fringe=fringe
-    )
+    choice = FeatureChoice(keys or range(shape[0]), [Interval(low, 1.0)])
+    coreset = build_coreset(series, scanned, choice, silent, fringe=fringe)
+    if not keys:
+        return coreset
+    times = KeyTimes(times=np.arange(shape[0], dtype=np.float64) ** 1.5, key_frames=tuple(keys))
+    return with_steps_between(coreset, series, scanned.value_range, times, silent)
 
 
 def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
@@ -190,7 +196,7 @@ def _trained(coreset: Coreset, settings: dict[str, Any], name: str, device: str)
     rates = np.append(plan.rates, [0.01, 0.01])
 
     def new() -> Any:
-        return make_engine(name, architecture, coreset, rates, seed=7, device=torch.device(device))
+        return make_engine(name, architecture, coreset, rates, seed=7, device=device)
 
     first, second, every = new(), new(), np.arange(len(coreset.bricks))
     train(first, plan, coreset, TrainingProgress())
@@ -198,14 +204,13 @@ def _trained(coreset: Coreset, settings: dict[str, Any], name: str, device: str)
     for _ in range(2):
         error = float(second.train(every[::2].copy()))
     psnr, values = Probe(coreset).psnr(second), second.infer(every)
-    assert values.device.type == device
     second.settle()
     parameters = second.parameters()
     return {
         "error": error,
         "psnr": psnr,
-        "values": values.cpu().numpy(),
-        **{part: getattr(parameters, part).numpy() for part in ("fine", "coarse", "network")},
+        "values": values,
+        **{part: getattr(parameters, part) for part in ("fine", "coarse", "network")},
     }
 
 
@@ -217,7 +222,10 @@ def trained() -> Callable[..., dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def noise_coreset() -> Callable[..., Coreset]:
-    """A function of (shape, low, fringe): noise; values from `low` to 1 are the feature."""
+    """A function of (shape, low, fringe, keys): noise; values from `low` to 1 are the feature.
+
+    With `keys`, these steps are key frames, and those between them are samples, too.
+    """
     return _noise_coreset
 
 
@@ -358,7 +366,6 @@ def setup() -> Callable[..., Any]:
         usual = {"learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
         plan = plan_training(coreset, epochs=epochs, **usual | settings)
         architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
-        device = torch.device("cpu")
-        return plan, make_engine("slab", architecture, coreset, plan.rates, seed=5, device=device)
+        return plan, make_engine("slab", architecture, coreset, plan.rates, seed=5, device="cpu")
 
     return make

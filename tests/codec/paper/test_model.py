@@ -449,7 +449,7 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(
         raise OutputError("no space left")
 
     monkeypatch.setattr("fhash_codec.paper.fit.KEEP_SECONDS", 0.0)
-    monkeypatch.setattr("fhash_codec.paper.train.save_checkpoint", full)
+    monkeypatch.setattr("fhash_codec.paper.fit.save_checkpoint", full)
     with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
     assert decoded(tmp_path / "a.fhz").shape == field().shape

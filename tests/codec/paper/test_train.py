@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from pretended_cuda import pretended_cuda
 
 import fhash_codec
@@ -109,14 +108,14 @@ class Engine:
         box = tuple(slice(a, a + n) for a, n in zip(low, size, strict=True))
         self.frames[:, : size[0], : size[1], : size[2]] = frames[(slice(None), *box)]
 
-    def infer(self, chosen: np.ndarray) -> torch.Tensor:
+    def infer(self, chosen: np.ndarray) -> np.ndarray:
         values = [
             self.frames[key][
                 tuple(slice(i * n, (i + 1) * n) for i, n in zip(place, self.shape, strict=True))
             ].ravel()
             for key, *place in self.bricks[chosen].tolist()
         ]
-        return torch.from_numpy(np.array(values)[self.samples[chosen]])
+        return np.array(values)[self.samples[chosen]]
 
 
 def built(field: np.ndarray, feature: object, fringe: bool) -> Coreset:
@@ -202,9 +201,7 @@ def test_training_that_diverges_is_an_error(setup, coreset) -> None:
 def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers) -> None:
     plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
     architecture = Architecture.for_box(coreset.box.shape, 3, width=64, hidden_layers=hidden_layers)
-    engine = make_engine(
-        "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
-    )
+    engine = make_engine("slab", architecture, coreset, plan.rates, seed=5, device="cpu")
     reached = TrainingProgress()
     with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
         train(engine, plan, coreset, reached)

@@ -356,7 +356,7 @@ def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -
 def test_marching_on_the_processor_loads_no_torch() -> None:
     code = (
         "import sys; from fhash_codec.rendering import plan as devices; "
-        "import fhash_codec.rendering.stream_march; devices._driver_exists = lambda: False; "
+        "import fhash_codec.rendering.stream_march; devices.may_have_cuda = lambda: False; "
         "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
     )
     assert (

@@ -32,6 +32,7 @@ from fhash_codec.paper.engines.slab import SlabEngine
 from fhash_codec.paper.model import Patch, PointSampler, PointTables, SparsePatch, time_nodes
 from fhash_codec.paper.network import Architecture, Network, Resolution
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.support.arrays import Single
 
 TRIAL_BRICKS = 4
 """Bricks of the trial of newly compiled kernels."""
@@ -157,7 +158,7 @@ class FusedEngine(SlabEngine):
         return self._errors[:blocks].sum()
 
     @torch.no_grad()
-    def infer(self, chosen: Chosen) -> Tensor:
+    def infer(self, chosen: Chosen) -> Single:
         """Return the values (n,) at the samples of some bricks."""
         ends = np.cumsum(self.counts[chosen])
         values = torch.empty(int(ends[-1]) if len(ends) else 0, device=self.device)
@@ -176,7 +177,7 @@ class FusedEngine(SlabEngine):
                     _pointer(values),
                 ],
             )
-        return values
+        return values.cpu().numpy()
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -235,7 +236,7 @@ class FusedEngine(SlabEngine):
         results = []
         for engine in (FusedEngine, SlabEngine):
             steps = [float(engine.train(self, batch)) for batch in batches]
-            results.append((np.array(steps), engine.infer(self, bricks).cpu().numpy()))
+            results.append((np.array(steps), engine.infer(self, bricks)))
             self._start_again(*start)
         (errors, values), (slab_errors, slab_values) = results
         wrong_errors = not np.allclose(errors, slab_errors, rtol=TRIAL_ERROR, atol=1e-9)
@@ -611,7 +612,7 @@ def start_fused(
     rates: npt.NDArray[np.float64],
     *,
     seed: int,
-    device: torch.device,
+    device: str,
     required: bool,
 ) -> FusedEngine | None:
     """Return a fused engine, or None, with one FhashWarning for each reason.
@@ -625,21 +626,22 @@ def start_fused(
     Raises:
         InputError: the engine is required and cannot be had.
     """
-    if device.type != "cuda" or torch.version.cuda is None:
+    if device != "cuda" or torch.version.cuda is None:
         if required:
             raise InputError(
-                f"engine is 'fused', which needs a CUDA device, but the device is '{device.type}'"
+                f"engine is 'fused', which needs a CUDA device, but the device is '{device}'"
                 " or torch is not built for CUDA; use --engine auto"
             )
         return None
+    cuda = torch.device(device)
     try:
         return FusedEngine(
             architecture,
             coreset,
             rates,
             seed=seed,
-            device=device,
-            kernels=program.CudaDevice(device),
+            device=cuda,
+            kernels=program.CudaDevice(cuda),
         )
     except Unavailable as error:
         if required:

@@ -315,6 +315,8 @@ def kernel_sizes(
         Unavailable: the kernels cannot do this model on this device.
     """
     check_layers(architecture)
+    if coreset.lattice is not None:
+        raise Unavailable("samples between key frames lie on no vertex of the finest table")
     axes = axis_tables(architecture, coreset)
     corners = tuple(zip(*(axis.corners for axis in axes), strict=True))
     fitting = [
