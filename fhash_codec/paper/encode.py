@@ -142,7 +142,7 @@ def encode_paper(
 
         promised = _promised(selection, series, config)
         with stage("tables", "--tables transform: coded at a loss that the promise allows"):
-            loss = write_coded(writer, architecture, coreset, trained, promised, progress)
+            loss = write_coded(writer, architecture, selection.samples, trained, promised, progress)
     else:
         with stage("writing", "tables"):
             vertices = write_tables(

@@ -391,7 +391,7 @@ class CodedTables:
         tables: the tables, finest first.
         layers: weight and bias of each layer, as the file has them.
         layer_settings: how the weights of each layer are coded; None for plain numbers.
-        loss: dB of PSNR over the samples at the key frames that coding costs.
+        loss: dB of PSNR over the samples that coding costs.
         error: mean squared error over the samples.
     """
 
@@ -604,7 +604,7 @@ class _Coding:
 def write_coded(
     writer: ContainerWriter,
     architecture: Architecture,
-    coreset: Coreset,
+    samples_of: Coreset,
     model: TrainedModel,
     psnr: float | None,
     progress: Progress,
@@ -613,13 +613,15 @@ def write_coded(
 
     The quantiser step is the largest that keeps the allowed error.
 
+    samples_of: the training samples.
     psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it
         before they are coded. Without it, coding may cost MAX_LOSS.
     progress: called before each trial.
     """
+    coreset = samples_of.lattice or samples_of
     bricks = Bricks(coreset)
     tables = trained_tables(architecture, coreset, bricks, model.fine, model.tables)
-    samples = Samples(coreset, bricks, tile_shape(architecture.levels[0]))
+    samples = Samples(samples_of, tile_shape(architecture.levels[0]))
     with thread_pool() as workers:
         coding = _Coding(architecture, tables, model.layers, samples, psnr, workers, progress)
         coded = coding.run()

@@ -318,23 +318,24 @@ SLOPE_POINTS = 1024
 
 
 class Samples:
-    """The coreset at the key frames, tile by tile of the finest level.
+    """The coreset at the key frames and the steps between, tile by tile of the finest level.
 
     Attributes:
         counts: number of samples of each tile that holds any, by its place, in C order.
-        tile: vertices (t, z, y, x) of a tile.
+        tile: vertices (t, z, y, x) of a tile; the steps after a key frame belong to it.
         total: number of samples of all tiles.
         sizes: vertices (t, z, y, x) of the finest level.
     """
 
-    def __init__(self, coreset: Coreset, bricks: Bricks, tile: Shape) -> None:
-        self._bricks, self._coreset = bricks, coreset
+    def __init__(self, coreset: Coreset, tile: Shape) -> None:
+        self._bricks, self._coreset = Bricks(coreset), coreset
         self._occupied = lru_cache(maxsize=MAX_FRAMES)(self._unpacked)
+        self._in_order = np.argsort(coreset.key_places, kind="stable")
         self.tile, self.sizes = tile, (len(coreset.key_frames), *coreset.box.shape)
         counts = {
-            index: sum(int(np.count_nonzero(self._mask(key, box))) for key in keys)
+            index: sum(int(np.count_nonzero(self._mask(step, box))) for step in steps)
             for index in sorted(self._touched(coreset))
-            for keys, box in [self._keys_and_box(index)]
+            for steps, box in [self._steps_and_box(index)]
         }
         self.counts = {index: count for index, count in counts.items() if count}
         self.total = sum(self.counts.values())
@@ -359,13 +360,14 @@ class Samples:
         """
         squares, count = [], 0
         for index in tiles:
-            keys, box = self._keys_and_box(index)
-            for key in keys:
-                in_coreset = self._mask(key, box)
+            steps, box = self._steps_and_box(index)
+            for step in steps:
+                in_coreset = self._mask(step, box)
                 if in_coreset.any():
-                    frame = decode_region(network, key, box, requested=in_coreset)
+                    place = float(self._coreset.key_places[step])
+                    frame = decode_region(network, place, box, requested=in_coreset)
                     decoded = np.clip(frame[in_coreset].astype(np.float64), 0.0, 1.0)
-                    samples = self._bricks.samples(key, box)[in_coreset]
+                    samples = self._bricks.samples(step, box)[in_coreset]
                     squares.append(float(np.square(decoded - samples).sum()))
                     count += len(decoded)
         return fsum(squares), count
@@ -377,17 +379,19 @@ class Samples:
         """
         slopes = []
         for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
-            keys, box = self._keys_and_box(index)
-            points = np.argwhere(np.stack([self._mask(key, box) for key in keys]))
-            points = points[:: -(-len(points) // SLOPE_POINTS)] + np.array(
-                [keys[0], *(low for low, _ in box)]
-            )
-            slopes.append(input_slopes(network, points.T.astype(np.float64)))
+            steps, box = self._steps_and_box(index)
+            points = np.argwhere(np.stack([self._mask(step, box) for step in steps]))
+            points = points[:: -(-len(points) // SLOPE_POINTS)]
+            places = self._coreset.key_places[np.array(steps)[points[:, 0]]]
+            inside = (points[:, 1:] + np.array([low for low, _ in box])).T.astype(np.float64)
+            slopes.append(input_slopes(network, np.concatenate([places[None], inside])))
         return np.concatenate(slopes, axis=1)
 
-    def _mask(self, key: int, box: Box) -> npt.NDArray[np.bool_]:
-        """Return which vertices of a region are in the coreset of a key frame, without fringe."""
-        return self._bricks.mask(key, box) & self._occupied(key)[box.slices()]
+    def _mask(self, step: int, box: Box) -> npt.NDArray[np.bool_]:
+        """Return which vertices of a region are samples of a step, without fringe."""
+        mask = self._bricks.mask(step, box)
+        between = step >= len(self._coreset.key_frames)
+        return mask if between else mask & self._occupied(step)[box.slices()]
 
     def _unpacked(self, key: int) -> npt.NDArray[np.bool_]:
         return unpack(self._coreset.occupancy[key], self._coreset.box.shape)
@@ -396,7 +400,8 @@ class Samples:
         """Return the places of the tiles that some brick of the coreset touches."""
         corners = coreset.bricks[:, 1:].astype(np.int64) * np.array(coreset.brick_shape)
         touched: set[Index] = set()
-        for (key, *_), corner in zip(coreset.bricks.tolist(), corners.tolist(), strict=True):
+        keys = coreset.key_places[coreset.bricks[:, 0]].astype(np.int64)
+        for key, corner in zip(keys.tolist(), corners.tolist(), strict=True):
             ends = [
                 min(low + n, size) - 1
                 for low, n, size in zip(corner, coreset.brick_shape, self.sizes[1:], strict=True)
@@ -408,13 +413,14 @@ class Samples:
             touched.update(product((key // self.tile[0],), z, y, x))
         return touched
 
-    def _keys_and_box(self, index: Index) -> tuple[range, Box]:
-        """Return the key frames and the vertices of the box that a tile covers."""
+    def _steps_and_box(self, index: Index) -> tuple[list[int], Box]:
+        """Return the steps of the samples and the vertices of the box that a tile covers."""
         spans = [
             (i * n, min((i + 1) * n, size))
             for i, n, size in zip(index, self.tile, self.sizes, strict=True)
         ]
-        return range(*spans[0]), Box.of(spans[1:])
+        first, end = np.searchsorted(self._coreset.key_places[self._in_order], spans[0])
+        return np.sort(self._in_order[first:end]).tolist(), Box.of(spans[1:])
 
 
 MIN_WEIGHTS = 512

@@ -82,7 +82,7 @@ def test_regions_are_those_of_the_frame(random_model, key) -> None:
 def samples(random_model) -> Samples:
     selection = random_model.selection
     tile = (2, *tile_shape(selection.architecture.levels[0])[1:3], 8)
-    return Samples(selection.coreset, random_model.bricks, tile)
+    return Samples(selection.coreset, tile)
 
 
 def test_errors_are_those_of_the_clipped_values_at_all_samples(random_model, samples) -> None:

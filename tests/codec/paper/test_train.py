@@ -12,10 +12,12 @@ import pytest
 from pretended_cuda import pretended_cuda
 
 import fhash_codec
+from fhash_codec.boxes import Box
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features import occupancy
-from fhash_codec.features.bricks import Coreset, build_coreset
+from fhash_codec.features.bricks import Coreset, build_coreset, with_steps_between
 from fhash_codec.features.features import Everything, FeatureChoice, Interval
+from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.fit import (
@@ -28,6 +30,7 @@ from fhash_codec.paper.fit import (
     train_model,
 )
 from fhash_codec.paper.network import Architecture
+from fhash_codec.paper.storage import Bricks
 from fhash_codec.paper.train import (
     LOWER,
     MAX_RESTARTS,
@@ -330,3 +333,67 @@ def test_a_series_is_encoded_on_the_device(tmp_path: Path, tables: str) -> None:
     assert figures["device"] == "cuda"
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         assert np.isfinite(volume[:]).any()
+
+
+def between(fringe: bool) -> tuple[np.ndarray, Coreset, Coreset]:
+    """Noise with gaps, 6 steps of uneven times; its coreset at steps 0, 2 and 5, and with all."""
+    noise = np.random.default_rng(2).random((6, 5, 9, 11)).astype(np.float32)
+    noise[3, :, 4] = np.nan
+    series = ArraySeries(noise)
+    scanned = scan(series, silent)
+    choice = FeatureChoice((0, 2, 5), [Interval(0.6, 1.0)])
+    coreset = build_coreset(series, scanned, choice, silent, fringe=fringe)
+    times = KeyTimes(times=np.array([0.0, 1.0, 4.0, 5.0, 6.0, 10.0]), key_frames=(0, 2, 5))
+    return noise, coreset, with_steps_between(coreset, series, scanned.value_range, times, silent)
+
+
+@pytest.mark.parametrize("fringe", [True, False])
+def test_samples_between_key_frames_are_what_a_reader_decodes_there(fringe: bool) -> None:
+    noise, coreset, samples = between(fringe)
+    np.testing.assert_allclose(samples.key_places, [0, 1, 2, 0.25, 1 + 1 / 6, 1 + 2 / 6])
+    assert samples.lattice is coreset
+    feature = noise[[0, 2, 5]] >= 0.6
+    join = np.logical_or if fringe else np.logical_and
+    found = Bricks(samples)
+    for number, (step, key) in enumerate(((1, 0), (3, 1), (4, 1)), 3):
+        box = samples.box
+        inside = Box.of([(0, n) for n in box.shape])
+        expected = join(feature[key], feature[key + 1]) & np.isfinite(noise[step])
+        np.testing.assert_array_equal(found.mask(number, inside), expected[box.slices()])
+        span = np.nanmax(noise) - np.nanmin(noise)
+        unit = (noise[step] - np.nanmin(noise)) / span
+        read = found.samples(number, inside)[expected[box.slices()]]
+        np.testing.assert_allclose(read, unit[expected], atol=1e-6)
+    # Those of the key frames come first, as they were.
+    assert np.array_equal(samples.values[: len(coreset.values)], coreset.values)
+    if fringe:
+        assert samples.fringe is not None
+        assert not samples.fringe[len(coreset.values) :].any()
+
+
+def test_a_series_of_key_frames_alone_has_no_other_samples(coreset: Coreset) -> None:
+    series = ArraySeries(np.zeros((3, 4, 4, 4), np.float32))
+    times = KeyTimes(times=np.arange(3.0), key_frames=coreset.key_frames)
+    value_range = scan(series, silent).value_range
+    assert with_steps_between(coreset, series, value_range, times, silent) is coreset
+
+
+@pytest.mark.parametrize("tables", ["float16", "transform"])
+def test_training_on_all_steps_is_better_between_key_frames(tmp_path: Path, tables: str) -> None:
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (7, 6, 12, 20)), indexing="ij")
+    front = np.tanh(x - 5 - 1.5 * t + np.sin(y / 2) + z / 3).astype(np.float32)
+    found = {}
+    for samples in ("keys", "all"):
+        config = EncodeConfig(
+            profile="paper",
+            key_frames="every:3",
+            samples=samples,
+            tables=tables,
+            features=("interval:-0.9:0.9",),
+            epochs=60,
+        )
+        found[samples] = fhash_codec.encode(front, tmp_path / f"{samples}.fhz", config)
+    keys, all_ = (found[name]["quality"]["between"] for name in ("keys", "all"))
+    assert all_["psnr"] > keys["psnr"] + 3
+    assert all_["psnr"] > all_["psnr_linear"] + 3
+    assert found["all"]["bytes"] < 1.1 * found["keys"]["bytes"]
