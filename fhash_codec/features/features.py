@@ -23,6 +23,7 @@ from fhash_codec.progress import Progress
 from fhash_formats.container.header import EVERYTHING
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Series, step_blocks
+from fhash_formats.support.arrays import Longs
 from fhash_formats.support.values import exact_number, is_wide_integer
 
 Frame = npt.NDArray[Any]
@@ -438,6 +439,12 @@ class Extent:
     def fraction(self) -> float:
         """samples / (key frames * vertices of the domain)."""
         return self.samples / (len(self.key_frames) * prod(self.domain))
+
+    @property
+    def vertices(self) -> Longs:
+        """Vertices of a frame, ascending, that are in the coreset of some key frame."""
+        bits = np.unpackbits(np.bitwise_or.reduce(self.packed), count=prod(self.domain))
+        return np.flatnonzero(bits)
 
     def mask(self, key: int) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of the box that are in the coreset.

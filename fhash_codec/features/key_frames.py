@@ -15,6 +15,7 @@ from fhash_codec.measure.value_range import power_of_two
 from fhash_codec.progress import Progress
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Series
+from fhash_formats.support.arrays import Longs
 from fhash_formats.support.values import integer_origin, is_wide_integer
 from fhash_formats.transform.values import about_origin
 
@@ -152,12 +153,17 @@ class KeyTimes:
 
 
 def select_key_frames(
-    spec: str, series: Series, times: npt.NDArray[np.float64], progress: Progress
+    spec: str,
+    series: Series,
+    times: npt.NDArray[np.float64],
+    progress: Progress,
+    vertices: Longs | None = None,
 ) -> tuple[int, ...]:
     """The steps that the setting `key_frames` names, ascending.
 
     spec: all | every:K (the last step is always included) | auto:N | a list such as 0,4,9.
     times: the model's time axis (T,); for auto:N it must be strictly monotonic.
+    vertices: those of a frame that auto:N looks at, ascending; None for all.
 
     auto:N reads every frame once (progress stage "key frames"). Raises InputError for a spec that
     is malformed or does not fit the series.
@@ -176,7 +182,11 @@ def select_key_frames(
                 f"key-frames is '{spec}' for {steps} steps; allowed: auto:N with N at least 2, "
                 "since both ends are kept"
             )
-        return tuple(range(steps)) if count >= steps else _auto(series, times, count, progress)
+        return (
+            tuple(range(steps))
+            if count >= steps
+            else _auto(series, times, count, progress, vertices)
+        )
     return _listed(spec, steps)
 
 
@@ -201,7 +211,11 @@ def _listed(spec: str, steps: int) -> tuple[int, ...]:
 
 
 def _auto(
-    series: Series, times: npt.NDArray[np.float64], count: int, progress: Progress
+    series: Series,
+    times: npt.NDArray[np.float64],
+    count: int,
+    progress: Progress,
+    vertices: Longs | None,
 ) -> tuple[int, ...]:
     """The `count` steps from which the other frames interpolate best, on a sample of vertices."""
     if not strictly_monotonic(times):
@@ -210,10 +224,17 @@ def _auto(
             "use step numbers in their place"
         )
     steps = series.shape[0]
-    stride = vertex_stride(series.shape[1:], max(1, min(MAX_VERTICES, MAX_SAMPLES // steps)))
+    most = max(1, min(MAX_VERTICES, MAX_SAMPLES // steps))
+    stride = vertex_stride(series.shape[1:], most)
+    if vertices is not None:
+        stride = -(-len(vertices) // most)
+        vertices = vertices[::stride]
     samples: list[npt.NDArray[Any]] = []
     for step, frame in enumerate(series.frames()):
-        samples.append(frame[::stride, ::stride, ::stride].flatten())
+        if vertices is None:
+            samples.append(frame[::stride, ::stride, ::stride].flatten())
+        else:
+            samples.append(frame.reshape(-1)[vertices])
         progress("key frames", step + 1, steps, f"every {stride}. vertex")
     return optimal_steps(segment_costs(gram_matrix(samples), times), count)
 

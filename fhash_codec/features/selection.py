@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import (
+    Everything,
     Extent,
     Feature,
     FeatureChoice,
@@ -599,13 +600,21 @@ def resolve_selection(
     with stage("scan", "range and missing values, by one pass over all steps"):
         scanned = scan(series, progress, ranks) if scanned is None else scanned
     _check_rounding(series, scanned, config)
+
+    def features_at(key_frames: Sequence[int]) -> tuple[Feature, ...]:
+        with stage("features", f"thresholds of {', '.join(config.features)}"):
+            texts, value_range = config.features, scanned.value_range
+            found = resolve_features(texts, series, key_frames, value_range, progress)
+        if mask is None:
+            return found
+        return (_array_mask(mask, series), *(() if texts == ("all",) else found))
+
     with stage("key frames", f"steps to encode: {config.key_frames}"):
-        key_frames = select_key_frames(config.key_frames, series, times, progress)
-    with stage("features", f"thresholds of {', '.join(config.features)}"):
-        features = resolve_features(
-            config.features, series, key_frames, scanned.value_range, progress
-        )
-    if mask is not None:
-        named = () if config.features == ("all",) else features
-        features = (_array_mask(mask, series), *named)
-    return scanned, tuple(key_frames), features
+        vertices = None
+        if config.key_frames.startswith("auto:"):
+            steps = range(series.shape[0])
+            choice = FeatureChoice(steps, features_at(steps), config.dilation)
+            if not any(isinstance(feature, Everything) for feature in choice.features):
+                vertices = find_extent(series, scanned, choice, progress).vertices
+        key_frames = select_key_frames(config.key_frames, series, times, progress, vertices)
+    return scanned, tuple(key_frames), features_at(key_frames)

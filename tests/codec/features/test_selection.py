@@ -40,6 +40,7 @@ from fhash_codec.features.selection import (
     array_series,
     labelled_series,
     open_source,
+    resolve_selection,
     select_features,
 )
 from fhash_codec.measure.value_range import ValueRange
@@ -555,3 +556,18 @@ def test_malformed_features_in_time_are_refused(text) -> None:
         parse_feature(text)
     with pytest.raises(InputError, match="looks at other steps"):
         parse_feature("onset:1").select(np.zeros((1, 1, 1)), 0)
+
+
+def test_auto_looks_at_the_vertices_of_the_feature_alone() -> None:
+    """Outside the feature the steps jump at 2; within it at 5."""
+    values = np.zeros((9, 6, 8, 10), np.float32)
+    values[2:] += 0.5 * np.random.default_rng(0).random((6, 8, 10)).astype(np.float32)
+    values[:, 2:4, 2:4, 2:4] = 2.0
+    values[5:, 2:4, 2:4, 2:4] = 3.0
+    series = ArraySeries(values)
+    keys = {}
+    for features in (("all",), ("interval:1:9",)):
+        config = EncodeConfig(profile="paper", key_frames="auto:4", features=features)
+        keys[features] = resolve_selection(series, config, silent, None)[1]
+    assert {1, 2} < set(keys["all",])
+    assert {4, 5} < set(keys["interval:1:9",])
