@@ -13,14 +13,14 @@ from typing import Any, cast
 from fhash_codec.records import Record, limits
 from fhash_formats.errors import InputError, suggestion
 
-TABLES = ("float32", "float16", "uint8", "sparse", "dense", "transform")
+TABLES = ("auto", "float32", "float16", "uint8", "sparse", "dense", "transform")
 """Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
 
 ENGINES = ("fused", "native", "slab")
 """Training engines of the paper profile, the fastest first; `fused` is for CUDA alone."""
 
-FRINGES = ("trained", "untrained")
-"""Treatments of vertices in the coreset of one neighbouring key frame only, in profile paper."""
+SAMPLES = ("all", "keys", "published")
+"""Samples that the profile paper trains on."""
 
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
@@ -69,29 +69,23 @@ class EncodeConfig(Record):
     samples: str = limits(
         "all",
         "paper: train on 'all' steps from the first key frame to the last, each at its place in "
-        "time, or on the 'keys' alone, as published",
-        choices=("all", "keys"),
-        profile="paper",
-    )
-    fringe: str = limits(
-        "trained",
-        "paper: a vertex in the coreset of one of two neighbouring key frames only is 'trained' at "
-        "both, so that values between them are right, or 'untrained' at one, as published",
-        choices=FRINGES,
+        "time, or on the 'keys' alone; with either, on the vertices that only a neighbouring key "
+        "frame selects, too, or without them on the keys, as 'published'",
+        choices=SAMPLES,
         profile="paper",
     )
     fold: int = limits(
         0,
         "paper: ratio of resolution from one level to the next, 2 to 64; 0 for 2, the published "
-        "one, or 8 with --tables transform, where more levels cost bytes",
+        "one, or 8 where tables are coded, of which more levels cost bytes",
         low=0,
         high=64,
         profile="paper",
     )
     embedding_size: int = limits(
         0,
-        "paper: numbers trained at each grid corner; 0 for 2, the published size, or 1 with "
-        "--tables transform",
+        "paper: numbers trained at each grid corner; 0 for 2, the published size, or 1 where "
+        "tables are coded",
         low=0,
         high=16,
         profile="paper",
@@ -101,8 +95,8 @@ class EncodeConfig(Record):
     )
     width: int = limits(
         0,
-        "paper: neurons of each hidden layer; 0 for 64, the published width, or 16 with "
-        "--tables transform",
+        "paper: neurons of each hidden layer; 0 for 64, the published width, or 16 where "
+        "tables are coded",
         low=0,
         high=1024,
         profile="paper",
@@ -116,8 +110,8 @@ class EncodeConfig(Record):
     )
     train_on_seconds: int = limits(
         3600,
-        "paper: time that training may take beyond its epochs where --tables transform "
-        "would miss --psnr",
+        "paper: time that training may take beyond its epochs where coded tables would miss "
+        "--psnr or --psnr-bulk",
         low=0,
         high=10**9,
         profile="paper",
@@ -207,10 +201,11 @@ class EncodeConfig(Record):
         "(trials of compact, for fewer bytes) and ssim; repeat, or join by commas",
     )
     tables: str = limits(
-        "float16",
+        "auto",
         "paper: number type of the stored tables, which have only the vertices that the coreset "
         "needs where it is below half of its box; 'sparse' (always so) and 'dense' (never) are "
-        "float16; 'transform' codes them as compact does, for at most 0.1 dB or down to --psnr",
+        "float16; 'transform' codes them as compact does, for at most 0.1 dB or down to --psnr or "
+        "--psnr-bulk; 'auto' does that where one of these is given, and is float16 elsewhere",
         choices=TABLES,
         profile="paper",
     )
@@ -255,13 +250,19 @@ class EncodeConfig(Record):
         return name.replace("_", "-")
 
     @property
+    def coded(self) -> bool:
+        """Whether the profile paper's tables are coded: `tables`, or what its auto stands for."""
+        promised = self.psnr is not None or self.psnr_bulk is not None
+        return self.tables == "transform" or (self.tables == "auto" and promised)
+
+    @property
     def model_fold(self) -> int:
         """The ratio of resolution of the profile paper's levels: `fold`, or what its 0 stands for.
 
         Coded tables of more levels take more bytes at the same PSNR: the finest table describes the
         values alone, and the coarser ones repeat what it could say.
         """
-        return self.fold or (8 if self.tables == "transform" else 2)
+        return self.fold or (8 if self.coded else 2)
 
     @property
     def model_embedding_size(self) -> int:
@@ -269,7 +270,7 @@ class EncodeConfig(Record):
 
         Of several numbers, coded tables use one: the coding turns the others into a constant.
         """
-        return self.embedding_size or (1 if self.tables == "transform" else 2)
+        return self.embedding_size or (1 if self.coded else 2)
 
     @property
     def model_width(self) -> int:
@@ -278,7 +279,7 @@ class EncodeConfig(Record):
         A function of a few numbers needs few. Beside coded tables, 64 would take up to a quarter of
         the file.
         """
-        return self.width or (16 if self.tables == "transform" else 64)
+        return self.width or (16 if self.coded else 64)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, `deterministic` where it is on; `from_dict` takes them."""

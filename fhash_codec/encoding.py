@@ -168,8 +168,9 @@ def encode_variable(
     if config.profile == "compact":
         header = encode_compact(writer, series, config, mask, progress, measured.complete)
     else:
-        header, checkpoint, advice = encode_paper(writer, series, config, mask, path, progress)
-        header = measured.complete(header)
+        header, checkpoint, advice = encode_paper(
+            writer, series, config, mask, path, progress, measured.complete
+        )
     figures = measured.figures(header)
     return EncodedVariable(
         header=header,

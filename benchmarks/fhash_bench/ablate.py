@@ -91,11 +91,11 @@ AXES = (
         why="vertices by which the feature grows",
     ),
     Axis(
-        name="fringe",
+        name="samples",
         profile="paper",
-        varied=_one("fringe", "trained", "untrained"),
+        varied=_one("samples", "all", "keys", "published"),
         common=(("key_frames", "every:4"),),
-        why="vertices that one of two neighbouring key frames alone selects, with every 4th step",
+        why="steps between key frames, and vertices of one neighbour alone, with every 4th step",
     ),
     Axis(
         name="brick",

@@ -280,20 +280,21 @@ def data_bench_ablate(tmp_path: Path) -> Path:
 def test_a_table_has_a_row_for_each_variation(
     fhash: Fhash, data_bench_ablate: Path, tmp_path: Path
 ) -> None:
-    arguments = ("bench", "ablate", data_bench_ablate, "--axis", "fringe", "--epochs", "1", "-q")
+    arguments = ("bench", "ablate", data_bench_ablate, "--axis", "samples", "--epochs", "1", "-q")
     result = fhash(*arguments, "-o", tmp_path / "runs", "--plot", tmp_path / "p.png")
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
-    assert lines[0].startswith("fringe: ")
-    assert [line.split()[1] for line in lines[2:4]] == ["trained", "untrained"]
-    assert "--fringe trained *" in lines[2]
+    assert lines[0].startswith("samples: ")
+    assert [line.split()[1] for line in lines[2:5]] == ["all", "keys", "published"]
+    assert "--samples all *" in lines[2]
     assert (tmp_path / "p.png").stat().st_size > 1000
     kept = list((tmp_path / "runs").iterdir())
-    assert len(kept) == 2
+    assert len(kept) == 3
     again = fhash(*arguments, "-o", tmp_path / "runs", "--json")
-    assert [row["settings"]["fringe"] for row in json.loads(again.stdout)["rows"]] == [
-        "trained",
-        "untrained",
+    assert [row["settings"]["samples"] for row in json.loads(again.stdout)["rows"]] == [
+        "all",
+        "keys",
+        "published",
     ]
 
 
@@ -306,7 +307,7 @@ def test_unsuitable_options_are_refused(
     assert "--var is for DATA" in refused(2, "bench", "ablate", "--var", "a")
     missing = tmp_path / "no" / "where"
     assert "give a folder that exists" in refused(
-        2, "bench", "ablate", data_bench_ablate, "--axis", "fringe", "-o", missing
+        2, "bench", "ablate", data_bench_ablate, "--axis", "samples", "-o", missing
     )
 
 

@@ -54,7 +54,7 @@ def test_bench_table(fhash: Fhash, data: Path, tmp_path: Path) -> None:
 
 
 def test_bench_ablate(fhash: Fhash, data: Path) -> None:
-    words = ["bench", "ablate", data, "--axis", "fringe", "--epochs", "1"]
+    words = ["bench", "ablate", data, "--axis", "samples", "--epochs", "1"]
     check("bench ablate", parsed(fhash(*words, "--json", "-q")))
 
 

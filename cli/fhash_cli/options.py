@@ -198,7 +198,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Values": ("outside", "fill"),
     "Profile compact": ("profile", "effort", "tile", "access", "without"),
     "Profile paper": (
-        "key-frames", "fringe", "fold", "embedding-size", "hidden-layers", "width", "epochs",
+        "key-frames", "samples", "fold", "embedding-size", "hidden-layers", "width", "epochs",
         "train-on-seconds", "learning-rate", "schedule", "batch", "brick", "tables", "engine",
         "engines",
     ),

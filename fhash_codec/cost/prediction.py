@@ -478,10 +478,10 @@ class Predictor:
             self._trainings[key] = probe_paper(part, share, key)
         probe = self._trainings[key]
         stages = probe.stage_seconds(config)
-        more = config.psnr is not None and config.tables == "transform"
+        more = config.psnr is not None and config.coded
         return Prediction(
             seconds=sum(stages.values()),
-            bytes=None if config.tables == "transform" else probe.bytes,
+            bytes=None if config.coded else probe.bytes,
             psnr=None,
             basis=f"two epochs on {_steps(part, self._series)}, in {now() - begun:.1f} s"
             + ("; further rounds for --psnr are not counted" if more else "")

@@ -214,16 +214,15 @@ def with_steps_between(
 ) -> Coreset:
     """Return a coreset with samples of the steps between its key frames, too.
 
-    Such a sample is a vertex with a finite value that both key frames around the step have
-    embeddings of: one that is in the coreset of either, or of both where there is no fringe.
+    Such a sample is a vertex with a finite value that is in the coreset of a key frame around the
+    step. Both must have embeddings of it: the coreset has its fringe.
     """
     keys, box = coreset.key_frames, coreset.box
     steps = [step for step in range(keys[0], keys[-1] + 1) if step not in set(keys)]
     if not steps:
         return coreset
     masks = [occupancy.unpack(grid, box.shape) for grid in coreset.occupancy]
-    join = np.logical_and if coreset.fringe is None else np.logical_or
-    between = [join(mask, after) for mask, after in itertools.pairwise(masks)]
+    between = [mask | after for mask, after in itertools.pairwise(masks)]
     places = times.key_indices(steps)
     most = sum(int(between[int(place)].sum()) for place in places)
     samples = _Samples(most, coreset.brick_shape, coreset.brick_grid)
@@ -233,16 +232,14 @@ def with_steps_between(
         samples.add(len(keys) + number, frame, mask, value_range)
         progress("gathering", number + 1, len(steps), "between key frames")
     more = samples.arrays()
-    fringe = coreset.fringe
-    if fringe is not None:
-        fringe = np.concatenate([fringe, np.zeros(len(more.values), np.bool_)])
+    assert coreset.fringe is not None
     return replace(
         coreset,
         bricks=np.concatenate([coreset.bricks, more.bricks]),
         mask_bits=np.concatenate([coreset.mask_bits, more.mask_bits]),
         values=np.concatenate([coreset.values, more.values]),
         offsets=np.concatenate([coreset.offsets, coreset.offsets[-1] + more.offsets[1:]]),
-        fringe=fringe,
+        fringe=np.concatenate([coreset.fringe, np.zeros(len(more.values), np.bool_)]),
         key_places=np.concatenate([coreset.key_places, places]),
         lattice=coreset,
     )

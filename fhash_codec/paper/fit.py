@@ -187,6 +187,7 @@ class TrainedModel:
         restarts: restarts at a lower learning rate.
         learning_rate: learning rate of the last start.
         limited: whether the limit in time ended the training before its goal.
+        psnr: PSNR in dB over the samples; None where it was not measured, or without an error.
     """
 
     fine: npt.NDArray[np.float32]
@@ -201,6 +202,7 @@ class TrainedModel:
     restarts: int
     learning_rate: float
     limited: bool
+    psnr: float | None
 
 
 def train_model(
@@ -258,6 +260,7 @@ class _Fitting:
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress, self._goal = progress, goal
         self._limited, self._threads = False, 1
+        self._psnr: float | None = None
         self._device = self._choose_device()
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -314,7 +317,7 @@ class _Fitting:
         """
         if self._goal is None:
             return None
-        psnr = Probe(self._coreset).psnr(engine)
+        psnr = self._psnr = Probe(self._coreset).psnr(engine)
         reached = self._reached
         decision = decide(
             self._goal,
@@ -426,4 +429,5 @@ class _Fitting:
             restarts=self._reached.restarts,
             learning_rate=self._reached.rate(self._config.learning_rate),
             limited=self._limited,
+            psnr=self._psnr,
         )

@@ -347,7 +347,7 @@ def measured(run: Run, name: str, feature: str, width: int, layers: int) -> Resu
 
     from fhash_codec.devices import threads_for
     from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.engines.slab import needed_bytes
+    from fhash_codec.paper.engines.parameters import needed_bytes
     from fhash_codec.paper.train import plan_training
 
     coreset = made_coreset(run.data, feature)

@@ -245,7 +245,8 @@ def measure_between(encoding: TrainedEncoding, places: list[Places]) -> dict[str
     }  # fmt: skip
     for step in places:
         decoded = encoding.sample(step.key, torch.from_numpy(step.vertices)).cpu().numpy()
-        error = decoded.astype(np.float64) - step.truth
+        # As a reader does.
+        error = np.clip(decoded.astype(np.float64), 0.0, 1.0) - step.truth
         errors["psnr"].append(error)
         if not step.between:
             errors["psnr_key_frames"].append(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -563,6 +564,15 @@ def test_needed_are_the_corners_around_samples(box, keys, fold, fringe) -> None:
             ]
             for corner in product(*around):
                 expected[corner] = True
+        if fringe:
+            # Samples of the steps between need no more.
+            for key, *place in np.argwhere(masks[1:] | masks[:-1]).tolist():
+                for share in (0.3, 0.5, 0.8):
+                    around = [
+                        {int(p * (r - 1) / max(n - 1, 1)), math.ceil(p * (r - 1) / max(n - 1, 1))}
+                        for p, r, n in zip((key + share, *place), level, sizes, strict=True)
+                    ]
+                    assert all(expected[corner] for corner in product(*around))
         found = np.stack([needed.mask(number, node) for node in range(level[0])])
         np.testing.assert_array_equal(found, expected)
         assert needed.counts(number) == expected.sum(axis=(1, 2, 3)).tolist()

@@ -61,9 +61,9 @@ CASES = {
         (5, 30, 20, 50),
         {"hidden_layers": 2, "keys": (1, 4), "low": 0.9995, "fringe": True, "embedding_size": 3},
     ),
-    "between key frames, no fringe, one level": (
+    "between key frames, one level": (
         (5, 9, 9, 20),
-        {"hidden_layers": 1, "keys": (0, 2, 4), "levels": 1},
+        {"hidden_layers": 1, "keys": (0, 2, 4), "levels": 1, "fringe": True},
     ),
 }
 
