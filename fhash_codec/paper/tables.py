@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from math import fsum, prod
@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import Box
 from fhash_codec.compact.attempt import even_tile
-from fhash_codec.compact.sample import spread_order
+from fhash_codec.compact.sample import fill, spread_order
+from fhash_codec.compact.tiles import Tile
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import unpack
@@ -141,7 +142,11 @@ CACHE_BYTES = 64 << 20
 BATCH = 8
 """Tiles that are worked on at a time."""
 ROUNDS = 2
-"""Projections by which the coder fills vertices that are not needed."""
+"""Projections by which the coder fills vertices that are not needed once more."""
+DENSITY = 8
+"""Thoroughness of their filling; see `compact.sample.fill`."""
+FILLINGS_BYTES = 512 << 20
+"""Bytes of the filled tiles of one table that are kept from one step to the next, at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,12 +159,15 @@ class LevelCoding:
             (`storage.mix_components`).
         unmixing: float64 (E, E); components = unmixing @ embedding.
         settings: settings of each component. Their quantiser steps are all the same.
+        fillings: components of tiles whose vertices are not all needed, filled at the first step
+            that is tried; all steps share them.
     """
 
     tile: Shape
     mixing: Single
     unmixing: npt.NDArray[np.float64]
     settings: tuple[TileSettings, ...]
+    fillings: dict[Index, list[Tile]] = field(default_factory=dict)
 
     def with_step(self, quantiser_step: float) -> LevelCoding:
         """Return the same coding with another quantiser step."""
@@ -238,13 +246,31 @@ class TiledTable:
         """Start the work on a tile; its result is the stream of each component, and the tile."""
         if index in self._streams:
             return self._workers.submit(self._decode, self._streams[index])
-        region = tile_region(index, self.coding.tile, self.shape)
-        return self._workers.submit(self._code, *components_of(self.table, self.coding, region))
+        tiles = self.coding.fillings.get(index)
+        if tiles is None:
+            region = tile_region(index, self.coding.tile, self.shape)
+            components, needed = components_of(self.table, self.coding, region)
+            counted = None if needed.all() else needed
+            tiles = [Tile(component, counted) for component in components]
+            if counted is not None:
+                return self._workers.submit(self._fill_and_code, index, tiles)
+        return self._workers.submit(self._code, tiles)
 
-    def _code(self, components: list[Single], needed: Mask) -> tuple[list[bytes], Single]:
+    def _fill_and_code(self, index: Index, tiles: list[Tile]) -> tuple[list[bytes], Single]:
+        """Fill a tile, for this step and, where there is memory, for those that are still tried."""
+        tiles = [
+            fill(tile, settings, DENSITY)
+            for tile, settings in zip(tiles, self.coding.settings, strict=True)
+        ]
+        own = sum(tile.values.nbytes for tile in tiles)
+        if own * (len(self.coding.fillings) + 1) <= FILLINGS_BYTES:
+            self.coding.fillings[index] = tiles
+        return self._code(tiles)
+
+    def _code(self, tiles: list[Tile]) -> tuple[list[bytes], Single]:
         coded = [
-            code_tile(component, needed, settings)
-            for component, settings in zip(components, self.coding.settings, strict=True)
+            code_tile(tile, settings)
+            for tile, settings in zip(tiles, self.coding.settings, strict=True)
         ]
         return [data for data, _ in coded], mix_components(
             [decoded for _, decoded in coded], self.coding.mixing
@@ -295,17 +321,11 @@ def components_of(
     return components, np.pad(needed, padding)
 
 
-def code_tile(
-    component: Single, needed: Mask, settings: TileSettings
-) -> tuple[bytes, npt.NDArray[Any]]:
-    """Return the stream of one component of a tile, and the values that it decodes to."""
-    complete = bool(needed.all())
-    coded = encode_tile(
-        component,
-        settings,
-        Coding(weight=WEIGHT, rounds=0 if complete else ROUNDS),
-        in_coreset=None if complete else needed,
-    )
+def code_tile(tile: Tile, settings: TileSettings) -> tuple[bytes, npt.NDArray[Any]]:
+    """Return the stream of one component of a filled tile, and the values that it decodes to."""
+    rounds = 0 if tile.counted is None else ROUNDS
+    coding = Coding(weight=WEIGHT, rounds=rounds, filled=True)
+    coded = encode_tile(tile.values, settings, coding, in_coreset=tile.counted)
     return coded.data, coded.decoded
 
 
