@@ -16,6 +16,11 @@ from fhash_formats.errors import InputError, suggestion
 TABLES = ("auto", "float32", "float16", "uint8", "sparse", "dense", "transform")
 """Storage of the paper profile's tables: a number type, float16 of some vertices, or the codec."""
 
+NAMED_PROFILES = {"lattice": "compact", "network": "paper"}
+"""Profiles by the names of what they fit."""
+MODELS = {"compact": "lattice", "paper": "network (F-Hash)"}
+"""Names of what the profiles fit, for people."""
+
 ENGINES = ("fused", "native", "slab")
 """Training engines of the paper profile, the fastest first; `fused` is for CUDA alone."""
 
@@ -49,9 +54,9 @@ class EncodeConfig(Record):
 
     profile: str = limits(
         "compact",
-        "'compact' is the smallest file at a promised quality; "
-        "'paper' is the published F-Hash, trained from a random start",
-        choices=("compact", "paper"),
+        "'lattice' or 'compact' is the smallest file at a promised quality; "
+        "'network' or 'paper' is the published F-Hash, trained from a random start",
+        choices=("compact", "paper", *NAMED_PROFILES),
     )
     features: tuple[str, ...] = limits(
         ("all",),
@@ -300,6 +305,8 @@ class EncodeConfig(Record):
             raise InputError(
                 f"without names '{unknown[0]}'; {suggestion(unknown[0], OPTIONAL_STAGES)}"
             )
+        profile = NAMED_PROFILES.get(self.profile, self.profile)
+        object.__setattr__(self, "profile", profile)
         # One order, so that the same stages give the same bytes however they are named.
         in_order = tuple(name for name in OPTIONAL_STAGES if name in names)
         object.__setattr__(self, "without", in_order)

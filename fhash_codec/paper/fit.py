@@ -56,6 +56,8 @@ MAX_DOUBLINGS = 10
 """Largest number of further rounds, by the gain of the last ones, that are worth one more."""
 MIN_STEPS = 8000
 """Training steps before which a small gain says nothing: many trainings pause at their start."""
+LEARNED = 3.0
+"""Gain in dB since the first epoch after which such a pause is over."""
 WATCHED_ROUNDS = 2
 """Rounds whose gain counts: a training may pause for one and then learn again."""
 
@@ -106,7 +108,13 @@ class Decision:
 
 
 def decide(
-    goal: Goal, psnr: float, epochs: int, steps: int, seconds: float, rounds: Sequence[Round]
+    goal: Goal,
+    psnr: float,
+    epochs: int,
+    steps: int,
+    seconds: float,
+    rounds: Sequence[Round],
+    first: float = math.inf,
 ) -> Decision:
     """Decide whether a training goes on.
 
@@ -117,6 +125,7 @@ def decide(
         steps: training steps so far.
         seconds: seconds of training so far.
         rounds: the further rounds so far.
+        first: PSNR in dB after the first epoch, infinite where it is not known.
     """
     if psnr >= goal.psnr:
         return Decision(round=None, message="")
@@ -125,7 +134,8 @@ def decide(
     short = (
         "" if psnr < goal.promised else f", which costs bytes: {goal.psnr:g} dB would leave room"
     )
-    if len(rounds) >= WATCHED_ROUNDS and steps >= MIN_STEPS:
+    awake = psnr > first + LEARNED or steps >= MIN_STEPS
+    if len(rounds) >= WATCHED_ROUNDS and awake:
         gain = psnr - rounds[-WATCHED_ROUNDS].psnr
         if gain * MAX_DOUBLINGS < WATCHED_ROUNDS * (goal.psnr - psnr):
             return Decision(
@@ -224,8 +234,8 @@ def train_model(
         config: the settings.
         path: the output file.
         progress: called after each batch.
-        goal: quality for which the training goes on beyond its epochs, each time with a
-            FhashWarning; None to end it after them.
+        goal: quality for which the training goes on beyond its epochs; a FhashWarning says why it
+            ends without. None to end it after its epochs.
 
     Raises:
         TrainingError: no learning rate gives a model.
@@ -313,7 +323,7 @@ class _Fitting:
     def _next_round(self, engine: Engine, plan: TrainingPlan) -> TrainingPlan | None:
         """Return the plan with a further round; None where the training ends.
 
-        The whole coreset is measured, once for each round. What follows is told in a warning.
+        The whole coreset is measured, once for each round.
         """
         if self._goal is None:
             return None
@@ -326,12 +336,14 @@ class _Fitting:
             reached.epoch * plan.batches,
             reached.seconds,
             [Round(**earlier) for earlier in reached.rounds],  # type: ignore[arg-type]
+            next((point["psnr"] for point in reached.history if point["psnr"]), math.inf),
         )
-        if decision.message:
-            warnings.warn(decision.message, FhashWarning, stacklevel=4)
         if decision.round is None:
+            if decision.message:
+                warnings.warn(decision.message, FhashWarning, stacklevel=4)
             self._limited = decision.limited
             return None
+        tell("training", decision.message)
         reached.rounds.append(asdict(decision.round))
         return extended(plan, decision.round.epochs, self._config.schedule)
 

@@ -361,6 +361,8 @@ def report_rows(
     part: whether options chose a part of the source.
     verbose: whether the table has the size after each stage of the search.
     """
+    from fhash_codec.config import MODELS
+
     paper = report["profile"] == "paper"
     model = (
         f"{report['parameters']:,} parameters, {report['epochs']} epochs"
@@ -379,7 +381,7 @@ def report_rows(
             f" in {spans(report['feature_bounding_box'])}",
         ),
         *quality_rows(report, units),
-        ("model", f"{model}, {report['profile']}"),
+        ("model", f"{MODELS[report['profile']]}, {model}, profile {report['profile']}"),
         *loss_rows(report),
         ("time", f"{duration(report['seconds'])} on {report['device']}"),
     ]

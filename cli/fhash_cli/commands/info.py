@@ -346,6 +346,8 @@ def _is_run(path: str) -> bool:
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
+    from fhash_codec.config import MODELS
+
     dtype = info["variable"]["dtype"]
     return [
         (
@@ -378,6 +380,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             "key frames",
             f"{len(info['key_frames'])}: {listed([str(step) for step in info['key_frames']])}",
         ),
+        ("model", f"{MODELS[volume.profile]}, profile {volume.profile}"),
         *(_compact(volume, info) if volume.profile == "compact" else loss_rows(info["model"])),
         ("training", _training(info)),
         *_predicted(info),

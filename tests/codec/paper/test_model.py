@@ -242,7 +242,6 @@ class Reached(Exception):
     """Raised instead of coding the tables."""
 
 
-@pytest.mark.filterwarnings("ignore:training goes on")
 @pytest.mark.parametrize("key_frames", ["all", "0,2"])
 def test_coded_tables_get_the_promise(tmp_path, monkeypatch, key_frames) -> None:
     given = []

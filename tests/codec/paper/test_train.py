@@ -21,6 +21,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.scan import scan
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.fit import (
+    LEARNED,
     MAX_DOUBLINGS,
     MIN_STEPS,
     Goal,
@@ -282,6 +283,10 @@ def test_a_training_that_hardly_learns_in_two_rounds_ends(gain, goes_on) -> None
     assert decide(GOAL, psnr, 80, MIN_STEPS - 1, 4.0, [first, last]).round is not None
     decision = decide(GOAL, psnr, 80, MIN_STEPS, 4.0, [first, last])
     assert (decision.round is not None) == goes_on
+    # Earlier, where the training has come far since its first epoch.
+    assert decide(GOAL, psnr, 80, 1, 4.0, [first, last], psnr - LEARNED).round is not None
+    early = decide(GOAL, psnr, 80, 1, 4.0, [first, last], psnr - LEARNED - 0.1)
+    assert (early.round is not None) == goes_on
     if not goes_on:
         assert f"the last 2 rounds brought {gain:.2f} dB" in decision.message
 
@@ -306,8 +311,7 @@ def test_a_training_goes_on_to_its_goal(coreset, tmp_path) -> None:
     psnr = first.history[-1]["psnr"]
     assert psnr is not None
     goal = Goal(psnr=psnr + 2.0, promised=psnr + 1.5, seconds=1e6)
-    with pytest.warns(FhashWarning, match="training goes on"):
-        trained = train_model(coreset, architecture, config, tmp_path / "a.fhz", goal=goal)
+    trained = train_model(coreset, architecture, config, tmp_path / "a.fhz", goal=goal)
     reached = trained.history[-1]["psnr"]
     assert reached is not None
     assert reached > goal.psnr - 0.01
