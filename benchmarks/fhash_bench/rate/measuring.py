@@ -29,7 +29,7 @@ from fhash_bench.rate.peers import (
     there_and_back,
 )
 from fhash_codec.boxes import Box
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import MODELS, EncodeConfig
 from fhash_codec.cost.peers import EXACT, UNIFORM, Search, Trial, Variant, filled, trial_of
 from fhash_codec.measure.errors import Errors
 from fhash_codec.progress import Progress
@@ -195,7 +195,7 @@ class RateBench:
         return {**asdict(self), "best_peers": self.best_peers()}
 
 
-PROFILES: tuple[str, ...] = EncodeConfig.__dataclass_fields__["profile"].metadata["choices"]
+PROFILES = tuple(MODELS)
 """Every profile there is."""
 
 

@@ -65,6 +65,7 @@ def test_promises_of_the_compact_profile_are_kept(
         assert volume.chunks == ((2, 4, 4, 4) if "--tile" in words else volume.chunks)
 
 
+@pytest.mark.filterwarnings("ignore:training ends")
 @pytest.mark.parametrize("as_json", [False, True])
 def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
     fhash: Fhash, data: Path, tmp_path: Path, as_json: bool
