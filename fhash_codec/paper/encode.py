@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import inf, log10, prod
+from math import inf, isinf, log10, prod
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,7 @@ def encode_paper(
         header = _written(writer, series, selection, trained, config, aim, progress) | described
         header = complete(header)
         missing = _missing_psnr(config, header["quality"])
-        if aim is None or (missing <= 0 and (writing > 0 or missing > -EXCESS)):
+        if aim is None or isinf(missing) or (missing <= 0 and (writing or missing > -EXCESS)):
             break
         if missing > 0 and trained.psnr is not None and trained.psnr < aim + missing:
             break  # no coding of this model keeps it

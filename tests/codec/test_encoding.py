@@ -264,6 +264,7 @@ def test_an_output_that_is_there_is_kept(field, tmp_path, config) -> None:
     assert decoded(path).shape == field().shape
 
 
+@pytest.mark.filterwarnings("ignore:training ends")
 def test_a_missed_promise_replaces_nothing(field, tmp_path) -> None:
     path, config = tmp_path / "run.fhz", EncodeConfig(profile="paper", epochs=1, width=4, psnr=150)
     path.write_bytes(b"precious")
@@ -331,6 +332,7 @@ def test_64_bit_integers_are_compared_exactly(tmp_path, config) -> None:
     assert figures["rmse"] == pytest.approx((sum(e * e for e in exact) / len(exact)) ** 0.5)
 
 
+@pytest.mark.filterwarnings("ignore:training ends")
 def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path) -> None:
     source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
     with pytest.raises(QualityError, match="an unknown PSNR"):
