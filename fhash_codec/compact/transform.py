@@ -250,23 +250,16 @@ def choose_transform(
     settings: TileSettings,
     coding: Coding,
     *,
-    quick: bool = False,
     coded: bool = True,
 ) -> tuple[TileSettings, float]:
     """Return settings with the transform of the lowest J on the sample, and that J.
 
     Of a priced sample, the best trials are coded at last.
 
-    quick: tries only the kinds of the settings, the usual ones, and the data's own bases in the
-        plane and along z.
     coded: whether the best ones by price are coded.
     """
     shape: Shape = sample.tiles[0].values.shape
     bases = _bases(sample, settings)
-    if quick:
-        trials = _quick_trials(shape, settings.transform.axes, bases)
-        lowest, axes = _cheapest(sample, settings, trials, coding)
-        return _along(settings, axes), lowest
     axes = settings.transform.axes
     lowest = math.inf
     groups = (
@@ -457,16 +450,6 @@ def _changed(axes: Axes, change: dict[int, AxisTransform]) -> Axes:
     """Return transforms with some replaced, by the number of the axis."""
     t, z, y, x = (change.get(number, axis) for number, axis in enumerate(axes))
     return t, z, y, x
-
-
-def _quick_trials(shape: Shape, axes: Axes, bases: Bases) -> list[Axes]:
-    """Return the usual transform, the kinds of `axes`, and bases where they are possible."""
-    usual = usual_transform(shape).axes
-    t, z, y, x = (_fitted(axis, length) for axis, length in zip(axes, shape, strict=True))
-    trials = [usual, (t, z, y, x)]
-    if bases.possible(*shape[1:]):
-        trials.append((usual[0], bases.along(1), bases.along(2), bases.along(3)))
-    return trials
 
 
 def _fitted(axis: AxisTransform, length: int) -> AxisTransform:

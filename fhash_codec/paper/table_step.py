@@ -62,8 +62,6 @@ def choose_codings(
     slopes: Single,
     quantiser_step: float,
     workers: ThreadPoolExecutor,
-    *,
-    quick: bool = False,
 ) -> list[LevelCoding]:
     """Choose the coding of each level.
 
@@ -74,7 +72,6 @@ def choose_codings(
         slopes: derivatives (inputs, n) of the value by the network's inputs at some samples.
         quantiser_step: about the step of the coding.
         workers: threads for trials.
-        quick: tries few transforms.
     """
     size = architecture.embedding_size
     importances: list[Matrix] = []
@@ -93,9 +90,7 @@ def choose_codings(
         )
     floor = MIN_LEVEL_IMPORTANCE * max(float(np.trace(matrix)) for matrix in importances) or 1.0
     return [
-        _with_best_transforms(
-            table, _coding(table, importance, floor, quantiser_step), workers, quick=quick
-        )
+        _with_best_transforms(table, _coding(table, importance, floor, quantiser_step), workers)
         for table, importance in zip(tables, importances, strict=True)
     ]
 
@@ -187,7 +182,7 @@ def _component_range(
 
 
 def _with_best_transforms(
-    table: TrainedTable, coding: LevelCoding, workers: ThreadPoolExecutor, *, quick: bool
+    table: TrainedTable, coding: LevelCoding, workers: ThreadPoolExecutor
 ) -> LevelCoding:
     """Return the coding with the transform of each component that codes the fullest tile best.
 
@@ -200,7 +195,7 @@ def _with_best_transforms(
             continue
         trials = _Trials(table, coding, component, workers)
         how = Coding(weight=WEIGHT, rounds=0 if trials.allows_bases else ROUNDS)
-        chosen.append(choose_transform(trials, settings, how, quick=quick)[0])
+        chosen.append(choose_transform(trials, settings, how)[0])
     return replace(coding, settings=tuple(chosen))
 
 
@@ -358,6 +353,10 @@ PROMISE_WIDTH = 0.05
 """dB above a promised PSNR within which no smaller file is looked for."""
 LOSS_WIDTH = 0.01
 """dB below MAX_LOSS within which no smaller file is looked for."""
+GUESS = 1.8
+"""Multiple of the step by its formula: most tables' numbers are near 0, and cost less error."""
+SAME_CODINGS = math.log(1.5)
+"""Difference of log steps up to which the codings that were chosen for one are good for another."""
 ROUGH_WIDTH = 1.0
 """Width in dB of the window for the step at which the codings are chosen."""
 SAMPLE_WIDTH = 0.1
@@ -433,10 +432,11 @@ class _Coding:
 
     def run(self) -> CodedTables:
         """Search for the step on some of the samples, then on all."""
-        step = self._guess()
-        self._choose_codings(step, quick=True)
-        step = self._search(step, self._some, ROUGH_WIDTH).step
-        self._choose_codings(step)
+        guess = self._guess()
+        self._choose_codings(guess)
+        step = self._search(guess, self._some, ROUGH_WIDTH).step
+        if abs(math.log(step / guess)) > SAME_CODINGS:
+            self._choose_codings(step)
         if len(self._some) < len(self._all):
             step = self._search(step, self._some, SAMPLE_WIDTH).step
         coded = self._search(step, self._all, self._width)
@@ -460,17 +460,17 @@ class _Coding:
         self._layers, self._layer_settings = quantised_layers(self._layers, error, before + added)
 
     def _guess(self) -> float:
-        """Return the step of a uniform quantiser with the error step^2 / 12 that adds the error.
+        """Return a multiple of the step of a quantiser with the error step^2 / 12 that adds it.
 
         The guess takes every number of the tables to contribute equally to the errors of all
         values.
         """
         numbers = sum(prod(table.shape) for table in self._trained)
         added = max(self._allowed - self._error_of_all, 0.0)
-        return math.sqrt(12 * added * self._samples.total / numbers)
+        return GUESS * math.sqrt(12 * added * self._samples.total / numbers)
 
-    def _choose_codings(self, step: float, *, quick: bool = False) -> None:
-        """Choose the coding of each level for about a step, by few trials if `quick`."""
+    def _choose_codings(self, step: float) -> None:
+        """Choose the coding of each level for about a step."""
         slopes = self._samples.slopes(self._network_before, self._some)
         self._codings = choose_codings(
             self._architecture,
@@ -479,7 +479,6 @@ class _Coding:
             slopes,
             step,
             self._workers,
-            quick=quick,
         )
         self._min_step = max(
             MIN_STEP,
