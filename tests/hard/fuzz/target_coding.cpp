@@ -441,7 +441,7 @@ int64_t learn(const Voxels& voxels, Training& training, const double* rates, con
     return fhash_head_learn(voxels.inputs.data(), voxels.targets.data(), voxels.lowest.data(),
                             voxels.highest.data(), voxels.sizes, training.parameters.data(),
                             training.means.data(), training.squares.data(), rates, roots, first,
-                            count, as_in_file);
+                            count, as_in_file, 2);
 }
 
 }  // namespace
