@@ -313,7 +313,7 @@ def _variants(
     unknown = sorted(set(engines) - set(ENGINES))
     if unknown:
         raise InputError(f"unknown engine '{unknown[0]}'; known: {', '.join(ENGINES)}")
-    reason = refusal(architecture) if device.type == "cpu" else f"the device is '{device}'"
+    reason = refusal(architecture, device.type)
     if reason is not None and "native" in engines:
         raise InputError(f"the engine 'native' does not take this model: {reason}")
     variants = []

@@ -218,17 +218,16 @@ def with_steps_between(
     step. Both must have embeddings of it: the coreset has its fringe.
     """
     keys, box = coreset.key_frames, coreset.box
-    steps = [step for step in range(keys[0], keys[-1] + 1) if step not in set(keys)]
+    steps = sorted(set(range(keys[0], keys[-1] + 1)).difference(keys))
     if not steps:
         return coreset
-    masks = [occupancy.unpack(grid, box.shape) for grid in coreset.occupancy]
-    between = [mask | after for mask, after in itertools.pairwise(masks)]
+    grids = list(itertools.starmap(occupancy.between, itertools.pairwise(coreset.occupancy)))
     places = times.key_indices(steps)
-    most = sum(int(between[int(place)].sum()) for place in places)
+    most = sum(int(np.bitwise_count(grids[int(place)]).sum()) for place in places)
     samples = _Samples(most, coreset.brick_shape, coreset.brick_grid)
     for number, (step, place) in enumerate(zip(steps, places, strict=True)):
         frame = series.frame(step)[box.slices()]
-        mask = between[int(place)] & np.isfinite(frame)
+        mask = occupancy.unpack(grids[int(place)], box.shape) & np.isfinite(frame)
         samples.add(len(keys) + number, frame, mask, value_range)
         progress("gathering", number + 1, len(steps), "between key frames")
     more = samples.arrays()
@@ -242,6 +241,18 @@ def with_steps_between(
         fringe=np.concatenate([coreset.fringe, np.zeros(len(more.values), np.bool_)]),
         key_places=np.concatenate([coreset.key_places, places]),
         lattice=coreset,
+    )
+
+
+def sample_places(coreset: Coreset) -> npt.NDArray[np.int32]:
+    """Places (samples, 4) of the samples in their order: (key, z, y, x) in vertices of the box."""
+    vertices = prod(coreset.brick_shape)
+    mask = np.unpackbits(coreset.mask_bits, axis=1, count=vertices).astype(bool)
+    brick, vertex = np.nonzero(mask)
+    inside = np.stack(np.unravel_index(vertex, coreset.brick_shape), axis=1)
+    corner = coreset.bricks[brick, 1:] * np.array(coreset.brick_shape, np.int32)
+    return np.concatenate(
+        [coreset.bricks[brick, :1], (corner + inside).astype(np.int32)], axis=1, dtype=np.int32
     )
 
 

@@ -355,8 +355,8 @@ LOSS_WIDTH = 0.01
 """dB below MAX_LOSS within which no smaller file is looked for."""
 GUESS = 1.8
 """Multiple of the step by its formula: most tables' numbers are near 0, and cost less error."""
-SAME_CODINGS = math.log(1.5)
-"""Difference of log steps up to which the codings that were chosen for one are good for another."""
+SAME_CODINGS = 1.5
+"""Ratio of two steps up to which the codings that were chosen for one are good for the other."""
 ROUGH_WIDTH = 1.0
 """Width in dB of the window for the step at which the codings are chosen."""
 SAMPLE_WIDTH = 0.1
@@ -435,7 +435,7 @@ class _Coding:
         guess = self._guess()
         self._choose_codings(guess)
         step = self._search(guess, self._some, ROUGH_WIDTH).step
-        if abs(math.log(step / guess)) > SAME_CODINGS:
+        if not guess / SAME_CODINGS <= step <= guess * SAME_CODINGS:
             self._choose_codings(step)
         if len(self._some) < len(self._all):
             step = self._search(step, self._some, SAMPLE_WIDTH).step

@@ -14,22 +14,10 @@ import torch
 from torch import Tensor
 
 from fhash_bench.paper.data import EMBEDDING_SIZE, WIDTH
-from fhash_codec.features.bricks import Coreset
+from fhash_codec.features.bricks import Coreset, sample_places
 from fhash_codec.paper.engines.parameters import SPREAD
 from fhash_codec.paper.engines.slab import SlabEngine, adam_step
 from fhash_codec.paper.network import Architecture, Resolution, parameter_count
-
-
-def sample_places(coreset: Coreset) -> npt.NDArray[np.int32]:
-    """Places (samples, 4) of the samples in their order: (key, z, y, x) in vertices of the box."""
-    vertices = prod(coreset.brick_shape)
-    mask = np.unpackbits(coreset.mask_bits, axis=1, count=vertices).astype(bool)
-    brick, vertex = np.nonzero(mask)
-    inside = np.stack(np.unravel_index(vertex, coreset.brick_shape), axis=1)
-    corner = coreset.bricks[brick, 1:] * np.array(coreset.brick_shape, np.int32)
-    return np.concatenate(
-        [coreset.bricks[brick, :1], (corner + inside).astype(np.int32)], axis=1, dtype=np.int32
-    )
 
 
 def of_key_frame(coreset: Coreset, key: int) -> Coreset:

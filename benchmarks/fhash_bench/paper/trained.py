@@ -37,10 +37,9 @@ from fhash_bench.paper.encodings import (
     Level,
     Values,
     of_key_frame,
-    sample_places,
 )
 from fhash_codec.boxes import Sizes
-from fhash_codec.features.bricks import Coreset
+from fhash_codec.features.bricks import Coreset, sample_places
 from fhash_codec.paper.engines.slab import adam_step
 from fhash_codec.paper.network import ceil_log, level_resolutions
 from fhash_codec.paper.train import TrainingPlan

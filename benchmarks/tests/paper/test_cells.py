@@ -44,7 +44,6 @@ from fhash_bench.paper.data import (
     simulated,
     tcnn_network,
 )
-from fhash_bench.paper.encodings import sample_places
 from fhash_bench.paper.printed import (
     DECIBELS,
     NOT_REACHED_TEXT,
@@ -67,6 +66,7 @@ from fhash_bench.paper.printed import (
 from fhash_bench.paper.printed import (
     SETS as SETS_PRINTED,
 )
+from fhash_codec.features.bricks import sample_places
 from fhash_codec.features.features import parse_feature
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries

@@ -34,9 +34,9 @@ from fhash_bench.paper.encodings import (
     Level,
     WeightedSum,
     of_key_frame,
-    sample_places,
 )
 from fhash_bench.paper.trained import TrainedEncoding, build, levels_of, paper_grid
+from fhash_codec.features.bricks import sample_places
 from fhash_formats.errors import MissingDependencyError
 from fhash_formats.series import ArraySeries
 

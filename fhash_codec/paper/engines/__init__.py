@@ -94,13 +94,11 @@ def make_engine(
             return fused
     from fhash_codec.paper.engines.native import NativeEngine, refusal
 
-    reason = refusal(architecture) if device == "cpu" else f"the device is '{device}'"
+    reason = refusal(architecture, device)
     if name == "auto":
         name = "slab" if reason else "native"
     if name == "native":
-        if reason:
-            raise InputError(f"the engine 'native' does not take this model: {reason}")
-        return NativeEngine(architecture, coreset, rates, seed=seed)
+        return NativeEngine(architecture, coreset, rates, seed=seed, device=device)
     if name == "slab":
         need_torch(f"engine 'slab' ({reason})" if reason else "engine 'slab'")
         from fhash_codec.paper.engines.slab import SlabEngine

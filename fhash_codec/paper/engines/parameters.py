@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.features.bricks import Coreset
+from fhash_codec.features.bricks import Coreset, sample_places
 from fhash_codec.paper.network import Architecture, Resolution
 from fhash_formats.support.arrays import Double, Longs, Single
 
@@ -136,7 +136,7 @@ class Parameters:
             return self
         size = architecture.embedding_size
         finest = np.zeros((prod(architecture.levels[0]), size), np.float32)
-        finest[sample_places(lattice)] = self.fine.T
+        finest[_of_samples(architecture, lattice)] = self.fine.T
         coarse = np.concatenate([finest.reshape(-1), self.coarse])
         return Parameters(np.empty((0, len(coreset.values)), np.float32), coarse, self.network)
 
@@ -146,25 +146,14 @@ class Parameters:
         if lattice is None:
             return self
         finest, coarse = np.split(self.coarse, [architecture.parameters_of_finest])
-        fine = finest.reshape(-1, architecture.embedding_size)[sample_places(lattice)]
+        fine = finest.reshape(-1, architecture.embedding_size)[_of_samples(architecture, lattice)]
         return Parameters(np.ascontiguousarray(fine.T), coarse, self.network)
 
 
-def sample_places(coreset: Coreset) -> Longs:
-    """Return the vertices (samples,) of a lattice (key frames, z, y, x) where its samples lie."""
-    places = [np.zeros(0, np.int64)]
-    _, y, x = coreset.box.shape
-    inside = np.stack(np.meshgrid(*map(np.arange, coreset.brick_shape), indexing="ij"), axis=-1)
-    inside = inside.reshape(-1, 3)
-    for first in range(0, len(coreset.bricks), BRICKS_AT_A_TIME):
-        bits = coreset.mask_bits[first : first + BRICKS_AT_A_TIME]
-        brick, vertex = np.unpackbits(bits, axis=1, count=len(inside)).nonzero()
-        key, *corner = coreset.bricks[first : first + BRICKS_AT_A_TIME].astype(np.int64)[brick].T
-        at_z, at_y, at_x = (
-            np.stack(corner) * np.array(coreset.brick_shape)[:, None] + inside[vertex].T
-        )
-        places.append(((key * coreset.box.shape[0] + at_z) * y + at_y) * x + at_x)
-    return np.concatenate(places)
+def _of_samples(architecture: Architecture, lattice: Coreset) -> Longs:
+    """Return the vertices (samples,) of the finest table at which the samples lie."""
+    places = sample_places(lattice)
+    return np.asarray(np.ravel_multi_index(tuple(places.T), architecture.sizes))
 
 
 def matrices_of(vector: Numbers, shapes: Sequence[tuple[int, int]]) -> list[Numbers]:
