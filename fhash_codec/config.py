@@ -158,18 +158,16 @@ class EncodeConfig(Record):
     )
     max_error: float | None = limits(
         None,
-        "compact: strict bound of the error of each value, in data units",
+        "strict bound of the error of each value, in data units; for a network (paper), what it "
+        "lacks is coded beside it as a lattice",
         low=0.0,
         high=1.7e308,
-        profile="compact",
     )
     max_error_rel: float | None = limits(
         None,
-        "compact: strict bound of the error of each value, "
-        "as a fraction of the range of the series",
+        "strict bound of the error of each value, as a fraction of the range of the series",
         low=0.0,
         high=1.0,
-        profile="compact",
     )
     ratio: float | None = limits(
         None,
@@ -257,8 +255,13 @@ class EncodeConfig(Record):
     @property
     def coded(self) -> bool:
         """Whether the profile paper's tables are coded: `tables`, or what its auto stands for."""
-        promised = self.psnr is not None or self.psnr_bulk is not None
+        promised = any(getattr(self, name) is not None for name in PROMISES)
         return self.tables == "transform" or (self.tables == "auto" and promised)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a bound of each error is promised."""
+        return self.max_error is not None or self.max_error_rel is not None
 
     @property
     def model_fold(self) -> int:

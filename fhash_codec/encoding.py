@@ -25,6 +25,7 @@ from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import brief_quality, check_name
 from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, recording, silent, skip, stage
+from fhash_codec.residual import with_residual
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
@@ -168,8 +169,12 @@ def encode_variable(
     if config.profile == "compact":
         header = encode_compact(writer, series, config, mask, progress, measured.complete)
     else:
+
+        def complete(header: dict[str, Any]) -> dict[str, Any]:
+            return measured.complete(with_residual(writer, series, config, header, progress))
+
         header, checkpoint, advice = encode_paper(
-            writer, series, config, mask, path, progress, measured.complete
+            writer, series, config, mask, path, progress, complete
         )
     figures = measured.figures(header)
     return EncodedVariable(

@@ -16,15 +16,23 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import TABLE_AXES, Box, Table
-from fhash_codec.compact.model import correction_of, correction_type, predicted
+from fhash_codec.compact.model import correction_of, predicted
 from fhash_codec.features.occupancy import pack, packed_bytes, write_bits
 from fhash_codec.header import check_name, write_coordinates
+from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
-from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, PLAIN_FEATURE, SPARSE, STEPS
+from fhash_formats.container.header import (
+    BITS_ARRAY,
+    MASK_ARRAY,
+    PLAIN_FEATURE,
+    RESIDUAL,
+    SPARSE,
+    STEPS,
+)
 from fhash_formats.container.hierarchy import COORDINATES
 from fhash_formats.container.source_entry import AUXILIARY
 from fhash_formats.errors import InputError
@@ -129,7 +137,8 @@ class _Export:
             **self._header,
             "coordinates": {},
             "model": {key: model[key] for key in model if key != SPARSE} | changed,
-            "required_features": [],
+            # tables that are numbers need no feature, and a residual is still one
+            "required_features": [RESIDUAL] if RESIDUAL in self._arrays else [],
         }
 
     def compact(self) -> dict[str, Any]:
@@ -300,7 +309,7 @@ class _Export:
             return correction
 
         mark = self._writer.mark()
-        self._write_tiles("corrections", array, correction_type(array.dtype), read)
+        self._write_tiles("corrections", array, decoded_type(array.dtype), read)
         if not needed:
             self._writer.rewind(mark)
 

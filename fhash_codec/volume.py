@@ -23,12 +23,12 @@ from fhash_codec.boxes import (
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.features.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import describe_file, read_missing
-from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.measure.value_range import ValueRange, decoded_type
 from fhash_codec.progress import Progress, silent
 from fhash_codec.times import Time, times_of
 from fhash_codec.volume_model import Card, Decoded, open_model
 from fhash_formats.container import Container, Place, StorageOptions
-from fhash_formats.container.header import EVERYTHING
+from fhash_formats.container.header import EVERYTHING, RESIDUAL
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, step_blocks
 from fhash_formats.support.values import exact_number
@@ -93,12 +93,6 @@ class ValueType:
         if chosen is not None or not self.has_gaps:
             return self.own, 0 if chosen is None else int(chosen)
         return self.floats, fill
-
-
-def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of decoded values: a float wide enough for the source's own precision."""
-    narrow = source.itemsize <= 2 or source == np.float32
-    return np.dtype(np.float32 if narrow else np.float64)
 
 
 def holds(dtype: np.dtype[Any], number: Number) -> bool:
@@ -230,6 +224,8 @@ class Volume(Card, ArrayLike):
         every_step = header["model"]["levels"][0][0] == self.shape[0]
         self._outside_is_missing = every_step and EVERYTHING in header["features"]
         self._model = open_model(container)
+        corrected = RESIDUAL in header["required_features"]
+        self._residual = CompactModel(container, RESIDUAL) if corrected else None
         self.chunks = self._model.chunks
 
     def _decoded(self, ranges: Sequence[range]) -> npt.NDArray[Any]:
@@ -285,8 +281,12 @@ class Volume(Card, ArrayLike):
 
         def decode(in_box: Box) -> Decoded:
             requested = self._occupied(key, in_box)
-            values = self._model.read(key, in_box, requested).astype(self.float_dtype, copy=False)
-            return (values if key.is_integer() else self._in_range(values)), requested
+            values = self._model.read(key, in_box, requested)
+            if self._residual is not None:
+                values = values + self._residual.read(t, in_box, requested)
+            values = values.astype(self.float_dtype, copy=False)
+            stored = key.is_integer() and self._residual is None
+            return (values if stored else self._in_range(values)), requested
 
         return self._completed(decode, region, self._missing_at(t, region), outside)
 

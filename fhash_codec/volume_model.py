@@ -16,7 +16,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
-from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, TABLE
+from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, RESIDUAL, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.arrays import Mask
@@ -63,6 +63,7 @@ class Card:
     shape: tuple[int, int, int, int]
     box: Box
     _model: VolumeModel
+    _residual: CompactModel | None
 
     if TYPE_CHECKING:
 
@@ -128,8 +129,9 @@ class Card:
         box.
 
         Keys: `config` (with `settings`), `tables` (with `level`, `shape`, `dtype`), `mlp` (with
-        `layer`, `shape` of the weights, `activation`) and `occupancy` (with `shape` of the bits,
-        and `apart`, the features that have bits of their own).
+        `layer`, `shape` of the weights, `activation`), `occupancy` (with `shape` of the bits,
+        and `apart`, the features that have bits of their own), and `residual` (with `shape`) where
+        a network has one.
         """
         settings = len(self.config)
         return {
@@ -150,7 +152,13 @@ class Card:
             ],
             "mlp": self._describe_mlp(),
             "occupancy": self._describe_occupancy(),
+            **({} if self._residual is None else {RESIDUAL: self._describe_residual()}),
         }
+
+    def _describe_residual(self) -> dict[str, Any]:
+        """The values that the network lacks, at every vertex of the box and step."""
+        shape = list(self.container.arrays[RESIDUAL].shape)
+        return {"shape": shape, **self._stored(RESIDUAL, "")}
 
     def _describe_mlp(self) -> list[dict[str, Any]]:
         """The layers: (weights, biases) in arrays of their own, or packed in the coded table."""
@@ -251,6 +259,11 @@ class Card:
                 found = self._model.sample_with_gradient(keys[inside], local)
                 values[inside], slopes[inside] = found
                 slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
+            if self._residual is not None:
+                further, by = self._residual.sample_with_gradient(steps[inside], local)
+                values[inside] += further
+                if slopes is not None:
+                    slopes[inside] += by
         return values, slopes
 
 

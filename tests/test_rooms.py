@@ -54,7 +54,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("paper",),
         ("volume_model", "times"),
         ("volume",),
-        ("dataset", "comparison"),
+        ("dataset", "comparison", "residual"),
         ("rendering",),
         ("simulation", "isosurface"),
         ("gallery",),

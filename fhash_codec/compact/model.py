@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from fhash_codec.boxes import NEIGHBOURS, Box, Mlp, Table, ceil_halvings
 from fhash_codec.features.occupancy import read_occupancy
+from fhash_codec.measure.value_range import decoded_type
 from fhash_formats.container import Container, StoredArray
-from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.container.header import PLAIN_FEATURE, TABLE
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.arrays import Double
 from fhash_formats.support.threads import chunk_region, common_part
@@ -151,15 +152,9 @@ def predicted(
         return cast(table if head is None else head.apply(np.ascontiguousarray(table)), dtype)
 
 
-def correction_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the corrections of values of a type."""
-    narrow = dtype.itemsize <= 2 or dtype == np.float32
-    return np.dtype(np.float32 if narrow else np.float64)
-
-
 def correction_of(values: npt.NDArray[Any], base: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return what takes predicted to decoded values, of one type; 0 where a value is not finite."""
-    kind = correction_type(values.dtype)
+    kind = decoded_type(values.dtype)
     if values.dtype.kind != "f":
         # Modulo 2^64, so that neighbouring integers beyond 2^53 are still told apart.
         return (values.astype(np.int64) - base.astype(np.int64)).astype(kind)
@@ -265,15 +260,15 @@ class PlainArray:
 
 
 class CompactModel:
-    """A `VolumeModel` (volume_model.py) of a compact file.
+    """A `VolumeModel` (volume_model.py) of a compact file, or of the residual of a network.
 
     Its table holds values (t, z, y, x) at the vertices of the feature bounding box.
     """
 
-    def __init__(self, container: Container) -> None:
+    def __init__(self, container: Container, name: str = TABLE) -> None:
         self._container = container
         self._arrays = container.arrays
-        self._table = self._arrays["tables/level_1"]
+        self._table = self._arrays[name]
         self._plain: PlainArray | None = None
         if PLAIN_FEATURE in container.header["required_features"]:
             self._plain = PlainArray(container.header["model"], self._arrays)

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from fhash_codec.cost.plan import Allowance, BudgetSpentError, Facts, Wish
 from fhash_codec.cost.results import Encoded
 from fhash_codec.measure.errors import Errors
+from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.progress import Progress
-from fhash_codec.volume import decoded_type
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import Series
 from fhash_formats.support.arrays import Values

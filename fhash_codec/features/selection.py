@@ -514,7 +514,7 @@ def _check_rounding(series: Series, scanned: Scan, config: EncodeConfig) -> None
         f"{series.source}: '{series.name}' has integers beyond 2^53 beside missing values, which "
         f"make floats of them: they are rounded, by up to {math.ulp(float(largest)) / 2:g}"
     )
-    if config.max_error is not None or config.max_error_rel is not None:
+    if config.bounded:
         raise InputError(
             f"{told}, and no bound of the error can be kept; promise a PSNR or a ratio, or encode "
             "the numbers as they are stored (--raw-values with --keep-extremes)"

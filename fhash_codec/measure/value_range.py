@@ -100,6 +100,12 @@ def mean_of(values: npt.NDArray[Any]) -> float:
     return mean.value()
 
 
+def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of decoded values: a float wide enough for the source's own precision."""
+    narrow = source.itemsize <= 2 or source == np.float32
+    return np.dtype(np.float32 if narrow else np.float64)
+
+
 @dataclass(frozen=True)
 class ValueRange:
     """The range of a series: finite numbers `low` <= `high` in data units.

@@ -382,6 +382,32 @@ MIN_TABLES_ERROR = 1e-20
 
 
 @dataclass(frozen=True, kw_only=True)
+class Target:
+    """The quality that coded tables need.
+
+    Attributes:
+        psnr: promised PSNR in dB over the samples, if any.
+        loss: dB that coding may cost where no PSNR is promised, or the tables do not have it.
+    """
+
+    psnr: float | None
+    loss: float = MAX_LOSS
+
+    def allowed(self, exact_error: float) -> tuple[float, float]:
+        """Return the mean squared error that decoded samples may have, and the search's width.
+
+        That is the dB below the error at which the search may end.
+
+        Args:
+            exact_error: mean squared error of the tables before they are coded.
+        """
+        promised = 0.0 if self.psnr is None else 10 ** (-(self.psnr + SAFE) / 10)
+        if promised > exact_error:
+            return promised, PROMISE_WIDTH
+        return max(exact_error * 10 ** (self.loss / 10), MIN_TABLES_ERROR), LOSS_WIDTH
+
+
+@dataclass(frozen=True, kw_only=True)
 class CodedTables:
     """Trained tables, coded.
 
@@ -411,7 +437,7 @@ class _Coding:
         trained: Sequence[TrainedTable],
         layers: Sequence[Layer],
         samples: Samples,
-        psnr: float | None,
+        target: Target,
         workers: ThreadPoolExecutor,
         progress: Progress,
     ) -> None:
@@ -422,7 +448,7 @@ class _Coding:
         progress("measuring the model", 0, 1, "")
         self._error_before = self._error(self._network(trained), self._all)
         # All samples decide whether the promise can be kept: some may be far easier than the rest.
-        self._allowed, self._width = _allowed_error(self._error_before, psnr)
+        self._allowed, self._width = target.allowed(self._error_before)
         self._quantise_layers()
         self._network_before = self._network(trained)
         self._error_of_all = self._error(self._network_before, self._all)
@@ -605,7 +631,7 @@ def write_coded(
     architecture: Architecture,
     samples_of: Coreset,
     model: TrainedModel,
-    psnr: float | None,
+    target: Target,
     progress: Progress,
 ) -> float:
     """Code and write a trained model; return the dB of PSNR that this costs.
@@ -613,8 +639,7 @@ def write_coded(
     The quantiser step is the largest that keeps the allowed error.
 
     samples_of: the training samples.
-    psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it
-        before they are coded. Without it, coding may cost MAX_LOSS.
+    target: the quality that the tables need.
     progress: called before each trial.
     """
     coreset = samples_of.lattice or samples_of
@@ -622,7 +647,7 @@ def write_coded(
     tables = trained_tables(architecture, coreset, bricks, model.fine, model.tables)
     samples = Samples(samples_of, tile_shape(architecture.levels[0]))
     with thread_pool() as workers:
-        coding = _Coding(architecture, tables, model.layers, samples, psnr, workers, progress)
+        coding = _Coding(architecture, tables, model.layers, samples, target, workers, progress)
         coded = coding.run()
         for level, table in enumerate(coded.tables, start=1):
             _write_table(writer, level, table)
@@ -648,19 +673,3 @@ def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None
             attributes={"mixing": [float(str(number)) for number in mixing]},
             codecs=transform_codecs(settings),
         )
-
-
-def _allowed_error(exact_error: float, psnr: float | None) -> tuple[float, float]:
-    """Return the mean squared error that decoded samples may have, and the width of the search.
-
-    Args:
-        exact_error: mean squared error of the tables before they are coded.
-        psnr: promised PSNR in dB, if any.
-
-    Returns:
-        The error, and the dB below it at which the search may end.
-    """
-    promised = 0.0 if psnr is None else 10 ** (-(psnr + SAFE) / 10)
-    if promised > exact_error:
-        return promised, PROMISE_WIDTH
-    return max(exact_error * 10 ** (MAX_LOSS / 10), MIN_TABLES_ERROR), LOSS_WIDTH

@@ -13,13 +13,8 @@ from numpy.testing import assert_array_equal
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, RegionError
 from fhash_codec.features.features import dilate
-from fhash_codec.volume import (
-    decoded_type,
-    feature_names,
-    holds_features_apart,
-    only_features,
-    rounded,
-)
+from fhash_codec.measure.value_range import decoded_type
+from fhash_codec.volume import feature_names, holds_features_apart, only_features, rounded
 from fhash_formats.series import ArraySeries, Coordinate
 
 LOW, HIGH = "interval:0:0.2", "interval:0.8:1"

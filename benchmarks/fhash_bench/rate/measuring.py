@@ -32,8 +32,8 @@ from fhash_codec.boxes import Box
 from fhash_codec.config import MODELS, EncodeConfig
 from fhash_codec.cost.peers import EXACT, UNIFORM, Search, Trial, Variant, filled, trial_of
 from fhash_codec.measure.errors import Errors
+from fhash_codec.measure.value_range import decoded_type
 from fhash_codec.progress import Progress
-from fhash_codec.volume import decoded_type
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, QualityError
 from fhash_formats.series import ArraySeries, Series

@@ -64,7 +64,7 @@ class TableParts:
     streams: Sequence[bytes]
     sizes: npt.NDArray[np.int64] | None = None
 
-    def write(self, writer: ContainerWriter) -> None:
+    def write(self, writer: ContainerWriter, name: str = TABLE) -> None:
         """Write the table, an array of a chunk for each tile.
 
         A single tile needs no shard, whose index and description would take some 120 bytes.
@@ -77,7 +77,7 @@ class TableParts:
                 sizes = np.fromiter(map(len, self.streams), np.int64, len(self.streams))
             shards = shard_shape(self.tile, grid, sizes)
         writer.add_array(
-            TABLE,
+            name,
             shape=self.shape,
             dtype=self.dtype,
             chunk_shape=self.tile,

@@ -269,7 +269,9 @@ FRINGE = "fringe"
 """Value of the key: the vertices that the coreset and its fringe need."""
 COUNTS = "counts"
 """Attribute of a table: number of its vertices at each time node."""
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE})
+RESIDUAL = "residual"
+"""Feature of files of the profile paper with this array: what the network's values lack."""
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE, RESIDUAL})
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
 COMPACT = "compact"
@@ -407,6 +409,8 @@ def validate_header(header: Mapping[str, Any]) -> None:
     if (profile == COMPACT and not plain) or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
+    residual = RESIDUAL in header["required_features"]
+    top.need(profile == PAPER or not residual, "required_features", "no residual of a lattice")
     check_sparse(
         top.record("model"),
         header["required_features"],

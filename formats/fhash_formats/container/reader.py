@@ -30,6 +30,7 @@ from fhash_formats.container.header import (
     PLAIN_FEATURE,
     PLAIN_TABLE_TYPES,
     POSITIONS,
+    RESIDUAL,
     SPARSE,
     STEP_BYTES,
     STEP_FIGURES,
@@ -170,6 +171,9 @@ def _required_arrays(
     if compact and PLAIN_FEATURE not in header["required_features"]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
+    if RESIDUAL in header["required_features"]:
+        box = [high - low for low, high in header["feature_bounding_box"]]
+        yield RESIDUAL, (header["domain"]["shape"][0], *box), ("float32", "float64")
     for number, level in enumerate(model["levels"], start=1):
         if model["tables"] == CODED:
             for component in range(1, model["embedding_size"] + 1):
