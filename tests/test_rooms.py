@@ -54,7 +54,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("paper",),
         ("volume_model", "times"),
         ("volume",),
-        ("dataset", "comparison", "residual"),
+        ("dataset", "comparison"),
         ("rendering",),
         ("simulation", "isosurface"),
         ("gallery",),
