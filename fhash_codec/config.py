@@ -18,6 +18,8 @@ TABLES = ("auto", "float32", "float16", "uint8", "sparse", "dense", "transform")
 
 NAMED_PROFILES = {"lattice": "compact", "network": "paper"}
 """Profiles by the names of what they fit."""
+AUTO = "auto"
+"""Profile that stands for one of the others (`cost.encodings.choose_model`)."""
 MODELS = {"compact": "lattice", "paper": "network (F-Hash)"}
 """Names of what the profiles fit, for people."""
 
@@ -55,8 +57,9 @@ class EncodeConfig(Record):
     profile: str = limits(
         "compact",
         "'lattice' or 'compact' is the smallest file at a promised quality; "
-        "'network' or 'paper' is the published F-Hash, trained from a random start",
-        choices=("compact", "paper", *NAMED_PROFILES),
+        "'network' or 'paper' is the published F-Hash, trained from a random start; "
+        "'auto' fits both to a crop, prints what each costs, and takes one by the access",
+        choices=("compact", "paper", *NAMED_PROFILES, AUTO),
     )
     features: tuple[str, ...] = limits(
         ("all",),
@@ -258,6 +261,22 @@ class EncodeConfig(Record):
         promised = any(getattr(self, name) is not None for name in PROMISES)
         return self.tables == "transform" or (self.tables == "auto" and promised)
 
+    def of_profile(self, profile: str) -> EncodeConfig:
+        """The settings for one profile, without those of the other.
+
+        A network without a promise gets the default one, so that it can be compared.
+        """
+        changes: dict[str, Any] = {
+            field.name: field.default
+            for field in dataclasses.fields(self)
+            if field.metadata.get("profile") not in (None, profile)
+        }
+        if profile == "paper":
+            changes["without"] = tuple(name for name in self.without if name in STAGES_OF_PAPER)
+            if not any(getattr(self, name) is not None for name in PROMISES):
+                changes["psnr"] = DEFAULT_PSNR
+        return dataclasses.replace(self, profile=profile, **changes)
+
     @property
     def bounded(self) -> bool:
         """Whether a bound of each error is promised."""
@@ -326,7 +345,7 @@ class EncodeConfig(Record):
             profile, value = field.metadata.get("profile"), getattr(self, field.name)
             if field.name == "device" and value == "cpu":
                 continue  # where every other profile computes
-            if profile and profile != self.profile and value != field.default:
+            if profile and self.profile not in (AUTO, profile) and value != field.default:
                 raise InputError(
                     f"{self.label(field)} belongs to --profile {profile}; "
                     f"the profile is {self.profile}"

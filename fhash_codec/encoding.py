@@ -19,7 +19,7 @@ from fhash_codec.compact.encode import DecodedTiles, code_series, encode_compact
 from fhash_codec.compact.goal import missed_promise, remarks
 from fhash_codec.compact.tiles import fits_memory
 from fhash_codec.comparison import measure, report, ssim_budget, steps_of_ssim
-from fhash_codec.config import EncodeConfig
+from fhash_codec.config import AUTO, EncodeConfig
 from fhash_codec.dataset import Dataset
 from fhash_codec.devices import choose_device
 from fhash_codec.features.selection import Source, mask_files, open_source, select_features
@@ -168,6 +168,11 @@ def encode_variable(
 
     mask: as in `encode`. path: of the file, beside which checkpoints lie.
     """
+    if config.profile == AUTO:
+        raise InputError(
+            "the profile is 'auto': fhash_codec.cost.encodings.choose_model(series, config).config "
+            "has the one to take"
+        )
     measured = _Measured(writer, series, config, progress)
     checkpoint, advice = None, ""
     if config.profile == "compact":

@@ -192,11 +192,11 @@ class CroppedSeries(Series):
         self.series.close()
 
 
-def cropped(series: Series, vertices: int) -> Series:
+def cropped(series: Series, vertices: int, around: Box | None = None) -> Series:
     """The series itself, or a part of it with at most about as many vertices as given.
 
     Steps in the middle are taken first, down to MIN_STEPS; then all axes in space are shortened
-    alike around the middle of the domain.
+    alike around the middle of the domain, or of a part of it.
     """
     steps, *space = series.shape
     if prod(series.shape) <= vertices:
@@ -204,10 +204,13 @@ def cropped(series: Series, vertices: int) -> Series:
     kept = max(min(MIN_STEPS, steps), min(steps, vertices // prod(space)))
     lengths = _shortened(space, vertices / kept)
     first = (steps - kept) // 2
-    region = Box.of(
-        ((n - length) // 2, (n - length) // 2 + length)
-        for n, length in zip(space, lengths, strict=True)
-    )
+    starts = [
+        min(max((low + high - length) // 2, 0), n - length)
+        for n, length, (low, high) in zip(
+            space, lengths, Box.of_shape(space) if around is None else around, strict=True
+        )
+    ]
+    region = Box.of_shape(lengths).shift(starts)
     return CroppedSeries(series, range(first, first + kept), region)
 
 

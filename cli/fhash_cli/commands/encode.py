@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import glob
+import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -35,6 +36,7 @@ from fhash_cli.output import (
     emit,
     extent,
     loss_rows,
+    number,
     one_line,
     quality_rows,
     say,
@@ -47,6 +49,7 @@ from fhash_formats.errors import FhashWarning, InterruptedEncodingError, Quality
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.cost.encodings import ModelChoice
     from fhash_codec.cost.prediction import Choice
     from fhash_formats.series import Series
 
@@ -146,13 +149,11 @@ def command(
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, options.components, quiet=quiet)
     if several is not None:
-        if (
-            time_budget is not None
-            or report_folder is not None
-            or options.verbose
-            or wish is not None
-        ):
-            raise click.UsageError("--time-budget, --report, --part and -v are for one variable")
+        alone = (time_budget, report_folder, wish, options.verbose or None)
+        if settings["profile"] == "auto" or any(given is not None for given in alone):
+            raise click.UsageError(
+                "--profile auto, --time-budget, --report, --part and -v are for one variable"
+            )
         encoded = _encode_several(data, output, several, settings, force, quiet)
         return _emit_several(encoded, explain, as_json)
     config = config_of(settings)
@@ -162,10 +163,7 @@ def command(
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed: QualityError | None = None
         stopped: InterruptedEncodingError | None = None
-        choice = None
-        if time_budget is not None:
-            choice = _choose(series, config, time_budget, progress, quiet=quiet)
-            config = choice.config
+        config, model, choice = _settled(series, config, time_budget, progress, quiet=quiet)
         predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
             report = encode_all_or_part(series, output, config, wish, force, progress, predicted)
@@ -184,6 +182,9 @@ def command(
     if report_folder is not None:
         rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows) + _explained(report, explain)
+    if model is not None:
+        report["models"] = model.to_dict()
+        text += f"\n\n{model_table(model)}" if model.prices else ""
     if choice is not None:
         report["time_budget"] = choice.to_dict()
     return emit(report, text, as_json, missed or stopped)
@@ -270,6 +271,25 @@ def _emit_several(
     emit(report, text, as_json, missed)
 
 
+def _settled(
+    series: Series,
+    config: EncodeConfig,
+    time_budget: float | None,
+    progress: Progress,
+    *,
+    quiet: bool,
+) -> tuple[EncodeConfig, ModelChoice | None, Choice | None]:
+    """The settings, and how the model, and effort or epochs, were chosen where they were left."""
+    model = choice = None
+    if config.profile == "auto":
+        model = _choose_model(series, config, time_budget, progress, quiet=quiet)
+        config = model.config
+    if time_budget is not None:
+        choice = _choose(series, config, time_budget, progress, quiet=quiet)
+        config = choice.config
+    return config, model, choice
+
+
 def _choose(
     series: Series, config: EncodeConfig, seconds: float, progress: Progress, *, quiet: bool
 ) -> Choice:
@@ -290,6 +310,48 @@ def _choose(
     elif not quiet:
         say(choice.why)
     return choice
+
+
+def _choose_model(
+    series: Series,
+    config: EncodeConfig,
+    seconds: float | None,
+    progress: Progress,
+    *,
+    quiet: bool,
+) -> ModelChoice:
+    """Choose the model by fits to a crop, and say so in one line."""
+    from fhash_codec.config import MODELS
+    from fhash_codec.cost.encodings import choose_model
+
+    budget = math.inf if seconds is None else seconds
+    choice = choose_model(series, config, budget=budget, progress=progress)
+    if not quiet:
+        say(f"{MODELS[choice.config.profile]}: {choice.why}")
+    return choice
+
+
+def model_table(choice: ModelChoice) -> str:
+    """Table of what each model costs, and which was taken."""
+    from fhash_codec.config import MODELS
+
+    rows = [["model", "size", "encoding", "region", "picture", "PSNR", "between steps", ""]]
+    for price in choice.prices:
+        taken = price.profile == choice.config.profile
+        why = f"taken: {choice.why}" if taken else "" if price.kept else "misses the promise"
+        rows.append(
+            [
+                MODELS[price.profile],
+                f"about {size(price.bytes)}",
+                duration(price.seconds),
+                f"{price.region_ms:.3g} ms",
+                f"{price.picture_ms:.3g} ms",
+                number(price.psnr, "dB"),
+                number(price.between, "dB"),
+                why,
+            ]
+        )
+    return f"{table(rows)}\nfrom {choice.crop}"
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:

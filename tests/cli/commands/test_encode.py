@@ -207,6 +207,23 @@ def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
     assert encoder["took_seconds"] > 0
 
 
+def test_auto_says_what_both_models_cost(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ("encode", data, "-o", tmp_path / "run.fhz", "--profile", "auto", "--psnr", "30")
+    result = fhash(*words, "--effort", "1", "--epochs", "2")
+    assert result.exit_code == 0
+    assert "fhash: lattice: the other does not keep the promise" in result.stderr
+    lines = result.stdout.splitlines()
+    assert any(line.startswith("network (F-Hash)  about") for line in lines)
+    assert sum("taken: " in line for line in lines) == 1
+    report = json.loads(fhash(*words, "--effort", "1", "--force", "--json", "-q").stdout)
+    assert report["models"]["chosen"] == report["profile"]
+    assert (
+        fhash("encode", data, "-o", tmp_path / "x.fhz", *words[4:], "--var", "all").exit_code == 2
+    )
+    with pytest.raises(fhash_codec.InputError, match="choose_model"):
+        fhash_codec.encode(data, tmp_path / "x.fhz", fhash_codec.EncodeConfig(profile="auto"))
+
+
 BOUNDED = ["--max-error", "0.01", "--tile", "1x6x7x8", "--effort", "1", "-q"]
 
 

@@ -633,3 +633,62 @@ def test_ctrl_c_in_a_training_ends_the_measurements(
     allowance = Allowance(1000.0)
     OwnEncodings(series, tmp_path, allowance, foretold, silent).measure(FAST)
     assert allowance.interrupted
+
+
+PRICE = own.ModelPrice(
+    profile="compact",
+    bytes=1000,
+    seconds=10.0,
+    region_ms=9.0,
+    picture_ms=1.0,
+    psnr=45.0,
+    between=40.0,
+    kept=True,
+)
+
+
+@pytest.mark.parametrize(
+    ("other", "access", "budget", "chosen", "why"),
+    [
+        ({"bytes": 1090, "region_ms": 3.0}, "balanced", 60, "paper", "1.09 times the bytes"),
+        ({"bytes": 1090, "region_ms": 3.0}, "small", 60, "compact", "the fewest bytes"),
+        ({"bytes": 1400, "region_ms": 3.0}, "balanced", 60, "compact", "the fewest bytes"),
+        ({"bytes": 1400, "region_ms": 3.0}, "fast", 60, "paper", "1.40 times"),
+        ({"bytes": 900, "kept": False}, "small", 60, "compact", "does not keep the promise"),
+        ({"bytes": 5000, "seconds": 4.0}, "small", 5, "paper", "longer than 5.00 s"),
+        ({"bytes": 500, "seconds": 20.0}, "small", 5, "compact", "too few for either"),
+    ],
+)
+def test_the_access_and_the_budget_choose_the_model(
+    other: dict[str, Any], access: str, budget: float, chosen: str, why: str
+) -> None:
+    price, text = own._cheapest([PRICE, replace(PRICE, profile="paper", **other)], access, budget)
+    assert price.profile == chosen
+    assert why in text
+
+
+def test_both_models_are_fitted_to_a_crop(monkeypatch: pytest.MonkeyPatch) -> None:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (6, 12, 20, 20)), indexing="ij")
+    series = ArraySeries((np.sin(x * y + t) * np.exp(-z)).astype(np.float32))
+    monkeypatch.setattr(own, "CROP_VERTICES", 6 * 10**3)
+    asked = EncodeConfig(profile="auto", features=("interval:0.2:2",), max_error_rel=0.02, effort=2)
+    choice = own.choose_model(series, asked)
+    assert choice.crop.startswith("a crop")
+    assert [price.profile for price in choice.prices] == ["compact", "paper"]
+    for price in choice.prices:
+        assert price.kept
+        assert 0 < price.bytes < series.values.nbytes
+        assert min(price.seconds, price.region_ms, price.picture_ms) > 0
+        assert 0 < (price.between or 0) < (price.psnr or 0)
+    assert choice.config == asked.of_profile(choice.config.profile)
+    assert choice.config.max_error_rel == 0.02
+    assert choice.to_dict()["chosen"] == choice.config.profile
+    # the part has a smaller range, in which the same errors are a larger share
+    whole, part = facts_of(series, silent), facts_of(cropped(series, 6000), silent)
+    moved = own._for_part(replace(asked, max_error_rel=None, psnr=60.0), whole, part)
+    assert moved.psnr == pytest.approx(60 - 20 * np.log10(whole.width / part.width))
+
+
+def test_a_ratio_leaves_no_choice() -> None:
+    choice = own.choose_model(SERIES, EncodeConfig(profile="auto", ratio=20.0))
+    assert (choice.config.profile, choice.prices) == ("compact", ())
