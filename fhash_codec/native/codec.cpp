@@ -5,6 +5,6 @@
 
 // Raise it whenever an exported signature or its meaning changes; native/__init__.py holds the same
 // number.
-constexpr std::int64_t FHASH_CODEC_ABI = 8;
+constexpr std::int64_t FHASH_CODEC_ABI = 9;
 
 FHASH_EXPORT std::int64_t fhash_codec_abi_version() { return FHASH_CODEC_ABI; }

@@ -30,8 +30,8 @@ FHASH_KERNEL(maximum, MAXIMUM)
 
 // Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`,
 // which begin as zeros (depth: infinity). flags: SHADED, LIT, MAXIMUM, or those of
-// march_effects.cpp. counters, added to: rays, passes, samples, gradients, skips. Returns -1 for an
-// input that cannot be.
+// march_effects.cpp. counters, added to: rays, passes, samples, gradients, skips, evaluations.
+// Returns -1 for an input that cannot be.
 FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t first,
                                  int64_t stop, int64_t* counters) {
     const FhashMarch& m = *march;

@@ -14,6 +14,13 @@ constexpr int FHASH_POWERS = 1024;  // intervals of the table of highlights
 constexpr int FHASH_BRICK = 4;      // cells along a brick's side
 constexpr int FHASH_PLANES = 6;     // planes that clip a picture, at most
 constexpr int FHASH_GRADES = 1024;  // intervals of the table of factors by gradient
+constexpr int FHASH_POINTS = 64;    // points that a network is evaluated at together, at most
+
+// `fhash_network_points` of the network's library (network/points.cpp).
+using FhashNetwork = std::int64_t (*)(const std::int64_t* sizes, const std::int64_t* levels,
+                                      const std::int64_t* layers, const std::int64_t* columns,
+                                      std::int64_t count, std::int64_t path, float* values,
+                                      float* slopes, float* by_inputs);
 
 // Mirrored field by field in fhash_codec/rendering/march.py. All places and directions
 // are in vertices of the frame, x, y, z.
@@ -70,17 +77,62 @@ extern "C" struct FhashMarch {
     double grade_scale;      // entries of that table to a gradient of shading of 1
     std::int64_t unlit;      // whether gradients are for opacity alone, not for shading
     const float* smooth;     // (z, y, x): values whose central differences shade; or null
+    // A network with values of its own, in place of those of the frame, which then say where there
+    // is a value.
+    FhashNetwork network;    // null for none
+    const std::int64_t* network_sizes;
+    const std::int64_t* network_levels;
+    const std::int64_t* network_layers;
+    std::int64_t network_path;
+    std::int64_t network_whole;  // whether there is a value at all places of the frame
+    double network_low, network_span;  // the value of its 0, and the change to that of its 1
+    std::int64_t* network_status;      // takes what it returns where it fails
 };
 
 struct FhashCell {
     double value, gx, gy, gz;
 };
 
+// Places at which a network is evaluated together, and its values there, with NaN where it fails.
+struct FhashPoints {
+    int count = 0;
+    double x[FHASH_POINTS], y[FHASH_POINTS], z[FHASH_POINTS];
+    float values[FHASH_POINTS];
+    float slopes[FHASH_POINTS][4];  // per key frame and vertex, t, z, y, x, if asked for
+
+    void add(double at_x, double at_y, double at_z) {
+        x[count] = at_x; y[count] = at_y; z[count++] = at_z;
+    }
+
+    void evaluate(const FhashMarch& m, bool sloped) {
+        const double time = 0;
+        const double* const places[4] = {&time, z, y, x};
+        std::int64_t columns[8];
+        for (int a = 0; a < 4; a++) {
+            columns[2 * a] = reinterpret_cast<std::int64_t>(places[a]);
+            columns[2 * a + 1] = a > 0;
+        }
+        const std::int64_t status =
+            m.network(m.network_sizes, m.network_levels, m.network_layers, columns, count,
+                      m.network_path, values, sloped ? slopes[0] : nullptr, nullptr);
+        if (status) *m.network_status = status;
+        const float low = (float)m.network_low, span = (float)m.network_span;
+        for (int i = 0; i < count; i++) {
+            const float unit = values[i] < 0 ? 0.f : values[i] > 1 ? 1.f : values[i];
+            values[i] = status ? std::numeric_limits<float>::quiet_NaN() : low + unit * span;
+            for (int a = 1; sloped && a < 4; a++) {
+                const float slope = slopes[i][a] * span;
+                slopes[i][a] = slope - slope == 0 ? slope : 0.f;
+            }
+        }
+    }
+};
+
 // The trilinear value at a place, clamped to the frame, and its gradient per vertex. A vertex of no
 // weight need not have a value; where it has none, the gradient has none (NaN). values: (z, y, x)
 // of the frame's shape.
 inline FhashCell fhash_cell_in(const FhashMarch& m, const float* values, double x, double y,
-                               double z) {
+                               double z, bool sloped = true) {
     using std::max;
     using std::min;
     const int nx = (int)m.shape[2], ny = (int)m.shape[1], nz = (int)m.shape[0];
@@ -102,6 +154,15 @@ inline FhashCell fhash_cell_in(const FhashMarch& m, const float* values, double 
     const double near = mix(mix(c[0], c[1], fx), mix(c[2], c[3], fx), fy);
     const double far = mix(mix(c[4], c[5], fx), mix(c[6], c[7], fx), fy);
     const double value = mix(near, far, fz);
+    if (m.network && values == m.values) {
+        if (!(value == value)) return {value, value, value, value};
+        FhashPoints point;
+        point.add(x, y, z);
+        point.evaluate(m, sloped);
+        const float(&slopes)[4] = point.slopes[0];
+        if (!sloped) return {point.values[0], 0, 0, 0};
+        return {point.values[0], slopes[3], slopes[2], slopes[1]};
+    }
     const double gx = (1 - fz) * ((1 - fy) * (c[1] - c[0]) + fy * (c[3] - c[2])) +
                       fz * ((1 - fy) * (c[5] - c[4]) + fy * (c[7] - c[6]));
     const double gy = (1 - fz) * ((1 - fx) * (c[2] - c[0]) + fx * (c[3] - c[1])) +
@@ -112,8 +173,9 @@ inline FhashCell fhash_cell_in(const FhashMarch& m, const float* values, double 
 }
 
 // The same for the values of the frame.
-inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z) {
-    return fhash_cell_in(m, m.values, x, y, z);
+inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z,
+                               bool sloped = true) {
+    return fhash_cell_in(m, m.values, x, y, z, sloped);
 }
 
 // Replace the gradient of a cell by central differences: half of the difference between the values
@@ -129,9 +191,9 @@ inline void fhash_central(const FhashMarch& m, const float* values, double x, do
     for (int c = 0; c < 3; c++) {
         const double here = at[c];
         at[c] = here + 1;
-        const double behind = fhash_cell_in(m, values, at[0], at[1], at[2]).value;
+        const double behind = fhash_cell_in(m, values, at[0], at[1], at[2], false).value;
         at[c] = here - 1;
-        const double before = fhash_cell_in(m, values, at[0], at[1], at[2]).value;
+        const double before = fhash_cell_in(m, values, at[0], at[1], at[2], false).value;
         const double difference = (behind - before) / 2;
         at[c] = here;
         if (difference == difference) *slopes[c] = difference;

@@ -4,6 +4,7 @@
 
 #include "march.hpp"
 #include "march_grading.hpp"
+#include "march_network.hpp"
 #include "march_packet.hpp"
 #include "march_projections.hpp"
 #include "march_rays.hpp"
@@ -128,6 +129,8 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::march(Counters& counted) {
         if (!(state & 1)) continue;
         counted.passes++;
         Seen seen;
+        if (m.network) sample_network(counted, seen);
+        else
 #if defined(FHASH_AVX512)
         if constexpr (FLAGS & WIDE) sample_wide(*this, counted, seen);
         else

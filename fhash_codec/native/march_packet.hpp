@@ -25,6 +25,7 @@ constexpr int SIDE = 4;   // rays along a packet's side
 constexpr int N = 16;     // rays of a packet
 constexpr int TILE = 16;  // pixels along a tile's side
 constexpr int BLOCK = 32; // samples whose opacity is summed in single precision
+constexpr int AHEAD = 16; // samples of a ray at which a network may be evaluated ahead
 
 // Flags of what is drawn.
 constexpr int SHADED = 1;    // the volume is lit by its gradients
@@ -43,10 +44,10 @@ const float NONE = std::numeric_limits<float>::quiet_NaN();
 const float FAR = std::numeric_limits<float>::infinity();
 
 struct Counters {
-    int64_t rays = 0, passes = 0, samples = 0, gradients = 0, skips = 0;
+    int64_t rays = 0, passes = 0, samples = 0, gradients = 0, skips = 0, evaluations = 0;
     void add_to(int64_t* counters) const {
-        const int64_t all[] = {rays, passes, samples, gradients, skips};
-        for (int n = 0; n < 5; n++) counters[n] += all[n];
+        const int64_t all[] = {rays, passes, samples, gradients, skips, evaluations};
+        for (int n = 0; n < 6; n++) counters[n] += all[n];
     }
 };
 
@@ -118,6 +119,10 @@ template <int FLAGS> struct Packet {
     alignas(64) int on[N];        // whether the ray takes part in this pass
     alignas(64) int where[N];     // of the largest value
     alignas(64) int quitting[N];  // whether the sample is the last before a gap, for surfaces
+    // Values of a network at the samples from `begun` on; bits of `held` say at which of them.
+    float ahead[N][AHEAD];
+    int begun[N];
+    unsigned held[N];
     // The same in double precision.
     alignas(64) double red[N], green[N], blue[N], clear[N];  // colours and light behind the blocks
     alignas(64) double rest[N];                // length of the shorter step, in steps
@@ -162,6 +167,11 @@ template <int FLAGS> struct Packet {
     void mend();
     FHASH_INLINE void slopes(const float* values);
     void mend_slopes(const float* values);
+    // march_network.hpp
+    void sample_network(Counters& counted, Seen& seen);
+    void look_ahead(Counters& counted);
+    void slopes_of_network();
+    void central_slopes_of_network();
     // march_surfaces.hpp
     void see(int l, double sample, const FhashCell* cell, Counters& counted);
     FHASH_INLINE double root(int l, double level, double to, double now, Counters& counted) const;
@@ -190,9 +200,9 @@ template <int FLAGS> struct Packet {
         const double nearest = min(sample, (double)farthest[l]);
         return clamp(o[c][l] + nearest * d[c][l], (double)low[c], (double)high[c]);
     }
-    FhashCell cell(int l, double sample) const {
+    FhashCell cell(int l, double sample, bool sloped = true) const {
         return fhash_cell_at(m, place_of(l, 0, sample), place_of(l, 1, sample),
-                             place_of(l, 2, sample));
+                             place_of(l, 2, sample), sloped);
     }
     // The cell in which a ray enters or leaves, its place snapped onto the faces. Otherwise
     // rounding decides whether a ray meets a surface that coincides with a face.
@@ -203,7 +213,7 @@ template <int FLAGS> struct Packet {
             for (const double face : m.seen[c])
                 place[c] = std::fabs(place[c] - face) < 1e-7 ? face : place[c];
         }
-        return fhash_cell_at(m, place[0], place[1], place[2]);
+        return fhash_cell_at(m, place[0], place[1], place[2], false);
     }
     // Join the block of samples to what was seen before.
     FHASH_INLINE void flush() {

@@ -9,7 +9,7 @@ namespace {
 template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::keep_lost_maximum() {
     for (int l = 0; l < N; l++) {
         if (!on[l] || value[l] == value[l]) continue;
-        const float here = (float)fhash_cell_at(m, px[l], py[l], pz[l]).value;
+        const float here = (float)fhash_cell_at(m, px[l], py[l], pz[l], false).value;
         const float ranked = FLAGS & MINIMUM ? -here : here;
         if (ranked > best[l]) best[l] = ranked, where[l] = k[l];
     }

@@ -210,6 +210,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::reset() {
         where[l] = quitting[l] = 0;
         previous[l] = NONE;
     }
+    for (int l = 0; m.network && l < N; l++) held[l] = 0, begun[l] = 0;
 }
 
 // The directions towards the light, and halfway between the light and the eye.

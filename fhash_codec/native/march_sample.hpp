@@ -118,6 +118,7 @@ FHASH_INLINE float value_at(const FhashMarch& m, const float* values, float x, f
 
 // Replace the gradients by central differences of values, as fhash_central does.
 template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes(const float* values) {
+    if (m.network && values == m.values) return central_slopes_of_network();
     int lost = 0;
 #if defined(FHASH_AVX512)
     if constexpr (FLAGS & WIDE) {

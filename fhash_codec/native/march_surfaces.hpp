@@ -34,7 +34,7 @@ FHASH_INLINE double Packet<FLAGS>::root(int l, double level, double to, double n
     double place = f_high == 0 ? high : low;
     for (int turn = 0; turn < 60 && f_low != 0 && f_high != 0 && fabs(high - low) > 1e-7; turn++) {
         place = high - f_high * (high - low) / (f_high - f_low);
-        const double f = cell(l, place).value - level;
+        const double f = cell(l, place, false).value - level;
         counted.samples++;
         if (!(f == f)) break;
         if (f == 0) break;
@@ -93,7 +93,7 @@ template <int FLAGS> void Packet<FLAGS>::cross(int l, double to, double now, Cou
         const double level = m.surface[s][0];
         if ((before < level) == (now < level)) continue;
         const double place = root(l, level, to, now, counted);
-        const double there = cell(l, place).value;
+        const double there = cell(l, place, false).value;
         if (there == there) roots[crossed++] = {place, s};
     }
     std::sort(roots, roots + crossed,

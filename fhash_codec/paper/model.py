@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -459,6 +460,17 @@ class PointSampler:
             ],
             np.int64,
         )
+
+    def fields(self) -> dict[str, Any]:
+        """Fields by which the native marcher calls `fhash_network_points`; valid as long as this."""
+        function = ctypes.cast(self._library.fhash_network_points, ctypes.c_void_p)
+        return {
+            "network": function.value,
+            "network_sizes": self._sizes,
+            "network_levels": self._levels,
+            "network_layers": self._layers,
+            "network_path": self._path,
+        }
 
     def sample(
         self,

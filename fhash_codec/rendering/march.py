@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32
+from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32, c_void_p
 from dataclasses import dataclass
 from itertools import count, product
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import native
+from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.bricks import SIDE, Bricks, cells_of, smoothed
 from fhash_codec.rendering.light import flatness, slope_scale, smoothing
 from fhash_codec.rendering.march_task import (
@@ -116,6 +117,15 @@ class March(ctypes.Structure):
         ("grade_scale", c_double),
         ("unlit", c_int64),
         ("smooth", POINTER(c_float)),
+        ("network", c_void_p),
+        ("network_sizes", POINTER(c_int64)),
+        ("network_levels", POINTER(c_int64)),
+        ("network_layers", POINTER(c_int64)),
+        ("network_path", c_int64),
+        ("network_whole", c_int64),
+        ("network_low", c_double),
+        ("network_span", c_double),
+        ("network_status", POINTER(c_int64)),
     )
 
     def __init__(self, **fields: Any) -> None:
@@ -211,6 +221,15 @@ class MarchInput:
             "floor": floor,
             **_light_fields(task, first, stride),
         }
+        if frame.network is not None:
+            start, stop = map(scaling.number, (frame.network.low, frame.network.high))
+            fields |= {
+                **frame.network.fields,
+                "network_whole": not np.isnan(values).any(),
+                "network_low": start,
+                "network_span": stop - start,
+                "network_status": np.zeros(1, np.int64),
+            }
         return cls(
             fields=fields,
             low=low,
@@ -286,7 +305,7 @@ PROJECTIONS = {
     "attenuated": ATTENUATED,
 }
 """Flags of the values that rays show instead of the volume."""
-COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks")
+COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks", "evaluations")
 """Names of the counters of `fhash_march`, in its order."""
 
 
@@ -298,6 +317,7 @@ def march_native(
     threads: int | None = None,
     *,
     path: int = 0,
+    progress: Progress = silent,
 ) -> Marched:
     """The picture of a task, as `march` describes it.
 
@@ -331,7 +351,9 @@ def march_native(
         normal=normal,
         path=path,
     )
-    counters = _march(library, structure, task, threads)
+    counters = _march(library, structure, task, threads, progress)
+    if frame.network is not None and given.fields["network_status"].any():
+        raise MemoryError("not enough memory to evaluate points")
     return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
 
 
@@ -358,11 +380,12 @@ def _skipping_fields(
     distance = bricks.distance(task)
     # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
     by_cells = not (task.surfaces and task.step > 0.99 * shortest)
+    # The values of a network are not known before it is evaluated: any brick may show something.
     cells = (
         bricks.remembered(
             "cells", task.visibility, lambda: cells_of(library, bricks, task, distance)
         )
-        if by_cells
+        if by_cells and "network" not in given.fields
         else None
     )
     if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
@@ -394,7 +417,7 @@ def _entries(table: Table, step: float) -> tuple[Single, npt.NDArray[np.float64]
 
 def _smooth(given: MarchInput, task: Task, bricks: Bricks) -> Single | None:
     """The smoothed values that what is lit is shaded by; None where those of the frame do."""
-    if not given.smoothing or not (task.shaded or task.surfaces):
+    if not given.smoothing or not (task.shaded or task.surfaces) or "network" in given.fields:
         return None
     values: Single = given.fields["values"]
     if values is not bricks.values:  # scaled for this task alone
@@ -433,7 +456,11 @@ def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
 
 
 def _march(
-    library: ctypes.CDLL, structure: March, task: Task, threads: int | None
+    library: ctypes.CDLL,
+    structure: March,
+    task: Task,
+    threads: int | None,
+    progress: Progress,
 ) -> dict[str, int]:
     """March all rays in several threads, into the buffers of a structure; the counters."""
     flags = SHADED * task.shaded | LIT * (task.light is not None)
@@ -444,9 +471,11 @@ def _march(
     spans = _spans(task)
     groups = count()
 
-    def work(_: int) -> npt.NDArray[np.int64]:
+    def work(thread: int) -> npt.NDArray[np.int64]:
         counters = np.zeros(len(COUNTED), dtype=np.int64)
         while (group := next(groups)) < len(spans):
+            if thread == 0:
+                progress("marching", group, len(spans), "")
             first, stop = spans[group]
             failed = library.fhash_march(
                 ctypes.byref(structure), flags, first, stop, counters.ctypes.data
@@ -487,7 +516,12 @@ def _tiles(ends: npt.NDArray[np.float64], limits: tuple[int, int]) -> tuple[int,
 
 
 def march(
-    frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: int | None = None
+    frame: Frame,
+    task: Task,
+    *,
+    bricks: Bricks | None = None,
+    threads: int | None = None,
+    progress: Progress = silent,
 ) -> Marched:
     """March the rays of a task.
 
@@ -505,6 +539,7 @@ def march(
         task: what to march.
         bricks: of the frame; made if None.
         threads: most threads; None for all processors.
+        progress: is told of the rows that are done.
 
     Raises InputError for more than MAX_SURFACES surfaces.
     """
@@ -516,11 +551,11 @@ def march(
         surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
         projection = dataclasses.replace(task, surfaces=())
         front, back = (
-            march_native(native.library(), frame, part, bricks, threads)
+            march_native(native.library(), frame, part, bricks, threads, progress=progress)
             for part in (surfaces, projection)
         )
         return _over(front, back)
-    return march_native(native.library(), frame, task, bricks, threads)
+    return march_native(native.library(), frame, task, bricks, threads, progress=progress)
 
 
 def _over(front: Marched, back: Marched) -> Marched:

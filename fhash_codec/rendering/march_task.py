@@ -201,6 +201,20 @@ def extinctions_in(extinctions: Double, length: float) -> Double:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class NetworkValues:
+    """A network that the native marcher evaluates at its samples.
+
+    Attributes:
+        fields: of the marcher, that name the network's function and what it takes.
+        low, high: values of the network's 0 and 1.
+    """
+
+    fields: Mapping[str, Any]
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
     """The values of one time step in a region.
 
@@ -208,11 +222,14 @@ class Frame:
         values: float32 (z, y, x), NaN where there is none.
         first: vertex (z, y, x) of the domain at which the first value lies.
         stride: vertices of the domain from one value to the next (level of detail).
+        network: has the values, also between vertices, for the native marcher; then `values` are
+            any numbers where there is one.
     """
 
     values: Single
     first: tuple[int, int, int]
     stride: int = 1
+    network: NetworkValues | None = None
 
     def bounds(self, grid: Grid) -> Double:
         """The box (3, 2), x, y, z, in vertices of the domain, in which the frame has values.

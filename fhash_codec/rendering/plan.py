@@ -226,6 +226,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
         through += f"; {plan.why_mode}"
     if plan.mode == "stream":
         return f"stream: one sample of each ray in a pass, straight through {through}"
+    if arrays_on(plan.scene.march.device) is NUMPY and plan.task.rays.grid.warp is None:
+        return f"arm: up to 16 samples of each ray at a time, straight through {through}"
     budget = plan.scene.march.samples_per_pass
     samples = "as many samples as rays" if budget is None else f"{budget:,} samples"
     return f"arm: {samples} in a pass, straight through {through}"
@@ -317,11 +319,12 @@ LONG_RAY = 10**5
 """Samples of a ray above which a warning is given: a picture of usual size then takes minutes."""
 MAX_RAY_SAMPLES = 10**8
 """Most samples of a ray: more would take days, and Ctrl-C cannot stop a ray being marched."""
-VERTICES_A_SAMPLE = 64
-"""Vertices that a CPU decodes in the time of a sample through the network, rounded up.
+VERTICES_A_SAMPLE = 4
+"""Vertices of a frame for each sample that a picture may take, from which on the samples are taken
+through the network.
 
-`bench render --part break-even` shows 43 where a first picture takes equally long either way. A
-second picture of the same step is faster from the kept frame.
+A sample takes 0.4 to 0.6 times as long as a vertex is decoded; but a second picture of the same
+step is faster from the kept frame.
 """
 MAX_RAYS = 2**26
 """Most rays of a picture: more would not fit in the memory of most machines."""

@@ -254,7 +254,9 @@ class Renderer:
         if upcoming is not None:
             self._start_prefetch(upcoming)
         task, secondary_rays = _lit(plan, decoded, progress)
+        progress("marching", 0, 1, "")
         marched = self._march(plan, task, decoded, progress)
+        progress("marching", 1, 1, "")
         more = {
             "secondary_rays": secondary_rays,
             "decoded_vertices": 0 if decoded is None else decoded.frame.values.size,
@@ -283,14 +285,21 @@ class Renderer:
         """March the rays of a task in the mode of the plan."""
         if plan.mode == "cache":
             assert decoded is not None
-            progress("marching", 0, 1, "")
-            marched = march(decoded.frame, task, bricks=decoded.bricks, threads=self.threads)
-            progress("marching", 1, 1, "")
-            return marched
+            return march(
+                decoded.frame,
+                task,
+                bricks=decoded.bricks,
+                threads=self.threads,
+                progress=progress,
+            )
         arrays = arrays_on(plan.scene.march.device)
-        field: Field = NetworkField(self.volume, plan.step, plan.units, arrays)
+        network = NetworkField(self.volume, plan.step, plan.units, arrays)
+        field: Field = network
         if task.rays.grid.warp is not None:
             field = WarpedField(field, task.rays.grid.warp)
+        elif plan.mode == "arm" and (frame := network.frame) is not None:
+            bricks, threads = network.bricks, self.threads
+            return march(frame, task, bricks=bricks, threads=threads, progress=progress)
         return stream(
             field,
             task,
@@ -431,12 +440,14 @@ def _histogram_of(volume: Volume) -> Histogram:
     scale = volume.value_range.scale
     edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
     counts = np.zeros(BINS, dtype=np.int64)
+    lod = 0
+    while float(np.prod(volume.box.shape)) / 8**lod > COARSE:
+        lod += 1
     if volume.profile == "compact":
-        vertices = float(np.prod([high - low for low, high in volume.box]))
-        lod = 0
-        while vertices / 8**lod > COARSE:
-            lod += 1
         frames = [volume.read_lod(step, lod) for step in sorted({0, last // 2, last})]
+    elif lod:
+        z, y, x = np.ix_(*(range(low, high, 1 << lod) for low, high in volume.box))
+        frames = [np.asarray(volume.sample(t=last // 2, z=z, y=y, x=x))]
     else:
         frames = [volume.read(last // 2)]
     for frame in frames:

@@ -22,6 +22,7 @@ from fhash_codec.rendering.march_task import (
     Arrays,
     Frame,
     Grading,
+    NetworkValues,
     Task,
     Units,
 )
@@ -65,7 +66,7 @@ class HostInference:
 
     def __init__(self, network: Network, key: float, arrays: Arrays) -> None:
         self._arrays = arrays
-        self._sampler = PointSampler(PointTables.of_box(network, key), key)
+        self.sampler = PointSampler(PointTables.of_box(network, key), key)
 
     def values(self, places: Array) -> Array:
         return self._arrays.array(self._sampled(places, None))
@@ -79,7 +80,7 @@ class HostInference:
         """Values (n,) at places; derivatives by t, z, y and x (n, 4) go into `slopes`."""
         values = np.empty(len(places), np.float32)
         x, y, z = self._arrays.host(places).T
-        self._sampler.sample((np.zeros(1), z, y, x), values, slopes, usable_threads())
+        self.sampler.sample((np.zeros(1), z, y, x), values, slopes, usable_threads())
         return values
 
 
@@ -244,6 +245,16 @@ class NetworkField(CoresetField):
         )
         with arrays.guarded():
             self._inference = inference_in(arrays, model.network, volume.key_times.key_index(step))
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame for the native marcher, as long as this is; None on a device."""
+        if not isinstance(self._inference, HostInference) or self.arrays.device is not None:
+            return None
+        x, y, z = self.first
+        fields = self._inference.sampler.fields()
+        network = NetworkValues(fields=fields, low=self._low, high=self._high)
+        return Frame(values=self.bricks.values, first=(int(z), int(y), int(x)), network=network)
 
     def values(self, places: Array, wanted: Array | None = None) -> Array:
         arrays, (at, inside) = self.arrays, self.inside(places)

@@ -167,7 +167,9 @@ def streamed(frame: Frame, task: Task) -> Marched:
     return replace(marched, counters={**marched.counters, "evaluations": 0})
 
 
-def by_stream(library: object, frame: Frame, task: Task, *_: object) -> Marched:
+def by_stream(
+    library: object, frame: Frame, task: Task, *_: object, progress: object = None
+) -> Marched:
     """A stand-in for `march_native`."""
     return streamed(frame, task)
 

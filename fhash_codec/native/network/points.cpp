@@ -3,6 +3,8 @@
 
 #include "guard.hpp"
 
+#include <vector>
+
 #if defined(FHASH_VECTORS)
 namespace {
 

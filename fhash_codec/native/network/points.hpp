@@ -9,7 +9,7 @@
 
 #include <cstdint>
 #include <cstring>
-#include <vector>
+#include <memory>
 
 #include "core.hpp"
 #include "vector.hpp"
@@ -71,6 +71,13 @@ struct Task {
     std::int64_t inputs;
 };
 
+// Numbers that nobody has set: zeros would cost a tile of a small network as much as its layers.
+template <class T> struct Unset {
+    explicit Unset(std::int64_t count) : numbers(new T[count]) {}
+    T* data() { return numbers.get(); }
+    std::unique_ptr<T[]> numbers;
+};
+
 // The numbers of one tile. Rows have TILE numbers.
 struct Workspace {
     explicit Workspace(const Task& task)
@@ -80,12 +87,12 @@ struct Workspace {
           changes(AXES * task.inputs * TILE),
           hidden(task.layer_count * task.width * TILE),
           slopes(2 * (task.width + task.inputs) * TILE) {}
-    std::vector<double> offsets;  // (levels, TILE): the first corner's place in the part
-    std::vector<float> after;     // (levels, AXES, TILE): weights of the corners after the points
-    std::vector<float> inputs;    // (inputs, TILE)
-    std::vector<float> changes;   // (AXES, inputs, TILE): derivatives of the inputs
-    std::vector<float> hidden;    // (layers, width, TILE): outputs of each layer
-    std::vector<float> slopes;    // two times (width or inputs, TILE)
+    Unset<double> offsets;  // (levels, TILE): the first corner's place in the part
+    Unset<float> after;     // (levels, AXES, TILE): weights of the corners after the points
+    Unset<float> inputs;    // (inputs, TILE)
+    Unset<float> changes;   // (AXES, inputs, TILE): derivatives of the inputs
+    Unset<float> hidden;    // (layers, width, TILE): outputs of each layer
+    Unset<float> slopes;    // two times (width or inputs, TILE)
 };
 
 // Find the cells around the points of a tile at one level. The quotient position (R - 1) / (S - 1)

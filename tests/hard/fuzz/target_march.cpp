@@ -196,6 +196,21 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
     m.normal = flags.on(6) && m.depth ? arrays.normal.data() : nullptr;
 }
 
+// A network of one wave, which is asked for no more places than it is made for.
+int64_t stand_in(const int64_t*, const int64_t*, const int64_t*, const int64_t* columns,
+                 int64_t count, int64_t, float* values, float* slopes, float*) {
+    require(count >= 0 && count <= FHASH_POINTS, "more points than fit");
+    for (int64_t i = 0; i < count; i++) {
+        double sum = 0;
+        for (int axis = 1; axis < 4; axis++)
+            sum += reinterpret_cast<const double*>(columns[2 * axis])[i];
+        values[i] = (float)(0.5 + std::sin(sum));
+        for (int axis = 0; slopes && axis < 4; axis++)
+            slopes[4 * i + axis] = axis ? (float)std::cos(sum) : 0.0F;
+    }
+    return 0;
+}
+
 }  // namespace
 
 void march(Reader& in) {
@@ -215,7 +230,15 @@ void march(Reader& in) {
     const int64_t effects =
         projected ? projections[in.within(0, 3)] : in.within(0, 1) ? drawn | 1 | 256 : drawn;
     if (projected) m.surfaces = 0;
-    int64_t counters[5] = {};
+    int64_t status = 0;
+    if (in.within(0, 1)) {
+        m.network = stand_in;
+        m.network_low = m.low;
+        m.network_span = (double)(m.entries - 1) / m.scale;
+        m.network_whole = in.within(0, 1);
+        m.network_status = &status;
+    }
+    int64_t counters[6] = {};
     fhash_march(&m, effects, 0, ((m.width + 15) / 16) * ((m.height + 15) / 16), counters);
     // The light that is left adds up to no more than all, whatever the values are.
     for (std::size_t pixel = 0; pixel < arrays.depth.size(); pixel++) {

@@ -14,13 +14,13 @@ import pytest
 from frame_field import CENTRAL, NETWORK_SCENES, SCENES, FrameField
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.paper.engines.fused import engine as start
 from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.rendering.bricks import Palette
 from fhash_codec.rendering.grid import Grid
 from fhash_codec.rendering.image import Image
-from fhash_codec.rendering.march import march
+from fhash_codec.rendering.march import march, march_native
 from fhash_codec.rendering.march_task import (
     NUMPY,
     Arrays,
@@ -225,10 +225,68 @@ def test_both_ways_make_one_picture_of_a_network_near_that_of_its_vertices(
             for mode in ("cache", "stream", "arm")
         )
     assert streamed[..., 3].max() > 0.05
-    np.testing.assert_array_equal(streamed, adaptive)
+    np.testing.assert_allclose(streamed, adaptive, atol=2e-5)
     assert np.isfinite(streamed).all()
     # Between vertices the network has values of its own: they make all the difference.
     assert np.mean(np.abs(streamed - cache)) < 0.02
+
+
+@pytest.mark.parametrize("path", [0, 1, 2])
+@pytest.mark.parametrize("scene", NETWORK_SCENES.values(), ids=NETWORK_SCENES)
+def test_native_and_streamed_samples_of_a_network_make_one_picture(
+    files: dict[str, Path], planned: Planned, scene: dict[str, Any], path: int
+) -> None:
+    with fhash_codec.open(files["paper"]) as volume:
+        field, task = planned(volume, scene, NUMPY)
+        assert isinstance(field, NetworkField)
+        assert field.frame is not None
+        whole = not np.isnan(field.frame.values).any()
+        here = march_native(native.library(), field.frame, task, field.bricks, path=path)
+        there = stream(field, task, adaptive=True)
+    np.testing.assert_allclose(here.rgba, there.rgba, atol=5e-4)
+    assert np.mean(np.abs(here.rgba - there.rgba)) < 2e-5
+    assert here.rgba[..., 3].max() > 0.05
+    for mine, other in ((here.depth, there.depth), (here.normal, there.normal)):
+        if mine is not None and other is not None:
+            np.testing.assert_allclose(mine, other, atol=2e-3)
+    if not task.skipping and not task.surfaces:
+        assert here.counters["samples"] == there.counters["samples"]
+        assert here.counters["evaluations"] >= there.counters["evaluations"]
+    assert not whole  # samples beside vertices without a value are among them
+
+
+def test_native_samples_of_a_network_of_all_vertices(tmp_path: Path, planned: Planned) -> None:
+    z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (9, 10, 11)), indexing="ij")
+    values = np.sin(5 * x * y) * np.cos(3 * z)
+    config = fhash_codec.EncodeConfig(profile="paper", epochs=200, width=8)
+    fhash_codec.encode(values.astype(np.float32)[None], tmp_path / "run.fhz", config)
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        scene = {
+            "transfer_function": {"opacity": [[-1, 0.1], [1, 0.4]]},
+            "effects": {"shading": True},
+        }
+        field, task = planned(volume, scene, NUMPY)
+        assert isinstance(field, NetworkField)
+        assert field.frame is not None
+        assert not np.isnan(field.frame.values).any()
+        here = march(field.frame, task, bricks=field.bricks)
+        there = stream(field, task, adaptive=True)
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(here.rgba, there.rgba, atol=5e-4)
+
+
+def test_native_march_tells_of_a_network_that_has_no_memory(
+    files: dict[str, Path], planned: Planned
+) -> None:
+    with fhash_codec.open(files["paper"]) as volume:
+        field, task = planned(volume, {}, NUMPY)
+        assert isinstance(field, NetworkField)
+        assert field.frame is not None
+        assert field.frame.network is not None
+        broken = {**field.frame.network.fields, "network_path": 3}  # a path that no machine has
+        frame = replace(field.frame, network=replace(field.frame.network, fields=broken))
+        with pytest.raises(MemoryError):
+            march(frame, task, bricks=field.bricks)
 
 
 def assert_same_work(here: Marched, there: Marched, scene: dict[str, Any]) -> None:

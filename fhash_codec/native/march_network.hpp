@@ -1,0 +1,147 @@
+// Samples of the rays of a packet from a network, which is evaluated ahead of the rays.
+//
+// The network takes FHASH_POINTS places at a time, of up to AHEAD samples of each ray: the fewer
+// rays are left, the more samples of each (adaptive ray marching: paper, algorithm 1).
+#pragma once
+
+#include "march_packet.hpp"
+#include "march_sample.hpp"
+#include "march_skip.hpp"
+
+namespace {
+
+// Evaluate the network at the next samples of all rays, the nearest first, where the frame says
+// that there is a value.
+template <int FLAGS> void Packet<FLAGS>::look_ahead(Counters& counted) {
+    FhashPoints points;
+    int ray[FHASH_POINTS], sample[FHASH_POINTS];
+    for (int l = 0; l < N; l++) {
+        const int gone = k[l] - begun[l];
+        begun[l] = k[l];
+        if (gone >= AHEAD) held[l] = 0;
+        if (!held[l] || !gone) continue;
+        held[l] >>= gone;
+        for (int j = 0; j + gone < AHEAD; j++) ahead[l][j] = ahead[l][j + gone];
+    }
+    for (int j = 0; j < AHEAD && points.count < FHASH_POINTS; j++)
+        for (int l = 0; l < N && points.count < FHASH_POINTS; l++) {
+            if (k[l] + j >= count[l] || (held[l] >> j & 1) || (j == 0 && !on[l])) continue;
+            if (j > 0 && m.distance && !visible(l, k[l] + j)) continue;
+            const float f = min((float)(k[l] + j), farthest[l]);
+            const float x = clamp(ox[l] + f * dx[l], low[0], high[0]);
+            const float y = clamp(oy[l] + f * dy[l], low[1], high[1]);
+            const float z = clamp(oz[l] + f * dz[l], low[2], high[2]);
+            if (!m.network_whole) {
+                const float there = value_at(m, m.values, x, y, z);
+                if (!(there == there)) continue;
+            }
+            ray[points.count] = l;
+            sample[points.count] = j;
+            points.add(x, y, z);
+        }
+    points.evaluate(m, false);
+    counted.evaluations += points.count;
+    for (int i = 0; i < points.count; i++) {
+        ahead[ray[i]][sample[i]] = points.values[i];
+        held[ray[i]] |= 1u << sample[i];
+    }
+}
+
+// `sample` for a network.
+template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen& seen) {
+    const float* const table = m.table;
+    const float top = (float)(m.entries - 1);
+    const float least = (float)m.low, scale = (float)m.scale;
+    int wanting = 0;
+    for (int l = 0; l < N; l++) {
+        const float f = min((float)k[l], farthest[l]);
+        px[l] = clamp(ox[l] + f * dx[l], low[0], high[0]);
+        py[l] = clamp(oy[l] + f * dy[l], low[1], high[1]);
+        pz[l] = clamp(oz[l] + f * dz[l], low[2], high[2]);
+        value[l] = m.network_whole ? 0.f : value_at(m, m.values, px[l], py[l], pz[l]);
+        const int j = k[l] - begun[l];
+        const bool there = j >= 0 && j < AHEAD && (held[l] >> j & 1);
+        wanting |= on[l] && value[l] == value[l] && !there;
+    }
+    if (wanting) look_ahead(counted);
+    for (int l = 0; l < N; l++) {
+        counted.samples += on[l];
+        const int j = k[l] - begun[l];
+        const bool known = value[l] == value[l] && on[l];
+        const float here = value[l] = known ? ahead[l][j] : NONE;
+        seen.lost |= on[l] && !known;
+        if (FLAGS & MAXIMUM) {
+            const float ranked = FLAGS & MINIMUM ? -here : here;
+            const bool better = on[l] && ranked > best[l];
+            best[l] = better ? ranked : best[l];
+            where[l] = better ? k[l] : where[l];
+            continue;
+        }
+        seen.ending |= on[l] && k[l] == last[l];
+        const float e = clamp((here - least) * scale, 0.f, top);
+        const int t = 4 * (int)e;
+        const float share = e - (float)(int)e;
+        at[l] = e;
+        alpha[l] = known ? table[t + 3] + share * (table[t + 7] - table[t + 3]) : 0.f;
+        seen.any |= alpha[l] > 0;
+        if (FLAGS & WIDE) {
+            cr[l] = table[t] + share * (table[t + 4] - table[t]);
+            cg[l] = table[t + 1] + share * (table[t + 5] - table[t + 1]);
+            cb[l] = table[t + 2] + share * (table[t + 6] - table[t + 2]);
+        }
+        gx[l] = gy[l] = gz[l] = 0;
+    }
+    if ((FLAGS & SHADED) && seen.any && !m.central) slopes_of_network();
+}
+
+// The gradients of a pass where it has an opacity: those of the network itself.
+template <int FLAGS> void Packet<FLAGS>::slopes_of_network() {
+    FhashPoints points;
+    int ray[N];
+    for (int l = 0; l < N; l++) {
+        if (!(alpha[l] > 0)) continue;
+        ray[points.count] = l;
+        points.add(px[l], py[l], pz[l]);
+    }
+    points.evaluate(m, true);
+    for (int i = 0; i < points.count; i++) {
+        gx[ray[i]] = points.slopes[i][3] * (float)m.gradient[0];
+        gy[ray[i]] = points.slopes[i][2] * (float)m.gradient[1];
+        gz[ray[i]] = points.slopes[i][1] * (float)m.gradient[2];
+    }
+}
+
+// The same by central differences, as fhash_central does.
+template <int FLAGS> void Packet<FLAGS>::central_slopes_of_network() {
+    float* const to[3] = {gx, gy, gz};
+    bool lost[N] = {};
+    for (int c = 0; c < 3; c++) {
+        FhashPoints points;
+        int ray[2 * N];
+        for (int l = 0; l < N; l++) {
+            if (!(alpha[l] > 0)) continue;
+            for (const float move : {1.f, -1.f}) {
+                float place[3] = {px[l], py[l], pz[l]};
+                place[c] = clamp(place[c] + move, 0.f, (float)(m.shape[2 - c] - 1));
+                const float there = value_at(m, m.values, place[0], place[1], place[2]);
+                lost[l] |= !(there == there);
+                ray[points.count] = l;
+                points.add(place[0], place[1], place[2]);
+            }
+        }
+        points.evaluate(m, false);
+        for (int i = 0; i < points.count; i += 2)
+            to[c][ray[i]] =
+                0.5f * (points.values[i] - points.values[i + 1]) * (float)m.gradient[c];
+    }
+    for (int l = 0; l < N; l++) {
+        if (!lost[l]) continue;
+        FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
+        fhash_central(m, m.values, px[l], py[l], pz[l], here);
+        gx[l] = known_or_zero(here.gx * m.gradient[0]);
+        gy[l] = known_or_zero(here.gy * m.gradient[1]);
+        gz[l] = known_or_zero(here.gz * m.gradient[2]);
+    }
+}
+
+}  // namespace
