@@ -462,7 +462,7 @@ class PointSampler:
         )
 
     def fields(self) -> dict[str, Any]:
-        """Fields by which the native marcher calls `fhash_network_points`; valid as long as this."""
+        """Fields by which the native marcher calls `fhash_network_points`, as long as this is."""
         function = ctypes.cast(self._library.fhash_network_points, ctypes.c_void_p)
         return {
             "network": function.value,
