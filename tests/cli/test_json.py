@@ -104,6 +104,12 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     outputs["encode --explain"] = explained
     words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]
     outputs["encode --time-budget"] = [*outputs["encode"], parsed(fhash(*words, "--json", "-q"))]
+    words[-4:] = ["--profile", "auto", "--max-error-rel", "0.05", "--epochs", "1"]
+    chosen = parsed(fhash(*words, "--json", "-q"))
+    outputs["encode --profile auto"] = [*outputs["encode"], chosen]
+    words[words.index("auto")] = "network"
+    fhash(*words, "-q")
+    outputs["info"].append(parsed(fhash("info", path, "--json")))
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)
