@@ -27,6 +27,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
 from fhash_formats.container.header import (
     BITS_ARRAY,
+    LAYERS,
     MASK_ARRAY,
     PLAIN_FEATURE,
     RESIDUAL,
@@ -112,7 +113,8 @@ class _Export:
             for table in self._volume.tables
             if SPARSE in model or f"tables/level_{table.level}" not in self._arrays
         ]
-        rewritten = (*(f"tables/level_{table.level}/" for table in coded), f"{MASK_ARRAY}/")
+        levels = (f"tables/level_{table.level}/" for table in coded)
+        rewritten = (*levels, f"{MASK_ARRAY}/", f"{LAYERS}/")
         copied = {
             name: array
             for name, array in self._arrays.items()
@@ -124,6 +126,10 @@ class _Export:
         write_coordinates(self._writer, self._volume.coords)
         for name, array in copied.items():
             self._copy(name, array)
+        if LAYERS in self._arrays:
+            for number, layer in enumerate(self._volume.mlp.layers, start=1):
+                for name, values in zip(("weight", "bias"), layer, strict=True):
+                    self._writer.add_whole(f"mlp/{name}_{number}", values)
         for table in coded:
             self._write_table(table)
         if keys:

@@ -16,7 +16,7 @@ from fhash_codec.features.key_frames import KeyTimes
 from fhash_codec.features.occupancy import pack, packed_bytes
 from fhash_codec.header import metadata_of
 from fhash_formats.container import Container
-from fhash_formats.container.header import BITS_ARRAY, MASK_ARRAY, RESIDUAL, TABLE
+from fhash_formats.container.header import BITS_ARRAY, LAYERS, MASK_ARRAY, RESIDUAL, TABLE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Coordinate, SourceMetadata
 from fhash_formats.support.arrays import Mask
@@ -161,15 +161,15 @@ class Card:
         return {"shape": shape, **self._stored(RESIDUAL, "")}
 
     def _describe_mlp(self) -> list[dict[str, Any]]:
-        """The layers: (weights, biases) in arrays of their own, or packed in the coded table."""
-        count = len(self.mlp.weights)
+        """The layers: in arrays of their own, all in one, or packed in the coded table."""
+        count, together = len(self.mlp.weights), LAYERS in self.container.arrays
         return [
             {
                 "layer": number,
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
                 **self._stored(
-                    f"mlp/weight_{number}",
+                    LAYERS if together else f"mlp/weight_{number}",
                     f"packed in the codec of {self._table_path}",
                 ),
             }
@@ -200,7 +200,8 @@ class Card:
         stored = self.container.arrays
         found = [key for key in stored if key == name or key.startswith(f"{name}/")]
         arrays = [stored[key] for key in found]
-        bias = stored.get(name.replace("weight_", "bias_")) if name.startswith("mlp/") else None
+        beside = name.replace("weight_", "bias_")
+        bias = stored.get(beside) if beside != name else None
         if not arrays:
             return {"path": "", "coding": otherwise, "bytes": 0}
         first, size = arrays[0], sum(array.nbytes_stored for array in arrays)

@@ -17,9 +17,17 @@ from fhash_codec.boxes import TABLE_AXES, Box, Sizes, TableSource
 from fhash_codec.features import occupancy
 from fhash_codec.features.bricks import Coreset
 from fhash_codec.features.occupancy import Bits, read_bits, write_bits
-from fhash_codec.paper.network import Architecture, Network, NumberType, Resolution, SparseFrame
+from fhash_codec.paper.network import (
+    Architecture,
+    Layer,
+    Network,
+    NumberType,
+    Resolution,
+    SparseFrame,
+)
 from fhash_formats.container import Container, ContainerWriter, StoredArray
-from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE
+from fhash_formats.container.header import BITS_ARRAY, COUNTS, FRINGE, LAYERS
+from fhash_formats.container.reader import layer_shapes
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.support.arrays import Longs, Mask, Single
 
@@ -469,10 +477,7 @@ def load_network(container: Container) -> Network:
     size = model["embedding_size"]
     levels = tuple(tuple(level) for level in model["levels"])
     needed = _needed(container)
-    layers = tuple(
-        (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read())
-        for n in range(1, model["hidden_layers"] + 2)
-    )
+    layers = _layers(container)
     try:
         return Network(
             levels=levels,
@@ -484,6 +489,20 @@ def load_network(container: Container) -> Network:
         )
     except InputError as error:
         raise DamagedFileError(f"{container.path}: {error}") from error
+
+
+def _layers(container: Container) -> tuple[Layer, ...]:
+    """Return weight (out, in) and bias (out,) of each layer of the network in a container."""
+    arrays, shapes = container.arrays, layer_shapes(container.header["model"])
+    if LAYERS not in arrays:
+        names = [f"mlp/{{}}_{number}" for number in range(1, len(shapes) + 1)]
+        return tuple(
+            (arrays[name.format("weight")].read(), arrays[name.format("bias")].read())
+            for name in names
+        )
+    ends = np.cumsum([outputs * (inputs + 1) for outputs, inputs in shapes])
+    parts = zip(np.split(arrays[LAYERS].read(), ends[:-1]), shapes, strict=True)
+    return tuple((part[:-n].reshape(n, inputs), part[-n:]) for part, (n, inputs) in parts)
 
 
 def table_name(level: int) -> str:

@@ -25,7 +25,7 @@ from fhash_codec.paper.network import Architecture, Layer, Network
 from fhash_codec.paper.storage import Bricks, mix_components, needed_by, write_occupancy
 from fhash_formats.container import ContainerWriter, shard_shape
 from fhash_formats.container.array import transform_codecs
-from fhash_formats.container.header import MASK_ARRAY, MASK_FEATURES
+from fhash_formats.container.header import LAYERS, MASK_ARRAY, MASK_FEATURES
 from fhash_formats.container.stored import ChunkCache
 from fhash_formats.support.arrays import Mask, Single
 from fhash_formats.support.threads import chunk_region
@@ -483,7 +483,14 @@ def quantised_layers(
 def write_layers(
     writer: ContainerWriter, layers: Sequence[Layer], settings: Sequence[TileSettings | None]
 ) -> None:
-    """Write the layers of `quantised_layers`."""
+    """Write the layers of `quantised_layers`: as one array, unless some are coded.
+
+    An array takes some 500 bytes beside its numbers.
+    """
+    if not any(settings):
+        numbers = [part.ravel() for layer in layers for part in layer]
+        writer.add_whole(LAYERS, np.concatenate(numbers))
+        return
     for number, ((weight, bias), how) in enumerate(zip(layers, settings, strict=True), start=1):
         codecs = None if how is None else transform_codecs(how)
         writer.add_whole(f"mlp/weight_{number}", weight, codecs=codecs)

@@ -269,6 +269,8 @@ FRINGE = "fringe"
 """Value of the key: the vertices that the coreset and its fringe need."""
 COUNTS = "counts"
 """Attribute of a table: number of its vertices at each time node."""
+LAYERS = "mlp/parameters"
+"""Name of the array of all layers of a network of coded tables, in place of two of each."""
 RESIDUAL = "residual"
 """Feature of files of the profile paper with this array: what the network's values lack."""
 KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, PLAIN_FEATURE, SPARSE_FEATURE, RESIDUAL})

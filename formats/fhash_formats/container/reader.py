@@ -21,6 +21,7 @@ from fhash_formats.container.header import (
     CODED,
     COMPACT,
     COUNTS,
+    LAYERS,
     LOWEST,
     MASK_ARRAY,
     MASK_FEATURES,
@@ -183,7 +184,11 @@ def _required_arrays(
         sparse = SPARSE in model
         shape = _sparse_shape(name, level, size, arrays) if sparse else (*level, size)
         yield name, shape, (model["tables"],)
-    for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
+    shapes = layer_shapes(model)
+    if LAYERS in arrays and model["tables"] == CODED:
+        yield LAYERS, (sum(outputs * (inputs + 1) for outputs, inputs in shapes),), ("float32",)
+        shapes = []
+    for number, (outputs, inputs) in enumerate(shapes, start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)
     # The profile compact merges its features.

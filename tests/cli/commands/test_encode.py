@@ -211,7 +211,7 @@ def test_auto_says_what_both_models_cost(fhash: Fhash, data: Path, tmp_path: Pat
     words = ("encode", data, "-o", tmp_path / "run.fhz", "--profile", "auto", "--psnr", "30")
     result = fhash(*words, "--effort", "1", "--epochs", "2")
     assert result.exit_code == 0
-    assert "fhash: lattice: the other does not keep the promise" in result.stderr
+    assert "fhash: lattice: the fewest bytes, --access balanced" in result.stderr
     lines = result.stdout.splitlines()
     assert any(line.startswith("network (F-Hash)  about") for line in lines)
     assert sum("taken: " in line for line in lines) == 1

@@ -11,6 +11,9 @@ import fhash_codec
 from fhash_codec import EncodeConfig, InputError, Renderer, Scene
 from fhash_codec.plain import export_plain
 from fhash_codec.rendering.scenes import Marching
+from fhash_formats.container import Container
+from fhash_formats.container.reader import check_arrays
+from fhash_formats.errors import DamagedFileError
 
 ABSOLUTE = 0.004
 FEATURE = "interval:0.3:2"
@@ -89,10 +92,24 @@ def test_sum_is_the_same_however_it_is_read(run: Path) -> None:
             assert (ends[1] - ends[0]) / 0.02 == pytest.approx(slope, rel=0.05, abs=2e-3)
 
 
-def test_plain_export_has_the_same_values(run: Path, tmp_path: Path) -> None:
+def test_plain_export_has_the_same_values_and_layers(run: Path, tmp_path: Path) -> None:
     export_plain(run, tmp_path / "plain.fhz")
     with fhash_codec.open(run) as volume, fhash_codec.open(tmp_path / "plain.fhz") as plain:
         np.testing.assert_array_equal(plain[...], volume[...])
+        assert volume.container.arrays["mlp/parameters"].shape == (volume.mlp.parameters,)
+        assert "mlp/weight_1" not in volume.container.arrays
+        for (weight, bias), number in zip(volume.mlp.layers, (1, 2, 3), strict=True):
+            stored = plain.container.arrays
+            np.testing.assert_array_equal(stored[f"mlp/weight_{number}"].read(), weight)
+            np.testing.assert_array_equal(stored[f"mlp/bias_{number}"].read(), bias)
+
+
+def test_layers_of_another_size_are_damage(run: Path) -> None:
+    with Container.open(run) as container:
+        arrays = {name: array._metadata for name, array in container.arrays.items()}
+        header = {**container.header, "model": {**container.header["model"], "width": 17}}
+        with pytest.raises(DamagedFileError, match="mlp/parameters"):
+            check_arrays(header, arrays)
 
 
 def test_pictures_are_of_the_sum(run: Path) -> None:
