@@ -79,6 +79,23 @@ def test_the_start_depends_on_the_seed_alone(noise_coreset) -> None:
     )
 
 
+@pytest.mark.parametrize("hidden_layers", [1, 2, 3])
+def test_layers_of_one_number_start_near_the_identity(noise_coreset, hidden_layers) -> None:
+    coreset = noise_coreset((2, 5, 6, 7))
+    architecture = Architecture.for_box(
+        coreset.box.shape, 2, embedding_size=1, hidden_layers=hidden_layers, width=16
+    )
+    _, layers = initial_parameters(architecture, coreset, 4).dense(architecture)
+    finest = np.linspace(-0.5, 1, 7, dtype=np.float32)
+    numbers = np.concatenate([finest[None], np.zeros((architecture.inputs - 1, 7), np.float32)])
+    for number, (weight, bias) in enumerate(layers, start=1):
+        numbers = weight @ numbers + bias[:, None]
+        if number < len(layers):
+            numbers = np.maximum(numbers, 0)
+    np.testing.assert_allclose(numbers[0], finest, atol=0.2)
+    assert np.abs(numbers[0] - finest).max() > 1e-4  # the other neurons count, too
+
+
 def test_embeddings_of_samples_start_where_those_of_whole_bricks_did(
     noise_coreset, in_coreset, monkeypatch
 ) -> None:
