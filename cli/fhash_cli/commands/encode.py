@@ -144,6 +144,7 @@ def command(
     time_budget, report_folder = options.time_budget, options.report_folder
     explain, as_json, quiet = options.explain, options.as_json, options.quiet
     others = explain or time_budget is not None or report_folder is not None
+    others = others or settings["profile"] == "auto"
     wish = WishedPart.of(options.part, options.plan, with_others=others)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
