@@ -19,6 +19,7 @@ from fhash_codec.boxes import Box
 from fhash_codec.config import MODELS, EncodeConfig
 from fhash_codec.cost.plan import (
     EPOCHS,
+    MIN_STEPS,
     Allowance,
     Facts,
     Wish,
@@ -40,6 +41,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import (
     FhashError,
     FhashWarning,
+    InputError,
     InterruptedEncodingError,
     QualityError,
 )
@@ -349,9 +351,31 @@ def choose_model(
     if config.ratio is not None:
         chosen = config.of_profile("compact")
         return ModelChoice(config=chosen, prices=(), crop="", why="only the lattice takes --ratio")
+    try:
+        part, prices = _prices(series, config, progress)
+    except InputError as error:
+        # Where the settings themselves are wrong, the encoding says so.
+        chosen = config.of_profile("compact")
+        why = f"no crop of the middle steps can be fitted: {error}"
+        return ModelChoice(config=chosen, prices=(), crop="", why=why)
+    best, why = _cheapest(prices, config.access, budget)
+    return ModelChoice(
+        config=config.of_profile(best.profile),
+        prices=tuple(prices),
+        crop=described(part),
+        why=why,
+    )
+
+
+def _prices(
+    series: Series, config: EncodeConfig, progress: Progress
+) -> tuple[Series, list[ModelPrice]]:
+    """The part of a series that both models were fitted to, and their prices for the whole."""
     part, asked, counted = series, config, None
     if prod(series.shape) > CROP_VERTICES:
-        middle = StepsSeries(series, [series.shape[0] // 2])
+        steps = series.shape[0]
+        first = max(0, (steps - MIN_STEPS) // 2)
+        middle = StepsSeries(series, range(first, min(steps, first + MIN_STEPS)))
         extent = select_features(middle, config.of_profile("compact"), silent).extent
         counted = extent.fraction * prod(series.shape)
         part = cropped(series, CROP_VERTICES, extent.box)
@@ -361,15 +385,7 @@ def choose_model(
         progress("fitting", number, len(MODELS), f"{MODELS[profile]} on {described(part)}")
         prices.append(_price(part, asked.of_profile(profile), counted))
     progress("fitting", len(MODELS), len(MODELS), "")
-    if part is not series:
-        prices = _foretold(prices, series, config)
-    best, why = _cheapest(prices, config.access, budget)
-    return ModelChoice(
-        config=config.of_profile(best.profile),
-        prices=tuple(prices),
-        crop=described(part),
-        why=why,
-    )
+    return part, prices if part is series else _foretold(prices, series, config)
 
 
 def _for_part(config: EncodeConfig, whole: Facts, part: Facts) -> EncodeConfig:

@@ -233,8 +233,8 @@ def coded_bound(config: EncodeConfig, series: Series, value_range: ValueRange) -
     bound = config.max_error
     if config.max_error_rel is not None:
         bound = config.max_error_rel * (value_range.high - value_range.low)
-    if bound is None:
-        return None
+    if bound is None or value_range.low == value_range.high:
+        return None  # a range of one value decodes to it
     spacing = np.finfo(decoded_type(series.dtype)).eps
     rounding = ROUNDINGS * float(spacing) * max(map(abs, value_range.floats))
     if bound <= 2 * rounding:

@@ -689,6 +689,18 @@ def test_both_models_are_fitted_to_a_crop(monkeypatch: pytest.MonkeyPatch) -> No
     assert moved.psnr == pytest.approx(60 - 20 * np.log10(whole.width / part.width))
 
 
+def test_a_crop_without_the_feature_leaves_the_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(0).random((12, 6, 7, 8), np.float32)
+    values[11, 2, 3, 4] = 9.0
+    monkeypatch.setattr(own, "CROP_VERTICES", 1000)
+    asked = EncodeConfig(profile="auto", features=("interval:5:10",), max_error=0.1)
+    choice = own.choose_model(ArraySeries(values), asked)
+    assert (choice.config.profile, choice.prices) == ("compact", ())
+    assert "no crop of the middle steps" in choice.why
+    changing = own.choose_model(ArraySeries(values), replace(asked, features=("change:0.5",)))
+    assert len(changing.prices) == 2
+
+
 def test_a_ratio_leaves_no_choice() -> None:
     choice = own.choose_model(SERIES, EncodeConfig(profile="auto", ratio=20.0))
     assert (choice.config.profile, choice.prices) == ("compact", ())

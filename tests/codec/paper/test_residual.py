@@ -65,6 +65,14 @@ def test_bounds_hold_at_every_value(
             assert np.nanmax(error) <= bound
 
 
+def test_values_of_no_range_need_no_residual(tmp_path: Path) -> None:
+    values = np.full((2, 4, 5, 6), 3.0, np.float32)
+    fhash_codec.encode(values, tmp_path / "a.fhz", settings(max_error=None, max_error_rel=0.01))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert "residual" not in volume.container.arrays
+        np.testing.assert_array_equal(volume[...], values)
+
+
 def test_sum_is_the_same_however_it_is_read(run: Path) -> None:
     values = swirl()
     with fhash_codec.open(run) as volume:
