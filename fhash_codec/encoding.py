@@ -79,7 +79,7 @@ def encode(
     KeyboardInterrupt passes through, and the same call starts again.
 
     Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
-    to be out of reach, and MissingDependencyError for the profile paper without torch. Raises
+    to be out of reach, and MissingDependencyError for CUDA without torch. Raises
     QualityError, with the figures of the file in the error, if the file
     misses what the settings promise. It is written nevertheless: as `path` where that is free; an
     older file stays as it is, and the new one is written beside it (`missed_path`). Warns

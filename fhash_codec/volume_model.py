@@ -254,16 +254,18 @@ class Card:
         if inside.any():
             first = self.box.first
             local = [(along - low)[inside] for along, low in zip(space, first, strict=True)]
+            residual = self._residual
             if slopes is None:
                 values[inside] = self._model.sample(keys[inside], local)
+                if residual is not None:
+                    values[inside] += residual.sample(steps[inside], local)
             else:
                 found = self._model.sample_with_gradient(keys[inside], local)
                 values[inside], slopes[inside] = found
                 slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
-            if self._residual is not None:
-                further, by = self._residual.sample_with_gradient(steps[inside], local)
-                values[inside] += further
-                if slopes is not None:
+                if residual is not None:
+                    more, by = residual.sample_with_gradient(steps[inside], local)
+                    values[inside] += more
                     slopes[inside] += by
         return values, slopes
 

@@ -29,6 +29,7 @@ from fhash_codec.cost.plan import (
     paper_config,
 )
 from fhash_codec.cost.prediction import Prediction, predictor
+from fhash_codec.cost.probe import reported
 from fhash_codec.cost.results import Curve, Encoded, seconds_text
 from fhash_codec.encoding import encode
 from fhash_codec.features.key_frames import KeyTimes, time_axis
@@ -273,7 +274,7 @@ SIDE = 256
 REGION = 16
 """Vertices along each axis of the region."""
 PLACES = 5
-"""Regions of which the median is taken."""
+"""Random places of which the median is taken; `uses` reads at one more as a warm-up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -426,7 +427,7 @@ def _foretold(
 def _price(part: Series, config: EncodeConfig, counted: float | None) -> ModelPrice:
     """The price of a model. counted: vertices of the coreset of the whole; None for those here."""
     with TemporaryDirectory() as folder:
-        report, kept = _reported(part, Path(folder) / "part.fhz", config)
+        report, kept = reported(part, Path(folder) / "part.fhz", config)
         with open_volume(report["path"]) as volume:
             sizes = {name: each.nbytes_stored for name, each in volume.container.arrays.items()}
             growing = sum(n for name, n in sizes.items() if name.split("/")[0] in SCALED)
@@ -443,16 +444,6 @@ def _price(part: Series, config: EncodeConfig, counted: float | None) -> ModelPr
             between=_between(part, config, Path(folder) / "half.fhz"),
             kept=kept,
         )
-
-
-def _reported(part: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
-    """The report of an encoding, and whether it keeps its promise."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FhashWarning)
-        try:
-            return encode(part, path, config), True
-        except QualityError as error:
-            return error.figures, False
 
 
 def _region_seconds(path: str, shape: Shape) -> Iterator[float]:
@@ -474,7 +465,7 @@ def _between(part: Series, config: EncodeConfig, path: Path) -> float | None:
         return None
     kept = range(0, steps, 2)
     half = replace(config, key_frames="all")
-    report, _ = _reported(StepsSeries(part, kept), path, half)
+    report, _ = reported(StepsSeries(part, kept), path, half)
     times = KeyTimes(times=time_axis(part.coords["t"].values), key_frames=tuple(kept))
     with open_volume(report["path"]) as volume:
         errors = Errors(volume.value_range.high - volume.value_range.low)

@@ -504,9 +504,15 @@ def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:
 
 def _encoded(part: Series, config: EncodeConfig) -> dict[str, Any]:
     """The report of an encoding into a file that is thrown away."""
-    with TemporaryDirectory() as folder, warnings.catch_warnings():
+    with TemporaryDirectory() as folder:
+        return reported(part, Path(folder) / "part.fhz", config)[0]
+
+
+def reported(part: Series, path: Path, config: EncodeConfig) -> tuple[dict[str, Any], bool]:
+    """The report of an encoding, without warnings, and whether it keeps its promise."""
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)
         try:
-            return encode(part, Path(folder) / "part.fhz", config)
+            return encode(part, path, config), True
         except QualityError as error:
-            return error.figures
+            return error.figures, False

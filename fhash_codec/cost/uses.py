@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.boxes import Box
-from fhash_codec.cost.encodings import KeptFile
+from fhash_codec.cost.encodings import PLACES, REGION, KeptFile
 from fhash_codec.cost.plan import Allowance, Facts
 from fhash_codec.cost.results import Picture, Read
 from fhash_codec.measure.errors import psnr
@@ -40,10 +40,6 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.series import Series
 from fhash_formats.support.arrays import Single, Values
 
-REGION = 16
-"""Vertices of a region along each axis."""
-PLACES = 5
-"""Random places of each kind of read; one more is a warm-up."""
 LEVELS = (1, 2, 3)
 """Levels of detail."""
 

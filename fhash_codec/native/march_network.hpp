@@ -49,7 +49,6 @@ template <int FLAGS> void Packet<FLAGS>::look_ahead(Counters& counted) {
 
 // `sample` for a network.
 template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen& seen) {
-    const float* const table = m.table;
     const float top = (float)(m.entries - 1);
     const float least = (float)m.low, scale = (float)m.scale;
     int wanting = 0;
@@ -78,17 +77,10 @@ template <int FLAGS> void Packet<FLAGS>::sample_network(Counters& counted, Seen&
             continue;
         }
         seen.ending |= on[l] && k[l] == last[l];
-        const float e = clamp((here - least) * scale, 0.f, top);
-        const int t = 4 * (int)e;
-        const float share = e - (float)(int)e;
-        at[l] = e;
-        alpha[l] = known ? table[t + 3] + share * (table[t + 7] - table[t + 3]) : 0.f;
+        at[l] = clamp((here - least) * scale, 0.f, top);
+        look_up(l);
+        if (!known) alpha[l] = 0;
         seen.any |= alpha[l] > 0;
-        if (FLAGS & WIDE) {
-            cr[l] = table[t] + share * (table[t + 4] - table[t]);
-            cg[l] = table[t + 1] + share * (table[t + 5] - table[t + 1]);
-            cb[l] = table[t + 2] + share * (table[t + 6] - table[t + 2]);
-        }
         gx[l] = gy[l] = gz[l] = 0;
     }
     if ((FLAGS & SHADED) && seen.any && !m.central) slopes_of_network();
@@ -134,14 +126,8 @@ template <int FLAGS> void Packet<FLAGS>::central_slopes_of_network() {
             to[c][ray[i]] =
                 0.5f * (points.values[i] - points.values[i + 1]) * (float)m.gradient[c];
     }
-    for (int l = 0; l < N; l++) {
-        if (!lost[l]) continue;
-        FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
-        fhash_central(m, m.values, px[l], py[l], pz[l], here);
-        gx[l] = known_or_zero(here.gx * m.gradient[0]);
-        gy[l] = known_or_zero(here.gy * m.gradient[1]);
-        gz[l] = known_or_zero(here.gz * m.gradient[2]);
-    }
+    for (int l = 0; l < N; l++)
+        if (lost[l]) mend_slope(l, m.values);
 }
 
 }  // namespace

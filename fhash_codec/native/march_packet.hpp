@@ -167,6 +167,8 @@ template <int FLAGS> struct Packet {
     void mend();
     FHASH_INLINE void slopes(const float* values);
     void mend_slopes(const float* values);
+    void mend_slope(int l, const float* values);
+    FHASH_INLINE void look_up(int l);
     // march_network.hpp
     void sample_network(Counters& counted, Seen& seen);
     void look_ahead(Counters& counted);

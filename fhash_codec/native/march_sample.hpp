@@ -87,6 +87,17 @@ template <int FLAGS> void Packet<FLAGS>::shorten() {
     }
 }
 
+// The opacity and the colours of one ray at its entry of the table.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::look_up(int l) {
+    const int t = (int)at[l];
+    const float* const entry = m.table + 4 * t;
+    const float share = at[l] - t;
+    alpha[l] = entry[3] + share * (entry[7] - entry[3]);
+    cr[l] = entry[0] + share * (entry[4] - entry[0]);
+    cg[l] = entry[1] + share * (entry[5] - entry[1]);
+    cb[l] = entry[2] + share * (entry[6] - entry[2]);
+}
+
 // Look again at samples without a value: on faces of cells a vertex without one may have no weight.
 template <int FLAGS> void Packet<FLAGS>::mend() {
     for (int l = 0; l < N; l++) {
@@ -95,13 +106,7 @@ template <int FLAGS> void Packet<FLAGS>::mend() {
         if (!(here.value == here.value)) continue;
         value[l] = (float)here.value;
         at[l] = (float)clamp((here.value - m.low) * m.scale, 0.0, (double)(m.entries - 1));
-        const int t = (int)at[l];
-        const float* const entry = m.table + 4 * t;
-        const float share = at[l] - t;
-        alpha[l] = entry[3] + share * (entry[7] - entry[3]);
-        cr[l] = entry[0] + share * (entry[4] - entry[0]);
-        cg[l] = entry[1] + share * (entry[5] - entry[1]);
-        cb[l] = entry[2] + share * (entry[6] - entry[2]);
+        look_up(l);
         gx[l] = known_or_zero(here.gx * m.gradient[0]);
         gy[l] = known_or_zero(here.gy * m.gradient[1]);
         gz[l] = known_or_zero(here.gz * m.gradient[2]);
@@ -150,14 +155,17 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes(const float* values
 
 // Look again at the central differences of a pass, as `mend` does.
 template <int FLAGS> void Packet<FLAGS>::mend_slopes(const float* values) {
-    for (int l = 0; l < N; l++) {
-        if (!(alpha[l] > 0)) continue;
-        FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
-        fhash_central(m, values, px[l], py[l], pz[l], here);
-        gx[l] = known_or_zero(here.gx * m.gradient[0]);
-        gy[l] = known_or_zero(here.gy * m.gradient[1]);
-        gz[l] = known_or_zero(here.gz * m.gradient[2]);
-    }
+    for (int l = 0; l < N; l++)
+        if (alpha[l] > 0) mend_slope(l, values);
+}
+
+// The same for one ray.
+template <int FLAGS> void Packet<FLAGS>::mend_slope(int l, const float* values) {
+    FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
+    fhash_central(m, values, px[l], py[l], pz[l], here);
+    gx[l] = known_or_zero(here.gx * m.gradient[0]);
+    gy[l] = known_or_zero(here.gy * m.gradient[1]);
+    gz[l] = known_or_zero(here.gz * m.gradient[2]);
 }
 
 }  // namespace

@@ -143,15 +143,15 @@ def command(
     """
     time_budget, report_folder = options.time_budget, options.report_folder
     explain, as_json, quiet = options.explain, options.as_json, options.quiet
-    others = explain or time_budget is not None or report_folder is not None
-    others = others or settings["profile"] == "auto"
+    auto = settings["profile"] == "auto"
+    others = explain or auto or time_budget is not None or report_folder is not None
     wish = WishedPart.of(options.part, options.plan, with_others=others)
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     several = variables_to_encode(source, data, options.components, quiet=quiet)
     if several is not None:
         alone = (time_budget, report_folder, wish, options.verbose or None)
-        if settings["profile"] == "auto" or any(given is not None for given in alone):
+        if auto or any(given is not None for given in alone):
             raise click.UsageError(
                 "--profile auto, --time-budget, --report, --part and -v are for one variable"
             )

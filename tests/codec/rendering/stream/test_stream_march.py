@@ -242,7 +242,8 @@ def test_native_and_streamed_samples_of_a_network_make_one_picture(
         assert field.frame is not None
         whole = not np.isnan(field.frame.values).any()
         here = march_native(native.library(), field.frame, task, field.bricks, path=path)
-        there = stream(field, task, adaptive=True)
+        there, plainly = (stream(field, task, adaptive=adaptive) for adaptive in (True, False))
+    np.testing.assert_array_equal(there.rgba, plainly.rgba)
     np.testing.assert_allclose(here.rgba, there.rgba, atol=5e-4)
     assert np.mean(np.abs(here.rgba - there.rgba)) < 2e-5
     assert here.rgba[..., 3].max() > 0.05
