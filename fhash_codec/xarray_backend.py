@@ -20,12 +20,12 @@ from fhash_codec.boxes import Box, index_ranges, slice_of
 from fhash_codec.config import EncodeConfig
 from fhash_codec.dataset import Handle, absolute, acquire, release
 from fhash_codec.encoding import encode
-from fhash_codec.features.selection import labelled_series
 from fhash_codec.header import figure_attributes, history_line, source_attributes
 from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError, UnsupportedFileError
 from fhash_formats.readers.common.cf import SCALING
+from fhash_formats.readers.labelled import labelled_series
 from fhash_formats.series import (
     AXES,
     NO_AXIS,

@@ -31,7 +31,7 @@ from fhash_codec.comparison import report
 from fhash_codec.config import EncodeConfig
 from fhash_codec.features.features import InTime, parse_feature
 from fhash_codec.features.scan import Scan, SpanScan
-from fhash_codec.features.selection import LazyFrames, Source, mask_files, open_source
+from fhash_codec.features.selection import Source, mask_files, open_source
 from fhash_codec.header import check_name
 from fhash_codec.measure.value_range import Ranks
 from fhash_codec.progress import Progress, recording, silent, stage
@@ -167,9 +167,8 @@ def _submit_to(client: Any, source: Source, series: Series) -> Submit:
             return client.submit(run_on_worker, work, path, 0, None, *arguments)
 
         return read_file
-    lazy = getattr(series, "lazy", None)
-    if isinstance(lazy, LazyFrames):
-        array = lazy.array
+    array = series.lazy
+    if array is not None:
         labels = {whole: HeldSteps(series, whole=whole) for whole in (False, True)}
 
         def take_frames(work: Any, steps: range, *arguments: Any, whole: bool = False) -> Any:

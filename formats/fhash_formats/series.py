@@ -389,6 +389,7 @@ class Series(ABC):
         remark: what is to be said of the times, "" for nothing.
         not_stored: what of the values nobody wrote; None where nothing is known of such.
         held: all frames (t, z, y, x) as `read` gives them; None where they are not in memory.
+        lazy: the array of dask (t, z, y, x) that the frames are computed from, if they are.
         defaults: default fill values of the format that were met in the frames read so far, of an
             array that declares no other. Among floats they are missing.
     """
@@ -409,6 +410,7 @@ class Series(ABC):
     remark: str = ""
     not_stored: NotStored | None = None
     held: npt.NDArray[Any] | None = None
+    lazy: Any = None
     defaults: AbstractSet[float] = frozenset()
     _metadata: SourceMetadata | Callable[[], SourceMetadata | None] | None = None
 

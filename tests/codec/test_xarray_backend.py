@@ -23,9 +23,9 @@ from xarray.core import indexing
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.features.selection import labelled_series
 from fhash_codec.xarray_backend import FhashArray, FhashBackend, Form, SideBySide
 from fhash_formats.errors import FhashWarning, InputError, UnsupportedFileError
+from fhash_formats.readers.labelled import labelled_series
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate, SourceMetadata, SourceVariable
 

@@ -1,12 +1,12 @@
-"""Reader of HDF5, with openPMD and plain groups of steps."""
+"""Reader of HDF5 and NetCDF-4, with openPMD: datasets by name, their dimensions by scales."""
 
 from __future__ import annotations
 
 import importlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,57 +14,46 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.cf import (
-    NAMES,
-    SCALING,
-    Column,
-    Packing,
-    beside,
-    counts_steps,
-    packing,
-    role_of_coordinate,
-    role_of_name,
-    usable,
-    written_times,
-)
-from fhash_formats.readers.common.file_series import (
-    FileSeries,
-    Request,
-    Stamp,
-    StoredFiles,
-    StoredValues,
-    refusing,
-)
-from fhash_formats.readers.common.layout import (
-    Dimension,
-    Layout,
-    Read,
-)
-from fhash_formats.readers.common.listing import Listed, listing
-from fhash_formats.readers.common.stored_parts import Hdf5Sources, not_stored, warn_of_column
-from fhash_formats.readers.common.surroundings import (
-    MAX_ARRAYS,
-    Arranged,
-    Stored,
-    Wanted,
-    metadata_of,
-    named_dimensions,
-    warn_left_out,
-)
+from fhash_formats.readers.common.file_series import Request, Stamp, refusing
+from fhash_formats.readers.common.layout import Read
+from fhash_formats.readers.common.stored_parts import Hdf5Sources
 from fhash_formats.readers.common.variables import (
-    MIN_DIMENSIONS,
-    FileOfArrays,
+    Behind,
+    Source,
     Variable,
-    expand,
-    field_reading,
+    file_source,
     parent,
     plain_name,
+    positions,
 )
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, SourceMetadata, shown_name
-from fhash_formats.support.values import PACKING, PLUMBING, json_attributes, text_of
+from fhash_formats.series import AXES
+from fhash_formats.support.values import PLUMBING, decoded_text, json_attributes, text_of
 
-CONVENTIONAL = frozenset(name for names in NAMES.values() for name in names.split())
-"""Names of coordinates, in lower case."""
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
+NETCDF_SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
+
+NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+"""Beginning of the NAME of a dimension scale that holds no values."""
+HIDDEN = "_nc4_non_coord_"
+"""Beginning of the name of a NetCDF variable that is called as a dimension, and is not along it."""
+
+DEFAULT_FILLS = {
+    "i2": -32767,
+    "u2": 65535,
+    "i4": -2147483647,
+    "u4": 4294967295,
+    "i8": -9223372036854775806,
+    "u8": 18446744073709551614,
+    "f4": 9.969209968386869e36,
+    "f8": 9.969209968386869e36,
+}
+"""NC_FILL_SHORT and so on of netcdf.h; bytes have none that counts."""
+
+
+def default_fill(dtype: np.dtype[Any]) -> float | int | None:
+    """The number that NetCDF puts where nobody wrote; None for bytes and other types."""
+    return DEFAULT_FILLS.get(dtype.newbyteorder("=").str[1:])
+
 
 FILTER_NAMES = {
     305: "LZO",
@@ -85,34 +74,91 @@ FILTER_NAMES = {
 """Names of registered HDF5 filters, for messages; the name in the file is often empty."""
 
 
-class Scalar:
-    """A dataset of one number or text, which is opened again when more of it is asked for.
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
-    HDF5 is slow at many thousands of open objects.
 
-    Attributes:
-        dtype, units: of the dataset.
+def is_hdf5(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of HDF5.
+
+    A user block of 512, 1024 or 2048 bytes may precede the signature.
+    """
+    return any(
+        head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048)
+    )
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is an HDF5 file."""
+    return is_hdf5(head)
+
+
+def says_netcdf(head: bytes, path: Path) -> bool:
+    """Whether an HDF5 file is NetCDF: by its suffix, `_NCProperties` or CF `Conventions`.
+
+    Raises InputError for a file that cannot be opened.
+    """
+    if not is_hdf5(head):
+        return False
+    if path.suffix.lower() in NETCDF_SUFFIXES:
+        return True
+    import h5py
+
+    with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
+        conventions = text_of(file.attrs.get("Conventions", "")).strip().upper()
+        return "_NCProperties" in file.attrs or conventions.startswith("CF-")
+
+
+class Attributes(Mapping[str, Any]):
+    """Attributes of an object, read at the first use.
+
+    Bytes are texts unless they stand for missing values; what h5py cannot read is left out.
     """
 
-    shape: tuple[int, ...] = ()
-    ndim, size, is_scale = 0, 1, False
+    def __init__(self, described: Any) -> None:
+        self._described = described
 
-    def __init__(self, group: Any, name: bytes, opened: Any) -> None:
+    @cached_property
+    def _values(self) -> dict[str, Any]:
         import h5py
 
-        self._group, self._name, self.dtype = group, name, opened.dtype
-        self.units = units_of(h5py.Dataset(opened)) if h5py.h5a.exists(opened, b"units") else ""
+        found = {}
+        attributes = self._described.attrs
+        for name in attributes:
+            if name in PLUMBING and name != "NAME":
+                continue
+            try:
+                value = attributes[name]
+            except (OSError, TypeError, RuntimeError):
+                continue
+            if isinstance(value, h5py.Empty):
+                if value.dtype.kind not in "SO":
+                    continue
+                value = ""
+            found[name] = _plain(name, value)
+        found.pop("NAME", None)
+        return found
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._opened(), name)
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
 
-    def __getitem__(self, places: Any) -> Any:
-        return self._opened()[places]
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
 
-    def _opened(self) -> Any:
-        import h5py
+    def __len__(self) -> int:
+        return len(self._values)
 
-        return h5py.Dataset(h5py.h5o.open(self._group.id, self._name))
+
+def _plain(name: str, value: Any) -> Any:
+    """An attribute as NetCDF has it: a number, a text, or an array of several."""
+    if isinstance(value, np.ndarray) and value.shape == (1,):
+        value = value[0]
+    if isinstance(value, np.ndarray) and value.dtype.kind in "SOU":
+        listed = value.reshape(-1).tolist()
+        if all(isinstance(each, str | bytes) for each in listed):
+            return [text_of(each) for each in listed]
+    if isinstance(value, bytes) and name not in ("_FillValue", "missing_value"):
+        return decoded_text(value)
+    return value
 
 
 @dataclass(frozen=True)
@@ -128,6 +174,30 @@ class Tree:
     datasets: dict[str, Any] = field(default_factory=dict)
     groups: dict[str, Any] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
+
+
+class Scalar:
+    """A dataset of one number or text, which is opened when it is asked for.
+
+    HDF5 is slow at many thousands of open objects.
+    """
+
+    shape: tuple[int, ...] = ()
+    is_scale, is_virtual, dims, chunks = False, False, (), None
+
+    def __init__(self, group: Any, name: bytes, dtype: np.dtype[Any]) -> None:
+        self._group, self._name, self.dtype = group, name, dtype
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._opened(), name)
+
+    def __getitem__(self, places: Any) -> Any:
+        return self._opened()[places]
+
+    def _opened(self) -> Any:
+        import h5py
+
+        return h5py.Dataset(h5py.h5o.open(self._group.id, self._name))
 
 
 def walk(root: Any) -> Tree:
@@ -156,12 +226,12 @@ def walk(root: Any) -> Tree:
         seen.add((info.fileno, info.addr))
         if isinstance(opened, h5py.h5d.DatasetID):
             if opened.get_space().get_simple_extent_type() == h5py.h5s.SCALAR:
-                tree.datasets[path] = Scalar(group, name, opened)
+                tree.datasets[path] = Scalar(group, name, opened.dtype)
             else:
                 tree.datasets[path] = h5py.Dataset(opened)
         elif isinstance(opened, h5py.h5g.GroupID):
             node = tree.groups[path] = h5py.Group(opened)
-            for child in sorted(opened, reverse=True):
+            for child in reversed(list(opened)):  # in the order of their making, or of names
                 entry = (f"{path}/{text_of(child)}".lstrip("/"), node, child)
                 hard = opened.links.get_info(child).type == h5py.h5l.TYPE_HARD
                 waiting.append(entry) if hard else linked.append(entry)
@@ -181,7 +251,54 @@ def _target(group: Any, name: bytes) -> str:
     return f"{text_of(value[1])} of {text_of(value[0])}"
 
 
-def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
+def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
+    """The datasets of an HDF5 file, of which a NetCDF-4 file is one.
+
+    netcdf: whether the rules of NetCDF hold: dimensions belong to groups, and values that nobody
+    wrote are the format's fill values.
+    """
+    import h5py
+
+    source, stamp = str(path), Stamp.of(path)
+    with refusing(f"{source} cannot be read as {'NetCDF' if netcdf else 'HDF5'}"):
+        file = h5py.File(path, "r")
+        try:
+            tree = walk(file)
+            variables = _Variables(source, path, file, tree, netcdf=netcdf).listed()
+            var = request.var and _own_name(file, tree.datasets, request.var)
+        except BaseException:
+            file.close()
+            raise
+    return file_source(
+        path,
+        variables,
+        groups={name: Attributes(group) for name, group in tree.groups.items()},
+        close=partial(_close, file, tree),
+        stamp=stamp,
+        naming=netcdf,
+        spread=not netcdf,
+        aliases={} if var == request.var else {str(request.var): str(var)},
+        default_fill=default_fill if netcdf else lambda dtype: None,
+    )
+
+
+def open_netcdf(path: Path, request: Request) -> Source:
+    """The variables of a NetCDF-4 file."""
+    return open_hdf5(path, request, netcdf=True)
+
+
+def _close(file: Any, tree: Tree) -> None:
+    """Close a file, and those that its links lead to, which stay open with their datasets."""
+    others = {}
+    for each in tree.datasets.values():
+        if not isinstance(each, Scalar) and each:
+            others[each.file.filename] = each.file
+    for other in others.values():
+        other.close()
+    file.close()
+
+
+def _own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
     """The name under which `walk` lists an object that the user called by another of its names.
 
     It is the given name where there is none.
@@ -192,118 +309,171 @@ def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
         other = None if name in tree else file.get(name)
     except (KeyError, OSError, RuntimeError):  # a link to nowhere
         other = None
-    return (
-        next((listed for listed, dataset in tree.items() if dataset == other), name)
-        if isinstance(other, h5py.Dataset)
-        else name
-    )
+    if not isinstance(other, h5py.Dataset):
+        return name
+    return next((listed for listed, dataset in tree.items() if dataset == other), name)
 
 
-def variables(tree: Tree) -> list[Variable]:
-    """Datasets that hold values, and links to nowhere, as Variables.
+class _Variables:
+    """Makes the variables of a file."""
 
-    Dimension scales and bounds are auxiliary.
-    """
-    bounds = set()
-    for name, dataset in tree.datasets.items():
-        if dataset.shape and isinstance(dataset.attrs.get("bounds"), str | bytes):
-            bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
-    return [
-        Variable(
-            name=name,
-            shape=dataset.shape,
-            dtype=dataset.dtype,
-            auxiliary=dataset.is_scale or name in bounds,
-            handle=dataset,
-            units=dataset.units if isinstance(dataset, Scalar) else units_of(dataset),
+    def __init__(self, source: str, path: Path, file: Any, tree: Tree, *, netcdf: bool) -> None:
+        self.source, self.path, self.tree, self.netcdf = source, path, tree, netcdf
+        self.home = file.filename
+        self._records: dict[str, int] = {}  # lengths of unlimited dimensions, by their scales
+        self._names = {
+            each.name: path for path, each in tree.datasets.items() if not isinstance(each, Scalar)
+        }
+
+    def listed(self) -> list[Variable]:
+        """Datasets that hold values, and links to nowhere."""
+        dims = {name: self._dimensions(name, each) for name, each in self.tree.datasets.items()}
+        for name, (_, scales) in dims.items() if self.netcdf else ():
+            dataset = self.tree.datasets[name]
+            for place, scale in enumerate(scales):
+                if scale and dataset.maxshape[place] is None:
+                    known = self._records.get(scale, 0)
+                    self._records[scale] = max(known, dataset.shape[place])
+        found: list[Variable] = []
+        for name, dataset in self.tree.datasets.items():
+            if dataset.shape is not None and not (dataset.is_scale and _is_empty(dataset)):
+                found += self._variables(name, dataset, *dims[name])
+        return found + [
+            Variable(
+                name=name,
+                shape=(),
+                dtype=np.dtype(object),
+                error=f"a link to {target}, which is not there",
+            )
+            for name, target in self.tree.broken.items()
+        ]
+
+    def _dimensions(self, path: str, dataset: Any) -> tuple[list[str | None], list[str]]:
+        """Name of each dimension, and the path of its scale, "" without one."""
+        if not dataset.shape:
+            return [], []
+        if dataset.is_scale:
+            ids = dataset.attrs.get("_Netcdf4Coordinates") if self.netcdf else None
+            if ids is not None and len(ids) == len(dataset.shape):
+                scales = [self._by_id.get(int(number), "") for number in ids]
+                return [plain_name(scale) or None for scale in scales], scales
+            own = path.replace(HIDDEN, "")
+            rest = len(dataset.shape) - 1
+            return [plain_name(own), *[None] * rest], [path, *[""] * rest]
+        names: list[str | None] = []
+        scales = []
+        for dimension in dataset.dims:
+            scale = dimension[0].name if len(dimension) else None
+            label = dimension.label
+            names.append(label or (None if scale is None else scale.rpartition("/")[2]))
+            scales.append("" if scale is None else self._names.get(scale, ""))
+        return names, scales
+
+    @cached_property
+    def _by_id(self) -> dict[int, str]:
+        """Paths of scales by the number that NetCDF gives its dimensions."""
+        return {
+            int(each.attrs["_Netcdf4Dimid"]): path
+            for path, each in self.tree.datasets.items()
+            if each.is_scale and "_Netcdf4Dimid" in each.attrs
+        }
+
+    def _variables(
+        self, path: str, dataset: Any, names: list[str | None], scales: list[str]
+    ) -> Iterator[Variable]:
+        """The variable of a dataset, and the positions that openPMD says of it."""
+        import h5py
+
+        text = h5py.check_string_dtype(dataset.dtype) is not None and dataset.dtype.kind == "O"
+        # references and lists of any length are objects, too
+        dtype = dataset.dtype if text or dataset.dtype.kind != "O" else np.dtype("V8")
+        if dtype.names is None and not text:
+            dtype = np.dtype(dtype.str)  # without what h5py notes of it, such as enumerations
+        attributes: Mapping[str, Any] = Attributes(dataset)
+        if self.netcdf and dtype == np.int8 and attributes.get("dtype") == "bool":
+            dtype = np.dtype(bool)  # as xarray writes booleans
+            attributes = {key: each for key, each in attributes.items() if key != "dtype"}
+        shape = (
+            tuple(
+                max(length, self._records.get(scale, 0))
+                if dataset.maxshape[place] is None
+                else length
+                for place, (length, scale) in enumerate(zip(dataset.shape, scales, strict=True))
+            )
+            if self._records
+            else tuple(dataset.shape)
         )
-        for name, dataset in tree.datasets.items()
-        if dataset.shape is not None
-    ] + [
-        Variable(
-            name=name,
-            shape=(),
-            dtype=np.dtype(object),
-            error=f"a link to {target}, which is not there",
+        variable = Variable(
+            name=path.replace(HIDDEN, ""),
+            shape=shape,
+            dtype=dtype,
+            dimensions=tuple(names),
+            attributes=attributes,
+            read=_padded(dataset, shape, dtype, text=text),
+            chunks=dataset.chunks,
+            auxiliary=bool(dataset.is_scale),
+            scales={
+                name: scale
+                for name, scale in zip(names, scales, strict=True)
+                if name and scale and scale != path and not _is_empty(self.tree.datasets[scale])
+            },
+            behind=partial(self._behind, path, dataset),
+            require=partial(require_filters, self.source, path, dataset),
         )
-        for name, target in tree.broken.items()
-    ]
+        lines = {}
+        if len(shape) > 1 and not any(scales):
+            group = self.tree.groups.get(parent(path))
+            around = {} if group is None else Attributes(group)
+            lines = openpmd_lines(around, attributes, shape)
+        if lines:
+            named = [f"{path}/{axis}" for axis in lines]
+            for name, values in zip(named, lines.values(), strict=True):
+                yield positions(name, values, {"units": UNITS})
+            variable = replace(
+                variable, dimensions=tuple(lines), scales=dict(zip(lines, named, strict=True))
+            )
+        yield variable
+
+    def _behind(self, path: str, dataset: Any) -> Behind:
+        with Hdf5Sources(self.source) as sources:
+            parts = sources.parts(path, dataset)
+            linked = Path(dataset.file.filename)
+            files = dict.fromkeys([linked, *sources.files])
+        return Behind(parts=parts, files=[file for file in files if file != self.path])
 
 
-def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
-    """Datasets directly in a group that may be coordinates, by lower-case conventional name.
-
-    They are 1-D numbers, or one number alone.
-    """
-    coordinates = {}
-    for path, dataset in tree.items():
-        place, _, name = path.rpartition("/")
-        if (
-            place == group
-            and name.lower() in CONVENTIONAL
-            and dataset.shape is not None
-            and len(dataset.shape) < 2
-            and usable(dataset.dtype)
-        ):
-            coordinates[name.lower()] = column(path, dataset)
-    return coordinates
+def _is_empty(scale: Any) -> bool:
+    """Whether a scale is that of a dimension without values."""
+    return text_of(scale.attrs.get("NAME", "")).startswith(NOT_A_VARIABLE)
 
 
-def texts_of(
-    tree: Mapping[str, Any], group: str, length: int
-) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
-    """Datasets of so many texts directly in a group, with a name of times: path, texts, attributes.
+def _padded(dataset: Any, shape: Sequence[int], dtype: np.dtype[Any], *, text: bool) -> Read:
+    """The read of a dataset; its fill value stands where an unlimited dimension has grown since."""
 
-    Names are those of `roles.NAMES`.
-    """
-    for path, dataset in tree.items():
-        place, _, name = path.rpartition("/")
-        told = place == group and name.lower() in NAMES["t"].split()
-        if told and dataset.shape == (length,) and dataset.dtype.kind in "SO":
-            yield path, dataset[()], json_attributes(dataset.attrs)
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        values = np.asarray(dataset[places])
+        if text:
+            texts = [text_of(each) for each in values.reshape(-1)]
+            return np.array(texts, dtype=object).reshape(values.shape)
+        return values if dtype.names else values.astype(dtype, copy=False)
 
+    def grown(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        wanted = [
+            range(each, each + 1) if isinstance(each, int) else range(*each.indices(length))
+            for each, length in zip(places, shape, strict=True)
+        ]
+        result = np.full([len(each) for each in wanted], dataset.fillvalue, dtype)
+        there = [
+            range(each.start, max(each.start, min(each.stop, length)))
+            for each, length in zip(wanted, dataset.shape, strict=True)
+        ]
+        if all(there):
+            stored = dataset[tuple(slice(each.start, each.stop) for each in there)]
+            result[tuple(slice(0, len(each)) for each in there)] = stored
+        kept = [len(w) for w, each in zip(wanted, places, strict=True) if isinstance(each, slice)]
+        return result.reshape(kept)
 
-def column(path: str, dataset: Any) -> Column:
-    """A dataset of at most one dimension as a Column."""
-    numeric = usable(dataset.dtype)
-    packed = packing_of(path, dataset) if dataset.dtype.kind in "iuf" else None
-
-    def read() -> Any:
-        with Hdf5Sources(path) as behind:
-            warn_of_column(path, behind.parts(path, dataset))
-        stored = dataset[()]
-        return stored if packed is None else packed.unpack(np.array(stored))
-
-    return Column(
-        name=path,
-        length=dataset.size,
-        read=read,
-        attributes=json_attributes(dataset.attrs, without=PLUMBING | PACKING),
-        numeric=numeric,
-    )
-
-
-def packing_of(source: str, dataset: Any) -> Packing:
-    """The packing of a dataset of numbers by its attributes; an empty attribute says nothing."""
-    import h5py
-
-    given = {name: dataset.attrs[name] for name in PACKING if name in dataset.attrs}
-    return packing(
-        source,
-        dataset.dtype,
-        {name: value for name, value in given.items() if not isinstance(value, h5py.Empty)},
-    )
-
-
-def units_of(dataset: Any) -> str:
-    """The attribute `units` of a dataset as text, "" without one."""
-    units = dataset.attrs.get("units", "") if "units" in dataset.attrs else ""
-    return text_of(units) if isinstance(units, str | bytes) else ""
-
-
-def sibling(path: str, name: str) -> str:
-    """Full name of another dataset in the same group."""
-    return f"{path.rpartition('/')[0]}/{name}".lstrip("/")
+    return read if tuple(shape) == tuple(dataset.shape) else grown
 
 
 def require_filters(source: str, name: str, dataset: Any) -> None:
@@ -339,364 +509,38 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
 UNITS = "m"
 
 
-def openpmd_axes(
+def openpmd_lines(
     record: Mapping[str, Any], component: Mapping[str, Any], shape: Sequence[int]
-) -> list[Column | None]:
-    """A column of positions for each dimension of a mesh; None for each if the file is none.
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Positions along each dimension of a mesh, by its label; none if the array is no mesh.
 
     record: attributes of the group of the components of a vector, of which `component` is one; a
     scalar has all attributes itself.
     """
-    own, group = json_attributes(component), json_attributes(record)
-    known = own if "axisLabels" in own else group
+    known = json_attributes(component if "axisLabels" in component else record)
     labels = known.get("axisLabels")
-    if (
-        not isinstance(labels, list)
-        or len(labels) != len(shape)
-        or not all(str(label) in AXES for label in labels)
-    ):
-        return [None] * len(shape)
+    labels = [labels] if isinstance(labels, str) else labels
+    if not isinstance(labels, list) or len(labels) != len(shape):
+        return {}
+    if not all(str(label) in AXES for label in labels) or len(set(labels)) < len(labels):
+        return {}
     # in Fortran's order the labels begin with the fastest axis
     way = -1 if known.get("dataOrder") == "F" else 1
     labels = labels[::way]
     spacing = _numbers(known.get("gridSpacing"), len(shape), 1.0)[::way]
     offset = _numbers(known.get("gridGlobalOffset"), len(shape), 0.0)[::way]
-    position = _numbers(own.get("position"), len(shape), 0.0)[::way]
+    place = _numbers(json_attributes(component).get("position"), len(shape), 0.0)[::way]
     unit = known.get("gridUnitSI")
     scale = float(unit) if isinstance(unit, int | float) else 1.0
-    return [
-        _column(str(labels[place]), length, numbers * scale)
-        for place, (length, numbers) in enumerate(
-            zip(
-                shape,
-                np.stack([offset + position * spacing, spacing], axis=1),
-                strict=True,
-            )
-        )
-    ]
+    return {
+        str(labels[n]): scale * (offset[n] + place[n] * spacing[n])
+        + scale * spacing[n] * np.arange(length)
+        for n, length in enumerate(shape)
+    }
 
 
 def _numbers(value: Any, count: int, default: float) -> npt.NDArray[np.float64]:
+    value = [value] if isinstance(value, int | float) else value
     if isinstance(value, list) and len(value) == count:
         return np.asarray(value, np.float64)
     return np.full(count, default)
-
-
-def _column(name: str, length: int, line: npt.NDArray[np.float64]) -> Column:
-    return Column(
-        name=name,
-        length=length,
-        read=lambda: line[0] + line[1] * np.arange(length),
-        attributes={"units": UNITS},
-    )
-
-
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
-
-def is_hdf5(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of HDF5.
-
-    A user block of 512, 1024 or 2048 bytes may precede the signature.
-    """
-    return any(
-        head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048)
-    )
-
-
-def matches(head: bytes, path: Path) -> bool:
-    """Whether this is an HDF5 file."""
-    return is_hdf5(head)
-
-
-def open_hdf5(path: Path, request: Request) -> FileSeries:
-    """Open the series in an HDF5 file: the only suitable dataset, or the one named.
-
-    Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the
-    dataset or in the root. Packing and fill values of the CF conventions are undone, as in NetCDF.
-    Arrays with one group a step are one variable, and each field of a compound type is one.
-    """
-    import h5py
-
-    source, stamp = str(path), Stamp.of(path)
-    with refusing(f"{source} cannot be read as HDF5"):
-        file = h5py.File(path, "r")
-    try:
-        with refusing(f"{source} cannot be read as HDF5"):
-            return _series(source, path, stamp, file, request)
-    except BaseException:
-        file.close()
-        raise
-
-
-class Hdf5File(FileOfArrays):
-    """The datasets of an open HDF5 file."""
-
-    def __init__(self, source: str, path: Path, file: Any, request: Request) -> None:
-        self.path, self.file = path, file
-        found = walk(file)
-        self.tree, self.groups = found.datasets, found.groups
-        super().__init__(source, request, expand(variables(found)))
-
-    def _stated(self, variable: Variable) -> list[Dimension]:
-        dataset = variable.handle
-        stated = openpmd_axes(self._attributes(parent(variable.name)), dataset.attrs, dataset.shape)
-        return [
-            *map(_dimension, dataset.dims, dataset.shape, stated),
-            *(Dimension(name=None, length=length) for length in variable.shape[dataset.ndim :]),
-        ]
-
-    def check(self, variable: Variable) -> None:
-        """Raise an error that says what is missing, if the values cannot be read here."""
-        for member in variable.members or (variable,):
-            require_filters(self.source, member.name, member.handle)
-
-    def packing(self, variable: Variable) -> Packing | None:
-        """The packing of the values, None where the user wants them as stored."""
-        if self.request.raw_values or variable.field or variable.dtype.kind not in "iuf":
-            return None
-        return packing_of(self.source, variable.handle)
-
-    def _reading(self, variable: Variable) -> Read:
-        dataset, packed = variable.handle, self.packing(variable)
-        if packed is not None:
-            return lambda ranges: packed.unpack(dataset[ranges])
-        return field_reading(lambda ranges: dataset[ranges], variable, dataset.ndim)
-
-    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
-        """Coordinates of the axes: what the file ties to a dimension, else by name."""
-        group = parent((variable.members or (variable,))[0].name)
-        places = [columns(self.tree, place) for place in dict.fromkeys([group, ""])]
-        said = {
-            axis: dimension
-            for axis, dimension in zip(layout.axes, layout.kept, strict=True)
-            if dimension.column is not None
-        }
-        certain = self.request.axes is not None or all(
-            dimension.role is not None for dimension in layout.kept
-        )
-        fitting = {
-            axis: dimension.column
-            for axis, dimension in said.items()
-            if dimension.column is not None
-            and dimension.column.numeric
-            and dimension.column.length == dimension.length
-        }
-        tied = [*said]
-        if "t" in fitting and _counts_steps(fitting["t"]):
-            tied.remove("t")  # a time beside the numbers of steps comes first
-        named = beside(self.source, layout.axes, layout.shape, places, certain=certain, tied=tied)
-        coords = layout.coordinates(self.source, fitting) | named
-        if "t" in layout.axes and ("t" not in coords or not coords["t"].attributes):
-            length = layout.shape[layout.axes.index("t")]
-            texts = [text for place in (group, "") for text in texts_of(self.tree, place, length)]
-            written = written_times("time", texts)
-            coords |= {} if written is None else {"t": written}
-        return coords
-
-    def _columns(self, group: str) -> Mapping[str, Column]:
-        return columns(self.tree, group)
-
-    def _attributes(self, path: str) -> Mapping[str, Any]:
-        attributes: Mapping[str, Any] = (self.groups.get(path) or self.tree[path]).attrs
-        return attributes
-
-    def _scalar(self, path: str) -> tuple[float, str] | None:
-        dataset = self.tree.get(path)
-        if dataset is None or dataset.size != 1 or dataset.dtype.kind not in "iuf":
-            return None
-        return float(dataset[()].reshape(-1)[0]), units_of(dataset)
-
-
-def _counts_steps(column: Column) -> bool:
-    """Whether a coordinate has no unit and only counts steps."""
-    return "units" not in column.attributes and counts_steps(column.read())
-
-
-def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
-    found = Hdf5File(source, path, file, request)
-    var = own_name(file, found.tree, request.var) if request.var else None
-    variable = found.choose(var)
-    found.check(variable)
-    layout = found.arrange(variable)
-    packed = found.packing(variable)
-    scaled = request.raw_values and SCALING & set(variable.handle.attrs)
-    first = (variable.members or (variable,))[0]
-    chunks = first.handle.chunks
-    trailing = first.shape[first.handle.ndim :]
-    coords = found.coordinates(variable, layout)
-    names = {*AXIS_NAMES.values()} | {each.name for each in coords.values()}
-    with Hdf5Sources(source) as behind:
-        parts = [
-            behind.parts(member.name, member.handle) for member in variable.members or (variable,)
-        ]
-    series = FileSeries(
-        files=StoredFiles(
-            source=source,
-            stamp=stamp,
-            close=partial(_close, file, variable),
-            beside=_beside(path, variable, behind.files),
-        ),
-        name=plain_name(shown_name(variable.name, names)),
-        values=StoredValues(
-            shape=layout.shape,
-            dtype=variable.dtype if packed is None else packed.dtype,
-            axes=layout.axes,
-            fetch=layout.fetch(found.reading(variable)),
-            chunks=layout.chunks(
-                chunks and (*((1,) if variable.members else ()), *chunks, *trailing)
-            ),
-            packing=packed,
-            not_stored=not_stored(parts, layout, joined=bool(variable.members)),
-        ),
-        coords=coords,
-        attributes=json_attributes(
-            variable.handle.attrs,
-            # counts have not the unit of the values
-            without=PLUMBING | PACKING | ({"units"} if scaled else frozenset()),
-        )
-        | layout.attributes(),
-    )
-    if not variable.members and not variable.field:
-        series.metadata = partial(_metadata, found, variable, layout, series, packed)
-    return series
-
-
-def _metadata(
-    found: Hdf5File,
-    variable: Variable,
-    layout: Layout,
-    series: FileSeries,
-    packed: Packing | None,
-) -> SourceMetadata | None:
-    """The datasets beside a variable; None where there are none but those of its positions.
-
-    Dimensions without a name have that of the axis, and beside the variable one of their own.
-    """
-    taken = {each.name for each in series.coords.values()}
-    names = named_dimensions(layout, series.coords)
-    stored = {variable.name: _stored(variable.handle, variable.name, names)}
-    positions = more = 0
-    for path, dataset in found.tree.items():
-        name = path.rpartition("/")[2]
-        if path == variable.name or dataset.shape is None or dataset.ndim >= MIN_DIMENSIONS:
-            continue  # what has so many dimensions can be encoded itself
-        is_position = name in taken and dataset.shape in ((), *((n,) for n in layout.shape))
-        positions += is_position
-        if len(stored) > MAX_ARRAYS:
-            more += 1
-        elif not (dataset.is_scale and _valueless(dataset)):
-            stored[path] = _stored(dataset, path, [name] * dataset.ndim if is_position else None)
-    if len(stored) == 1 + positions:
-        return None
-    in_group = {path.removeprefix(f"{parent(variable.name)}/"): path for path in stored}
-    flat = {path: short.replace("/", "_") for short, path in in_group.items()}
-    if len(set(flat.values())) < len(flat):
-        flat = {path: path.replace("/", "_") for path in stored}
-    if more:
-        warn_left_out(
-            f"{found.source}: not everything beside {variable.name} is kept",
-            {f"{more} datasets": f"more than {MAX_ARRAYS}"},
-        )
-    wanted = Wanted(source=found.source, name=flat[variable.name], path=found.path)
-    with refusing(f"{found.source} cannot be read as HDF5"):
-        return metadata_of(
-            wanted,
-            {flat[path]: each for path, each in stored.items()},
-            json_attributes(found.file.attrs),
-            Arranged(layout=layout, request=found.request, packed=packed, coords=series.coords),
-        )
-
-
-def _stored(dataset: Any, path: str, names: Sequence[str] | None) -> Stored:
-    """A dataset as the file has it. names: of its dimensions; None for those it states."""
-    import h5py
-
-    text = h5py.check_string_dtype(dataset.dtype) is not None and dataset.dtype.kind == "O"
-
-    def read(places: tuple[slice | int, ...]) -> Any:
-        values = np.asarray(dataset[places])
-        if not text:
-            return values
-        texts = [text_of(each) for each in values.reshape(-1)]
-        return np.array(texts, dtype=object).reshape(values.shape)
-
-    if names is None:
-        own = path.replace("/", "_")
-        names = [
-            _dimension(each, length, None).name or f"{own}_dim_{place}"
-            for place, (each, length) in enumerate(
-                zip(dataset.dims if dataset.shape else (), dataset.shape, strict=True)
-            )
-        ]
-    return Stored(
-        dimensions=tuple(names),
-        shape=tuple(dataset.shape),
-        # references and lists of any length are objects, too
-        dtype=dataset.dtype if text or dataset.dtype.kind != "O" else np.dtype("V8"),
-        attributes=json_attributes(dataset.attrs),
-        read=read,
-    )
-
-
-def _close(file: Any, variable: Variable) -> None:
-    """Close a file, and those that its links lead to, which stay open with their datasets."""
-    handles = [member.handle for member in variable.members or (variable,) if member.handle]
-    for each in {handle.file.filename: handle.file for handle in handles}.values():
-        each.close()
-    file.close()
-
-
-def _beside(path: Path, variable: Variable, files: Iterable[Path]) -> list[Path]:
-    """The other files that hold values: those of external links, and those behind datasets."""
-    linked = [Path(member.handle.file.filename) for member in variable.members or (variable,)]
-    return [file for file in dict.fromkeys([*linked, *files]) if file != path]
-
-
-def list_hdf5(path: Path, request: Request) -> list[Listed]:
-    """The variables of an HDF5 file."""
-    import h5py
-
-    source = str(path)
-    with refusing(f"{source} cannot be read as HDF5"), h5py.File(path, "r") as file:
-        found = Hdf5File(source, path, file, replace(request, raw_values=False))
-        return listing(source, found.variables, found.dimensions, request, found.packing)
-
-
-def _dimension(dimension: Any, length: int, stated: Column | None) -> Dimension:
-    scale = _scale(dimension)
-    name = dimension.label or (scale[0] if scale else None)
-    if scale is None:
-        name = name or (stated.name if stated else None)
-        role = role_of_name(name) if name else None
-        return Dimension(name=name, length=length, role=role, column=stated)
-    # a NetCDF dimension without values is a scale too, and says so in its NAME
-    valued = not _valueless(scale[1]) and scale[1].shape == (length,)
-    return Dimension(
-        name=name,
-        length=length,
-        role=_hint(dimension.label, scale),
-        column=column(*scale) if valued and scale[1].dtype.kind in "iufMSOU" else None,
-    )
-
-
-def _scale(dimension: Any) -> tuple[str, Any] | None:
-    """Name and dataset of the dimension scale that was attached first; None without one."""
-    if len(dimension) == 0:
-        return None
-    dataset = dimension[0]
-    return dataset.name.rpartition("/")[2], dataset
-
-
-def _hint(label: str, scale: tuple[str, Any] | None) -> str | None:
-    if scale is not None:
-        role = role_of_coordinate(scale[0], json_attributes(scale[1].attrs))
-        if role is not None:
-            return role
-    return role_of_name(label) if label else None
-
-
-def _valueless(scale: Any) -> bool:
-    return text_of(scale.attrs.get("NAME", "")).startswith(
-        "This is a netCDF dimension but not a netCDF variable"
-    )

@@ -13,15 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import assign_axes, role_of_name
-from fhash_formats.readers.common.file_series import (
-    FileSeries,
-    Request,
-    Stamp,
-    StoredFiles,
-    StoredValues,
-    naming,
-)
+from fhash_formats.readers.common.cf import role_of_name
+from fhash_formats.readers.common.file_series import Request, Stamp, naming
 from fhash_formats.readers.common.stored_bytes import (
     MAX_FILES,
     CompressedFile,
@@ -30,14 +23,19 @@ from fhash_formats.readers.common.stored_bytes import (
     StoredArray,
     StoredBytes,
     axis_steps,
-    choose_component,
-    component_variables,
     in_files,
     lattice,
     numbered_files,
 )
-from fhash_formats.readers.common.variables import Variable
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
+from fhash_formats.readers.common.variables import (
+    Source,
+    Variable,
+    components,
+    file_source,
+    placed,
+    positions,
+)
+from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import decoded_text
 
 TYPE_NAMES = {
@@ -203,8 +201,8 @@ def is_nrrd(head: bytes, path: Path) -> bool:
     return head.startswith(MAGIC)
 
 
-def open_nrrd(path: Path, request: Request) -> FileSeries:
-    """Open the series in a NRRD file or behind a NRRD header.
+def open_nrrd(path: Path, request: Request) -> Source:
+    """The array in a NRRD file or behind a NRRD header, or its components.
 
     Raises InputError for colours, turned grids, more than four dimensions, and files that are cut;
     MissingInputError for a file of values that is not there.
@@ -216,41 +214,20 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
         kinds = words_of(fields, "kinds", len(sizes), "domain")
         axes, vector = _axes(fields, pairs, sizes, kinds)
         dtype = dtype_of(fields)
-        name = _content(fields, path)
-        outer = tuple(length for place, length in enumerate(sizes) if place != vector)[::-1]
-        whole = Variable(name=name, shape=outer, dtype=dtype)
-        values = component_variables(whole, 1 if vector is None else sizes[vector])
-        variable = choose_component(source, values, request)
-        _, component = variable.handle
         stored, files = _nrrd_values(path, fields, end, sizes, dtype, request)
-        array = StoredArray(path, tuple(reversed(sizes)), dtype, stored)
-        coords = _nrrd_coordinates(fields, pairs, sizes, axes)
-    slow = tuple(axis for axis in reversed(axes) if axis)
-    if request.axes is not None and request.axes != slow:
-        if len(request.axes) != len(slow):
-            raise InputError(
-                f"{source}: --axes {','.join(request.axes)} names {len(request.axes)} axes, the"
-                f" array has {len(slow)}, the slowest first"
-            )
-        slow, coords = request.axes, {}
-
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        if vector is None:
-            return array.read(ranges)
-        place = len(sizes) - 1 - vector
-        all_of_it = slice(0, sizes[vector])
-        read = array.read((*ranges[:place], all_of_it, *ranges[place:]))
-        values: npt.NDArray[Any] = read.take(component, axis=place)
-        return values
-
-    units = fields.get("sample units", "").strip('" ')
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp, close=stored.close, beside=files),
-        name=variable.name,
-        values=StoredValues(shape=variable.shape, dtype=dtype, axes=slow, fetch=fetch),
-        coords=coords,
-        attributes={"units": units} if units else {},
-    )
+        units = fields.get("sample units", "").strip('" ')
+        shape = tuple(reversed(sizes))
+        whole = Variable(
+            name=_content(fields, path),
+            shape=shape,
+            dtype=dtype,
+            dimensions=tuple(AXIS_NAMES.get(axis) for axis in reversed(axes)),
+            attributes={"units": units} if units else {},
+            read=StoredArray(path, shape, dtype, stored).read,
+        )
+        arrays = [whole] if vector is None else components(whole, len(sizes) - 1 - vector)
+        found = placed(arrays, _nrrd_coordinates(fields, pairs, sizes, axes))
+    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
 
 
 def _axes(
@@ -370,7 +347,7 @@ def _nrrd_coordinates(
     pairs: Mapping[str, str],
     sizes: Sequence[int],
     axes: Sequence[str],
-) -> dict[str, Coordinate]:
+) -> dict[str, Variable]:
     """Coordinates of the axes that the header places."""
     coords = _even(fields, sizes, axes)
     units = re.findall(r'"([^"]*)"', fields.get("units", ""))
@@ -387,7 +364,7 @@ def _nrrd_coordinates(
     return coords
 
 
-def _exact(pairs: Mapping[str, str], axis: str, length: int) -> Coordinate:
+def _exact(pairs: Mapping[str, str], axis: str, length: int) -> Variable:
     """A coordinate that a file of this project lists, with its name and units."""
     try:
         values = np.array([float(word) for word in pairs[f"coordinates_{axis}"].split()])
@@ -398,14 +375,12 @@ def _exact(pairs: Mapping[str, str], axis: str, length: int) -> Coordinate:
     extra = {
         key: pairs[f"{key}_{axis}"] for key in ("units", "calendar") if f"{key}_{axis}" in pairs
     }
-    return Coordinate(
-        name=pairs.get(f"name_{axis}") or AXIS_NAMES[axis], values=values, attributes=extra
-    )
+    return positions(pairs.get(f"name_{axis}") or AXIS_NAMES[axis], values, extra)
 
 
-def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str, Coordinate]:
+def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str, Variable]:
     """Coordinates from directions and origin, else from spacings and minima."""
-    coords: dict[str, Coordinate] = {}
+    coords: dict[str, Variable] = {}
     directions = directions_of(fields, len(sizes))
     count = len(sizes)
     spacings = [number_of(word) for word in words_of(fields, "spacings", count, "nan")]
@@ -463,8 +438,8 @@ def is_metaimage(head: bytes, path: Path) -> bool:
     return re.match(rb"\s*(ObjectType\s*=\s*Image|NDims\s*=\s*\d)", head) is not None
 
 
-def open_metaimage(path: Path, request: Request) -> FileSeries:
-    """Open the series in a MetaImage, or behind its header.
+def open_metaimage(path: Path, request: Request) -> Source:
+    """The array in a MetaImage or behind its header, or its channels.
 
     Raises InputError for turned grids, other types than numbers, and files that are cut;
     MissingInputError for a file of values that is not there.
@@ -475,30 +450,21 @@ def open_metaimage(path: Path, request: Request) -> FileSeries:
         sizes = _sizes(fields)
         channels = _whole(fields, "ElementNumberOfChannels", 1)
         dtype = _dtype(fields)
-        shape = tuple(reversed(sizes))
-        if len(sizes) == 2:
-            shape = (1, *shape)
-        name = fields.get("Name", "") or path.stem
-        values = component_variables(Variable(name=name, shape=shape, dtype=dtype), channels)
-        variable = choose_component(source, values, request)
-        _, component = variable.handle
-        hints = ["t", "z", "y", "x"][-len(shape) :]
-        axes = assign_axes(source, shape, hints, hints, request.axes)
         stored, files = _metaimage_values(
             path, fields, lines, end, (*sizes, channels), dtype, request
         )
-        coords = _metaimage_coordinates(fields, sizes) if request.axes is None else {}
-    array = StoredArray(path, (*shape, channels), dtype, stored)
-
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        return array.read((*ranges, slice(0, channels)))[..., component]
-
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp, close=stored.close, beside=files),
-        name=variable.name,
-        values=StoredValues(shape=shape, dtype=dtype, axes=axes, fetch=fetch),
-        coords=coords,
-    )
+        shape = (*reversed(sizes), channels)
+        names = [AXIS_NAMES[axis] for axis in AXES[-len(sizes) :]]
+        whole = Variable(
+            name=fields.get("Name", "") or path.stem,
+            shape=shape,
+            dtype=dtype,
+            dimensions=(*names, None),
+            read=StoredArray(path, shape, dtype, stored).read,
+        )
+        arrays = components(whole, len(sizes))
+        found = placed(arrays, _metaimage_coordinates(fields, sizes))
+    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
 
 
 def _header(path: Path) -> tuple[dict[str, str], list[str], int]:
@@ -603,7 +569,7 @@ def _metaimage_file(
     return PlainFile(path, start=start, size=size)
 
 
-def _metaimage_coordinates(fields: Fields, sizes: Sequence[int]) -> dict[str, Coordinate]:
+def _metaimage_coordinates(fields: Fields, sizes: Sequence[int]) -> dict[str, Variable]:
     """Positions of the vertices; those of a plane's z are left to their index."""
     count = len(sizes)
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), [1.0] * count)

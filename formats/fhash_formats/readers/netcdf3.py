@@ -19,7 +19,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.readers.common.file_series import Request, Stamp, refusing
+from fhash_formats.readers.common.variables import Source, Variable, file_source
+from fhash_formats.readers.hdf5 import default_fill
 from fhash_formats.support.values import decoded_text
+
+MAGIC = (b"CDF\x01", b"CDF\x02", b"CDF\x05")
+"""First bytes of classic files."""
 
 DIMENSIONS = 10
 """Tag of the list of dimensions in a header; the tag 0 is that of an empty list."""
@@ -98,6 +104,10 @@ class ClassicArray:
             copied: npt.NDArray[Any] = stored[key].copy()
             del stored  # the map cannot be closed before
         return copied
+
+    def native(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
+        """The stored numbers at integers and slices, in the machine's byte order."""
+        return self[key].astype(self.dtype.newbyteorder("="), copy=False)
 
 
 class _Bytes:
@@ -213,3 +223,34 @@ def _parsed(path: Path, data: bytes, size: int) -> Header:
             )
         variables[name] = array
     return Header(lengths=lengths, records=records, attributes=attributes, variables=variables)
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is classic NetCDF."""
+    return head[:4] in MAGIC
+
+
+def open_classic(path: Path, request: Request) -> Source:
+    """The variables of a classic file."""
+    stamp = Stamp.of(path)
+    with refusing(f"{path} cannot be read as classic NetCDF"):
+        header = read_header(path)
+    variables = [
+        Variable(
+            name=name,
+            shape=array.shape,
+            dtype=array.dtype.newbyteorder("="),
+            dimensions=array.dimensions,
+            attributes=array.attributes,
+            read=array.native,
+        )
+        for name, array in header.variables.items()
+    ]
+    return file_source(
+        path,
+        variables,
+        groups={"": header.attributes},
+        stamp=stamp,
+        naming=True,
+        default_fill=default_fill,
+    )

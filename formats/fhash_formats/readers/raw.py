@@ -5,31 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.file_series import (
     ENDIANS,
-    FileSeries,
     RawLayout,
     Request,
     Stamp,
-    StoredFiles,
-    StoredValues,
     parse_dtype,
     refusing,
 )
-from fhash_formats.readers.common.layout import Dimension, arrange
-from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.stored_bytes import FlatArray
-from fhash_formats.readers.common.variables import (
-    Variable,
-    choose,
-    expand,
-    field_reading,
-)
+from fhash_formats.readers.common.variables import Source, Variable, file_source
 from fhash_formats.series import AXES
 
 NAME = re.compile(
@@ -56,8 +45,8 @@ def layout_of_name(stem: str) -> tuple[str, RawLayout]:
     )
 
 
-def open_raw(path: Path, request: Request) -> FileSeries:
-    """Open the series in a raw file: x fastest, then y, z, t.
+def open_raw(path: Path, request: Request) -> Source:
+    """The values of a raw file: x fastest, then y, z, t.
 
     The request's axes (slowest first) may state another order of the same lengths. Raises
     InputError where the layout is unknown, or where the size of the file differs from it.
@@ -102,11 +91,8 @@ def open_raw(path: Path, request: Request) -> FileSeries:
         raise InputError(
             f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}"
         )
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp),
-        name=name,
-        values=StoredValues(shape=shape, dtype=array.dtype, axes=axes, fetch=array.read),
-    )
+    values = Variable(name=name, shape=shape, dtype=array.dtype, dimensions=axes, read=array.read)
+    return file_source(path, [values], stamp=stamp)
 
 
 def _advice(lengths: Mapping[str, int], size: int, needed: int) -> str:
@@ -122,78 +108,39 @@ def is_npy(head: bytes, path: Path) -> bool:
     return head.startswith(MAGIC) or path.suffix.lower() == ".npz"
 
 
-class _Npy:
-    """The header of a .npy file: its variables, one for each field of a structured array."""
-
-    def __init__(self, path: Path, request: Request) -> None:
-        self.source, self.stamp = str(path), Stamp.of(path)
-        if path.suffix.lower() == ".npz":
-            raise InputError(
-                f"{self.source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
-                f" numpy.load('{path.name}')[NAME])"
-            )
-        with refusing(f"{self.source} cannot be read as .npy"):
-            # opened as a map for its header only: type, shape, order and the offset of the values;
-            # Python objects are refused by it
-            header = np.load(path, mmap_mode="r", allow_pickle=False)
-            self.shape, dtype, offset = header.shape, header.dtype, int(header.offset)
-            self.fortran = header.flags.f_contiguous and not header.flags.c_contiguous
-            del header
-        # Fortran's order: the same bytes, read as C order with the dimensions reversed
-        stored = self.shape[::-1] if self.fortran else self.shape
-        self.array = FlatArray(path, stored, dtype, offset=offset)
-        if self.array.end != self.stamp.size:
-            raise InputError(
-                f"{self.source} has {self.stamp.size} bytes, its header promises"
-                f" {self.array.end}; the file is cut or holds more than one array"
-            )
-        whole = Variable(name=path.stem, shape=self.shape, dtype=dtype)
-        self.variables = expand([whole])
-        if self.variables == [whole]:
-            request.refuse_var(self.source)
-
-    def dimensions(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of a variable; none has a name."""
-        return [Dimension(name=None, length=length) for length in variable.shape]
-
-    def read(self, ranges: tuple[slice, ...]) -> Any:
-        """Values of the stored array in ranges of its dimensions."""
-        if self.fortran:
-            return self.array.read(ranges[::-1]).transpose()
-        return self.array.read(ranges)
-
-
-def open_npy(path: Path, request: Request) -> FileSeries:
-    """Open the series in a .npy file.
+def open_npy(path: Path, request: Request) -> Source:
+    """The array of a .npy file, or one variable for each field of a structured array.
 
     Its dimensions are (t, z, y, x) or (z, y, x) unless the request names the axes.
     """
-    found = _Npy(path, request)
-    variable = choose(
-        found.source,
-        found.variables,
-        request.var,
-        booleans=request.booleans,
-        selected=len(request.select),
+    source, stamp = str(path), Stamp.of(path)
+    if path.suffix.lower() == ".npz":
+        raise InputError(
+            f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
+            f" numpy.load('{path.name}')[NAME])"
+        )
+    with refusing(f"{source} cannot be read as .npy"):
+        # opened as a map for its header only: type, shape, order and the offset of the values;
+        # Python objects are refused by it
+        header = np.load(path, mmap_mode="r", allow_pickle=False)
+        shape, dtype, offset = header.shape, header.dtype, int(header.offset)
+        fortran = header.flags.f_contiguous and not header.flags.c_contiguous
+        del header
+    # Fortran's order: the same bytes, read as C order with the dimensions reversed
+    array = FlatArray(path, shape[::-1] if fortran else shape, dtype, offset=offset)
+    if array.end != stamp.size:
+        raise InputError(
+            f"{source} has {stamp.size} bytes, its header promises"
+            f" {array.end}; the file is cut or holds more than one array"
+        )
+    if dtype.names is None and dtype.kind != "c":
+        request.refuse_var(source)
+    values = Variable(
+        name=path.stem,
+        shape=shape,
+        dtype=dtype,
+        read=(lambda places: array.read(places[::-1]).transpose()) if fortran else array.read,
+        # time as the fastest dimension: all steps are read together
+        chunks=shape if fortran else None,
     )
-    layout = arrange(found.source, variable.name, found.dimensions(variable), request)
-    stored = len(found.shape)
-    return FileSeries(
-        files=StoredFiles(source=found.source, stamp=found.stamp),
-        name=variable.name,
-        values=StoredValues(
-            shape=layout.shape,
-            dtype=variable.dtype,
-            axes=layout.axes,
-            fetch=layout.fetch(field_reading(found.read, variable, stored)),
-            # time as the fastest dimension: all steps are read together
-            chunks=layout.chunks(variable.shape) if found.fortran else None,
-        ),
-        attributes=layout.attributes(),
-    )
-
-
-def list_npy(path: Path, request: Request) -> list[Listed]:
-    """The variables of a .npy file."""
-    found = _Npy(path, request)
-    return listing(found.source, found.variables, found.dimensions, request)
+    return file_source(path, [values], stamp=stamp)

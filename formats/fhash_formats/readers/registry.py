@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
-from fhash_formats.readers import hdf5, images, netcdf, raw, tiff, vtk, zarr_store
+from fhash_formats.readers import hdf5, images, netcdf3, raw, tiff, vtk, zarr_store
 from fhash_formats.readers.common.file_series import (
     FileSeries,
     RawLayout,
@@ -23,8 +23,9 @@ from fhash_formats.readers.common.file_series import (
     selection,
 )
 from fhash_formats.readers.common.listing import Listed, listed_series
+from fhash_formats.readers.common.select import list_selected, open_selected
 from fhash_formats.readers.common.stored_parts import require_inside
-from fhash_formats.readers.common.variables import SeveralVariablesError
+from fhash_formats.readers.common.variables import Source
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern, warn_of_gaps
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
 
@@ -42,47 +43,21 @@ class Reader:
         name: name for messages.
         suffixes: file name suffixes.
         matches: whether a file is of the format, from its first bytes (none for a folder) and path.
-        open: opens it.
-        variables: lists what it holds; None where the file is opened for it.
-        packed: whether its values may be packed, so that `raw_values` means something.
-        selects: whether its arrays may have more dimensions than t, z, y and x.
+        open: gives its variables; of a list of files, the series itself.
     """
 
     name: str
     suffixes: tuple[str, ...]
     matches: Callable[[bytes, Path], bool]
-    open: Callable[[Path, Request], FileSeries | JoinedSeries]
-    variables: Callable[[Path, Request], list[Listed]] | None = None
-    packed: bool = False
-    selects: bool = False
+    open: Callable[[Path, Request], Source | JoinedSeries]
 
     def __str__(self) -> str:
         return f"{self.name} ({' '.join(self.suffixes)})"
 
-    def refuse_unused(self, path: Path, request: Request) -> None:
-        """Raise InputError for a wish that means nothing in this format, and would be ignored."""
-        if request.select and not self.selects:
-            name, index = request.select[0]
-            raise InputError(
-                f"{path}: --select {name}={index} cannot be used, {self.name} files have no"
-                " dimensions but t, z, y and x; a component is chosen by --var, such as velocity.x"
-            )
-        if request.raw_values and not self.packed:
-            raise InputError(
-                f"{path}: --raw-values cannot be used, {self.name} files hold no packed numbers;"
-                " leave it out"
-            )
-
 
 RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.is_raw, open=raw.open_raw)
 ZARR = Reader(
-    name="Zarr",
-    suffixes=(".zarr", ".zip"),
-    matches=zarr_store.matches,
-    open=zarr_store.open_zarr,
-    variables=zarr_store.list_zarr,
-    packed=True,
-    selects=True,
+    name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
 )
 REGISTRY = (
     RAW,
@@ -92,32 +67,15 @@ REGISTRY = (
         matches=vtk.is_vtkhdf,
         open=vtk.open_vtkhdf,
     ),
+    Reader(name="NetCDF-3", suffixes=(), matches=netcdf3.matches, open=netcdf3.open_classic),
     Reader(
         name="NetCDF",
-        suffixes=netcdf.SUFFIXES,
-        matches=netcdf.matches,
-        open=netcdf.open_netcdf,
-        variables=netcdf.list_netcdf,
-        packed=True,
-        selects=True,
+        suffixes=hdf5.NETCDF_SUFFIXES,
+        matches=hdf5.says_netcdf,
+        open=hdf5.open_netcdf,
     ),
-    Reader(
-        name="HDF5",
-        suffixes=(".h5", ".hdf5", ".hdf", ".he5"),
-        matches=hdf5.matches,
-        open=hdf5.open_hdf5,
-        variables=hdf5.list_hdf5,
-        packed=True,
-        selects=True,
-    ),
-    Reader(
-        name="NumPy",
-        suffixes=(".npy",),
-        matches=raw.is_npy,
-        open=raw.open_npy,
-        variables=raw.list_npy,
-        selects=True,
-    ),
+    Reader(name="HDF5", suffixes=hdf5.SUFFIXES, matches=hdf5.matches, open=hdf5.open_hdf5),
+    Reader(name="NumPy", suffixes=(".npy",), matches=raw.is_npy, open=raw.open_npy),
     ZARR,
     Reader(name="VTK", suffixes=vtk.XML_SUFFIXES, matches=vtk.is_vtk_xml, open=vtk.open_vtk),
     Reader(
@@ -227,9 +185,12 @@ def list_variables(
     """
     text, request = str(path), _request(**wishes)
     place = files_of(text)[0] if is_pattern(text) else Path(path)
-    found = find_reader(place, request)
-    found.refuse_unused(place, request)
-    listed = (found.variables or _list_by_opening)(place, request)
+    opened = find_reader(place, request).open(place, request)
+    if isinstance(opened, Source):
+        listed = list_selected(opened, request)
+    else:
+        opened.close()
+        listed = [listed_series(opened, request)]
     if steps is None:
         return listed
     _check_stride(path, steps)
@@ -253,21 +214,6 @@ def _check_stride(path: str | Path, steps: slice) -> None:
         )
 
 
-def _list_by_opening(path: Path, request: Request) -> list[Listed]:
-    """The variables of a file that is opened for each of them."""
-    try:
-        with open_whole(path, request) as series:
-            return [listed_series(series, request)]
-    except SeveralVariablesError as error:
-        names = error.names
-    found = []
-    for name in names:
-        named = replace(request, var=name)
-        with open_whole(path, named) as series:
-            found.append(listed_series(series, named))
-    return found
-
-
 def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
@@ -275,11 +221,10 @@ def open_whole(path: str | Path, request: Request) -> Series:
         return _open_one(Path(path), request)
     files = files_of(text)
     if all(tiff.matches(b"", file) for file in files):
-        find_reader(files[0], request).refuse_unused(files[0], request)
         pages = tiff.open_pages(text, files, request)
         if pages is not None:
             warn_of_gaps(text, files)
-            return pages.as_asked(request)
+            return open_selected(pages, request).as_asked(request)
     return JoinedSeries(text, files, lambda file: _open_of_pattern(file, request))
 
 
@@ -294,10 +239,10 @@ def _open_of_pattern(path: Path, request: Request) -> FileSeries:
 
 def _open_one(path: Path, request: Request) -> FileSeries | JoinedSeries:
     try:
-        reader = find_reader(path, request)
-        reader.refuse_unused(path, request)
-        series = reader.open(path, request)
-        return series.as_asked(request) if isinstance(series, FileSeries) else series
+        opened = find_reader(path, request).open(path, request)
+        if isinstance(opened, Source):
+            return open_selected(opened, request).as_asked(request)
+        return opened
     except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
         if isinstance(error, FhashError):
             raise

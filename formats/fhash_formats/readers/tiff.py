@@ -19,29 +19,27 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.file_series import (
-    FileSeries,
-    Request,
-    Stamp,
-    StoredFiles,
-    StoredValues,
-    condense,
-    naming,
+from fhash_formats.readers.common.file_series import Request, Stamp, condense, naming
+from fhash_formats.readers.common.stored_bytes import PlainFile, lattice
+from fhash_formats.readers.common.stored_parts import StoredParts
+from fhash_formats.readers.common.variables import (
+    Behind,
+    Source,
+    Variable,
+    components,
+    file_source,
+    placed,
 )
-from fhash_formats.readers.common.stored_bytes import (
-    PlainFile,
-    choose_component,
-    component_variables,
-    lattice,
-)
-from fhash_formats.readers.common.variables import Variable
-from fhash_formats.series import Coordinate, NotStored
+from fhash_formats.series import AXES, AXIS_NAMES
 
 SUFFIXES = (".tif", ".tiff")
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 PAGES = "QIZ"
 """Letters of tifffile for pages, images and z: all are slices along z."""
+
+CHANNEL = "channel"
+"""Role of a dimension of channels."""
 
 CENTIMETRE = {2: "inch", 3: "cm"}
 """Units of a page's resolution by its code."""
@@ -91,8 +89,8 @@ def _strictly() -> Iterator[None]:
         raise InputError(f"it is cut or damaged: {condense(Exception(complaints.texts[0]))}")
 
 
-def open_tiff(path: Path, request: Request) -> FileSeries:
-    """Open the stack in a TIFF file.
+def open_tiff(path: Path, request: Request) -> Source:
+    """The stack in a TIFF file, or its channels.
 
     Raises InputError for colours and for axes beyond time, z, channel, y and x.
     """
@@ -103,13 +101,14 @@ def open_tiff(path: Path, request: Request) -> FileSeries:
         file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
     try:
         with naming(source), _strictly():
-            return _series(source, path, stamp, file, request)
+            found = _variables(path, file)
     except BaseException:
         file.close()
         raise
+    return file_source(path, found, stamp=stamp, close=file.close)
 
 
-def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
+def _variables(path: Path, file: Any) -> list[Variable]:
     if not file.series:
         raise InputError("it holds no picture")
     if len(file.series) > 1:
@@ -117,90 +116,72 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         raise InputError(f"it holds {len(file.series)} series of pages ({shapes}); keep one")
     series = file.series[0]
     letters, shape = str(series.axes), tuple(int(length) for length in series.shape)
-    axes = _roles(letters, shape, request)
-    channel = letters.find("C")
-    outer = [length for place, length in enumerate(shape) if place != channel]
-    roles = [axis for place, axis in enumerate(axes) if place != channel]
-    kept = [axis for axis in roles if axis]
-    lengths = tuple(length for length, axis in zip(outer, roles, strict=True) if axis)
-    if len(lengths) == 2:  # a plane
-        kept, lengths = ["z", *kept], (1, *lengths)
-    whole = Variable(name=path.stem, shape=lengths, dtype=np.dtype(series.dtype))
-    variables = component_variables(whole, 1 if channel < 0 else shape[channel])
-    variable = choose_component(source, variables, request)
+    axes = _roles(letters, shape)
+    kept = [n for n, axis in enumerate(axes) if axis]
     _check_size(path, series)
-    shares = _not_stored(series)
-    never = None
-    if shares is not None:
-        t = axes.index("t") if "t" in axes[: shares.ndim] else None
-        each = shares.mean(axis=tuple(n for n in range(shares.ndim) if n != t)).reshape(-1)
-        never = NotStored(
-            shares=each, fill=np.dtype(series.dtype).type(series.keyframe.nodata).item()
-        )
 
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        steps = ranges[kept.index("t")] if "t" in kept else slice(None)
-        values = _pages(series, axes, channel, variable.handle[1], steps)
-        read = [_length(each, full) for each, full in zip(ranges, lengths, strict=True)]
-        return values.reshape(read)
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        index: list[slice | int] = [0] * len(axes)
+        for n, each in zip(kept, places, strict=True):
+            index[n] = each
+        return _pages(series, index)
 
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp, close=file.close),
-        name=variable.name,
-        values=StoredValues(
-            shape=lengths,
-            dtype=np.dtype(series.dtype),
-            axes=kept,
-            fetch=fetch,
-            not_stored=never,
-        ),
-        coords=_coordinates(file, dict(zip(kept, lengths, strict=True))),
+    whole = Variable(
+        name=path.stem,
+        shape=tuple(shape[n] for n in kept),
+        dtype=np.dtype(series.dtype),
+        dimensions=tuple(AXIS_NAMES.get(axes[n]) for n in kept),
+        read=read,
+        behind=lambda: Behind(parts=_stored_parts(series, kept)),
     )
+    lengths = {axis: shape[n] for n, axis in enumerate(axes) if axis}
+    channel = [axes[n] for n in kept].index(CHANNEL) if CHANNEL in axes else None
+    arrays = [whole]
+    if channel is not None:
+        arrays = components(whole, channel, _channel_names(file), interleaved=False)
+    return placed(arrays, _coordinates(file, lengths))
 
 
-def _not_stored(series: Any) -> npt.NDArray[np.float64] | None:
-    """Share of each page whose strips or tiles are not in the file; None where all are."""
+def _stored_parts(series: Any, kept: Sequence[int]) -> StoredParts | None:
+    """The pages whose strips or tiles are in the file; None where all are."""
     shares = [
-        1 - sum(map(bool, page.databytecounts)) / max(1, prod(page.chunked))
+        sum(map(bool, page.databytecounts)) / max(1, prod(page.chunked))
         for page in series.pages
         if page is not None
     ]
     outer = series.shape[: len(series.shape) - len(series.keyframe.shape)]
-    if not any(share > 0 for share in shares) or prod(outer) != len(shares):
+    if not any(share < 1 for share in shares) or prod(outer) != len(shares):
         return None
-    return np.clip(np.reshape(shares, outer), 0, 1)
+    inner = [1] * (len(series.shape) - len(outer))
+    share = np.clip(np.reshape(shares, (*outer, *inner)), 0, 1).astype(np.float32)
+    edges = tuple(
+        np.arange(length + 1) if n < len(outer) else np.array([0, length])
+        for n, length in enumerate(series.shape)
+    )
+    return StoredParts(
+        edges=tuple(edges[n] for n in kept),
+        share=share.reshape([share.shape[n] for n in kept]),
+        fill=np.dtype(series.dtype).type(series.keyframe.nodata),
+    )
 
 
-def _length(part: slice, full: int) -> int:
-    return len(range(*part.indices(full)))
-
-
-def _roles(letters: str, shape: Sequence[int], request: Request) -> list[str]:
-    """The axis of each dimension of the series; "" for those of one picture, and for channels."""
-    axes = []
+def _roles(letters: str, shape: Sequence[int]) -> list[str]:
+    """The axis of each dimension of the series, CHANNEL for channels; "" for those of one
+    picture."""
+    axes: list[str] = []
     for letter, length in zip(letters, shape, strict=True):
         if letter == "S" and length > 1:
             raise InputError(f"its pages are colour pictures of {length} samples; one can be read")
-        role = "z" if letter in PAGES else {"T": "t", "Y": "y", "X": "x"}.get(letter, "")
-        if (length == 1 and letter not in "YX") or letter in "CS":
+        role = "z" if letter in PAGES else {"T": "t", "C": CHANNEL}.get(letter, letter.lower())
+        if length == 1 and letter not in "YX":
             role = ""
-        elif not role or role in axes:
+        elif role not in (*AXES, CHANNEL) or role in axes:
             raise InputError(
                 f"its axes are {letters} {tuple(shape)}; time, z, channels, y and x can be read"
             )
         axes.append(role)
     if not letters.endswith("YX") and not letters.endswith("YXS"):
         raise InputError(f"its axes are {letters}; the last two must be y and x")
-    if request.axes is not None:
-        pages = [axis for axis in axes if axis]
-        wanted = list(request.axes)
-        if len(wanted) != len(pages) or wanted[-2:] != ["y", "x"]:
-            raise InputError(
-                f"--axes {','.join(wanted)} does not fit its dimensions"
-                f" ({','.join(pages)}); the last two are y and x"
-            )
-        new = iter(wanted)
-        axes = [next(new) if axis else "" for axis in axes]
     return axes
 
 
@@ -222,25 +203,17 @@ def _check_size(path: Path, series: Any) -> None:
         raise InputError(f"it needs {series.dataoffset + needed} bytes and has {size}; it is cut")
 
 
-def _pages(
-    series: Any, axes: Sequence[str], channel: int, number: int, steps: slice
-) -> npt.NDArray[Any]:
-    """The pages of some steps and one channel, in the order of the file's dimensions."""
-    index: list[slice | int] = [slice(None)] * len(axes)
-    if channel >= 0:
-        index[channel] = number
-    if "t" in axes:
-        index[axes.index("t")] = steps
+def _pages(series: Any, index: Sequence[slice | int]) -> npt.NDArray[Any]:
+    """The values at an index or a range along each dimension of the file."""
     per_page = prod(series.keyframe.shape)
     outer = 0
     while prod(series.shape[outer:]) > per_page:
         outer += 1
     numbers = np.arange(prod(series.shape[:outer])).reshape(series.shape[:outer])
     chosen = numbers[tuple(index[:outer])]
-    pages = [_page(series, int(page)) for page in chosen.ravel()]
-    stack = np.stack(pages).reshape(*chosen.shape, *series.shape[outer:])
-    rest = tuple(index[outer:])
-    return stack[(..., *rest)] if rest else stack
+    pages = [_page(series, int(page)) for page in np.ravel(chosen)]
+    stack = np.stack(pages).reshape(*np.shape(chosen), *series.shape[outer:])
+    return stack[(..., *index[outer:])]
 
 
 def _page(series: Any, number: int) -> npt.NDArray[Any]:
@@ -259,7 +232,7 @@ def _page(series: Any, number: int) -> npt.NDArray[Any]:
     return values
 
 
-def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Coordinate]:
+def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Variable]:
     """Positions from ImageJ's metadata, OME's, or the resolution of the first page."""
     steps: dict[str, tuple[float, str]] = {}
     resolution = _resolution(file.series[0].keyframe)
@@ -277,22 +250,33 @@ def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Coordinate]
         steps = {
             axis: (1 / per_unit, unit) for axis, (per_unit, unit) in resolution.items() if unit
         }
-    coords = {}
-    for axis, (step, unit) in steps.items():
-        if axis in lengths and np.isfinite(step) and step > 0:
-            place = lattice(axis, 0.0, step, lengths[axis])
-            extra = {"units": unit} if unit else {}
-            coords[axis] = Coordinate(name=place.name, values=place.values, attributes=extra)
-    return coords
+    return {
+        axis: lattice(axis, 0.0, step, lengths[axis], units=unit)
+        for axis, (step, unit) in steps.items()
+        if axis in lengths and np.isfinite(step) and step > 0
+    }
 
 
-def _ome_steps(file: Any) -> dict[str, tuple[float, str]]:
+def _ome_pixels(file: Any) -> dict[str, Any]:
+    """The description of the pixels of the first picture in the metadata of OME."""
     pixels = importlib.import_module("tifffile").xml2dict(file.ome_metadata)
     for key in ("OME", "Image", "Pixels"):
         pixels = pixels.get(key, {}) if isinstance(pixels, dict) else {}
         pixels = pixels[0] if isinstance(pixels, list) and pixels else pixels
-    if not isinstance(pixels, dict):
-        return {}
+    return pixels if isinstance(pixels, dict) else {}
+
+
+def _channel_names(file: Any) -> list[str]:
+    """Names of the channels, as OME's metadata and ImageJ's labels have them."""
+    if not file.is_ome:
+        return []
+    channels = _ome_pixels(file).get("Channel", [])
+    channels = channels if isinstance(channels, list) else [channels]
+    return [str(each.get("Name", "")) for each in channels if isinstance(each, dict)]
+
+
+def _ome_steps(file: Any) -> dict[str, tuple[float, str]]:
+    pixels = _ome_pixels(file)
     names = {axis: f"PhysicalSize{axis.upper()}" for axis in "xyz"} | {"t": "TimeIncrement"}
     return {
         axis: (
@@ -322,8 +306,8 @@ def _number(value: Any) -> float:
         return float("nan")
 
 
-def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSeries | None:
-    """Open files of one page each as one series: `--axes` says what they are.
+def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source | None:
+    """Files of one page each as one series: `--axes` says what they are.
 
     None where the first file holds more than a page, or where there is one file: each file is then
     a step, as in any pattern. Raises InputError where the axes are not given, and for files that
@@ -335,33 +319,37 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSer
             return None
         letters, shape = str(file.series[0].axes), tuple(file.series[0].shape)
         dtype = np.dtype(file.series[0].dtype).newbyteorder("=")
-    if letters == "YXS":
-        raise InputError(f"{paths[0]} is a colour picture; one number a pixel can be read")
-    if letters != "YX":
-        return None
+        if letters == "YXS":
+            raise InputError(f"{paths[0]} is a colour picture; one number a pixel can be read")
+        if letters != "YX":
+            return None
+        coords = _coordinates(file, {"y": shape[0], "x": shape[1]})
     if request.axes not in (("z", "y", "x"), ("t", "y", "x")):
         raise InputError(
             f"{pattern}: {len(paths)} files of one page each; say whether they are slices, with"
             " --axes z,y,x, or steps, with --axes t,y,x"
         )
     request.refuse_var(pattern)
-    stamps = [Stamp.of(path) for path in paths]
 
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        return np.stack([_plane(tifffile, path, shape, dtype) for path in paths[ranges[0]]])
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        chosen = paths[places[0]]
+        if isinstance(chosen, Path):
+            return _plane(tifffile, chosen, shape, dtype)[places[1:]]
+        planes = np.stack([_plane(tifffile, path, shape, dtype) for path in chosen])
+        return planes[(slice(None), *places[1:])]
 
-    with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
-        coords = _coordinates(file, {"y": shape[0], "x": shape[1]})
-    return FileSeries(
-        files=StoredFiles(source=pattern, stamp=stamps[0], beside=paths),
+    whole = Variable(
         name=paths[0].stem.rstrip("0123456789_-. ") or paths[0].stem,
-        values=StoredValues(
-            shape=(len(paths), *shape),
-            dtype=dtype,
-            axes=request.axes,
-            fetch=fetch,
-        ),
-        coords=coords,
+        shape=(len(paths), *shape),
+        dtype=dtype,
+        dimensions=tuple(AXIS_NAMES[axis] for axis in request.axes),
+        read=read,
+    )
+    return Source(
+        name=pattern,
+        variables=placed([whole], coords),
+        stamp=Stamp.of(paths[0]),
+        files=paths,
     )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -13,29 +13,26 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.cf import assign_axes
-from fhash_formats.readers.common.file_series import (
-    FileSeries,
-    Request,
-    Stamp,
-    StoredFiles,
-    StoredValues,
-    naming,
-)
-from fhash_formats.readers.common.stored_bytes import (
-    axis_steps,
-    choose_component,
-    component_variables,
-    lattice,
-)
+from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.readers.common.select import open_selected
+from fhash_formats.readers.common.stored_bytes import axis_steps, lattice
 from fhash_formats.readers.common.stored_parts import Hdf5Sources
-from fhash_formats.readers.common.variables import Variable
-from fhash_formats.readers.hdf5 import is_hdf5, require_filters
+from fhash_formats.readers.common.variables import (
+    HEADER,
+    Behind,
+    Source,
+    Variable,
+    components,
+    file_source,
+    placed,
+    positions,
+)
+from fhash_formats.readers.hdf5 import Attributes, is_hdf5, require_filters
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
-from fhash_formats.series import AXES, AXIS_NAMES, Coordinate, NotStored
+from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import PLUMBING, json_attributes, text_of
+from fhash_formats.support.values import json_attributes, text_of
 
 XML_SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")
@@ -99,8 +96,8 @@ class _Grid:
     files: tuple[Path, ...] = ()
 
 
-def open_vtk(path: Path, request: Request) -> FileSeries:
-    """Open the one step of a grid: its only array or component, or the one named.
+def open_vtk(path: Path, request: Request) -> Source:
+    """The arrays and components of the one step of a grid.
 
     Raises MissingInputError for a file of a piece that is not there; InputError for other kinds of
     VTK data, turned grids, and files that are cut or damaged.
@@ -108,32 +105,14 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
         grid = _grid(path, request)
-        variables = list(_variables(grid))
-        variable = choose_component(source, variables, request)
-        axes = assign_axes(source, variable.shape, list(SPACE), list(SPACE), request.axes)
-        array, component = variable.handle
-        elements = [_element(piece.element, array) for piece in grid.pieces]
-        for piece, element in zip(grid.pieces, elements, strict=True):
-            count = prod(_shape(piece.extent, array.place)) * array.components
-            piece.arrays.check(element, count)
-        there = sum(prod(_shape(piece.extent, array.place)) for piece in grid.pieces)
-        if there < prod(variable.shape):
-            raise InputError(
-                f"its pieces leave at least {prod(variable.shape) - there} values of the grid open"
+        found = [
+            each
+            for where in PLACES
+            for each in placed(
+                _arrays(source, grid, where), _positions(grid, where), f"{HEADER}/{where}"
             )
-        coords = _positions(grid, array.place)
-
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        with naming(source):
-            return _frame(grid, array, component)
-
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp, beside=grid.files),
-        name=variable.name.rpartition("/")[2],
-        values=StoredValues(shape=variable.shape, dtype=variable.dtype, axes=axes, fetch=fetch),
-        coords=coords if axes == SPACE else {},
-        attributes=_units(elements[0]),
-    )
+        ]
+    return file_source(path, found, stamp=stamp, files=grid.files)
 
 
 def _grid(
@@ -212,34 +191,59 @@ def _shape(extent: Extent, place: str) -> tuple[int, int, int]:
     return z, y, x
 
 
-def _variables(grid: _Grid) -> Iterator[Variable]:
-    """The arrays of all places; their place precedes a name that two places have."""
+def _arrays(source: str, grid: _Grid, place: str) -> list[Variable]:
+    """The arrays of points or of cells; their place precedes a name that both have."""
     first = grid.pieces[0]
-    found = [
-        (place, number, element)
-        for place in PLACES
-        for holder in first.element.all(place)
-        for number, element in enumerate(holder.all("DataArray"))
-    ]
-    names = [element.attributes.get("Name", "values") for _, _, element in found]
-    for (place, number, element), name in zip(found, names, strict=True):
-        components = element.attributes.get("NumberOfComponents", "1")
-        if not (components.isascii() and components.isdigit() and 0 < int(components) < 1000):
-            raise InputError(f"the array {name} has {components!r} components")
-        parts = [element.attributes.get(f"ComponentName{i}") for i in range(int(components))]
-        array = Variable(
-            name=name if names.count(name) == 1 else f"{place}/{name}",
-            shape=_shape(grid.extent, place),
-            dtype=first.arrays.dtype(element),
-            auxiliary=name in GHOSTS,
-            handle=_Array(
-                place=place,
-                number=number,
-                name=element.attributes.get("Name", ""),
-                components=int(components),
-            ),
+    held = {
+        where: [each for holder in first.element.all(where) for each in holder.all("DataArray")]
+        for where in PLACES
+    }
+    names = [each.attributes.get("Name", "values") for one in held.values() for each in one]
+    found: list[Variable] = []
+    for number, element in enumerate(held[place]):
+        name = element.attributes.get("Name", "values")
+        components_text = element.attributes.get("NumberOfComponents", "1")
+        if not (components_text.isascii() and components_text.isdigit()) or not (
+            0 < int(components_text) < 1000
+        ):
+            raise InputError(f"the array {name} has {components_text!r} components")
+        count = int(components_text)
+        array = _Array(
+            place=place, number=number, name=element.attributes.get("Name", ""), components=count
         )
-        yield from component_variables(array, int(components), parts)
+        whole = Variable(
+            name=name if names.count(name) == 1 else f"{place}/{name}",
+            shape=(*_shape(grid.extent, place), count),
+            dtype=first.arrays.dtype(element),
+            dimensions=(*SPACE, None),
+            attributes=_units(element),
+            auxiliary=name in GHOSTS,
+            read=partial(_read, source, grid, array),
+            require=partial(_check, source, grid, array),
+        )
+        parts = [element.attributes.get(f"ComponentName{i}") for i in range(count)]
+        found += components(whole, len(SPACE), parts)
+    return found
+
+
+def _read(
+    source: str, grid: _Grid, array: _Array, places: tuple[slice | int, ...]
+) -> npt.NDArray[Any]:
+    with naming(source):
+        return _frame(grid, array)[places]
+
+
+def _check(source: str, grid: _Grid, array: _Array) -> None:
+    """Raise InputError unless the pieces hold the values of an array, as their sizes tell."""
+    with naming(source):
+        there = 0
+        for piece in grid.pieces:
+            count = prod(_shape(piece.extent, array.place))
+            piece.arrays.check(_element(piece.element, array), count * array.components)
+            there += count
+        needed = prod(_shape(grid.extent, array.place))
+        if there < needed:
+            raise InputError(f"its pieces leave at least {needed - there} values of the grid open")
 
 
 def _element(piece: Element, array: _Array) -> Element:
@@ -259,15 +263,15 @@ def _element(piece: Element, array: _Array) -> Element:
     return element
 
 
-def _frame(grid: _Grid, array: _Array, component: int) -> npt.NDArray[Any]:
-    """One component of an array over the whole grid, (z, y, x)."""
-    shape = _shape(grid.extent, array.place)
+def _frame(grid: _Grid, array: _Array) -> npt.NDArray[Any]:
+    """An array over the whole grid, (z, y, x, components)."""
+    shape = (*_shape(grid.extent, array.place), array.components)
     parts = []
     for piece in grid.pieces:
         own = _shape(piece.extent, array.place)
         element = _element(piece.element, array)
         values = piece.arrays.read(element, prod(own) * array.components)
-        parts.append((piece.extent, values.reshape(*own, array.components)[..., component]))
+        parts.append((piece.extent, values.reshape(*own, array.components)))
     if len(parts) == 1 and parts[0][1].shape == shape:
         return parts[0][1]
     whole = np.empty(shape, parts[0][1].dtype)
@@ -277,15 +281,16 @@ def _frame(grid: _Grid, array: _Array, component: int) -> npt.NDArray[Any]:
             raise InputError(f"its pieces hold values of the types {whole.dtype} and {part.dtype}")
         place = tuple(
             slice(first - low, first - low + length)
-            for (first, _), (low, _), length in zip(extent, grid.extent, part.shape, strict=True)
+            for (first, _), (low, _), length in zip(extent, grid.extent, part.shape, strict=False)
         )
         whole[place], filled[place] = part, True
     if not filled.all():
-        raise InputError(f"its pieces leave {int((~filled).sum())} values of the grid open")
+        missing = int((~filled[..., 0]).sum())
+        raise InputError(f"its pieces leave {missing} values of the grid open")
     return whole
 
 
-def _positions(grid: _Grid, place: str) -> dict[str, Coordinate]:
+def _positions(grid: _Grid, place: str) -> dict[str, Variable]:
     """Coordinates of the points or of the centres of cells, and the time where the file has it."""
     if grid.element.name.endswith("ImageData"):
         # A parallel file may leave out what its pieces say, such as the direction.
@@ -307,7 +312,7 @@ def _positions(grid: _Grid, place: str) -> dict[str, Coordinate]:
 
 def _even(
     extent: Extent, place: str, origin: Values, spacing: Values, direction: Values
-) -> dict[str, Coordinate]:
+) -> dict[str, Variable]:
     """Coordinates of an even grid: of its points, or of the centres of its cells.
 
     origin, spacing: along x, y and z. direction: a matrix (3, 3), row by row.
@@ -322,7 +327,7 @@ def _even(
     return coords
 
 
-def _listed(grid: _Grid, *, cells: bool) -> dict[str, Coordinate]:
+def _listed(grid: _Grid, *, cells: bool) -> dict[str, Variable]:
     """Coordinates of a rectilinear grid, put together from its pieces."""
     coords = {}
     for axis, (low, high) in zip(SPACE, grid.extent, strict=True):
@@ -339,11 +344,11 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Coordinate]:
             values[first - low : last - low + 1] = piece.arrays.read(element, last - first + 1)
         if cells and high > low:
             values = (values[:-1] + values[1:]) / 2
-        coords[axis] = Coordinate(name=AXIS_NAMES[axis], values=values)
+        coords[axis] = positions(AXIS_NAMES[axis], values)
     return coords
 
 
-def _time(grid: _Grid) -> Coordinate | None:
+def _time(grid: _Grid) -> Variable | None:
     """The field array TimeValue as the coordinate of the one step; None without it."""
     fields = (
         (element, arrays)
@@ -358,7 +363,7 @@ def _time(grid: _Grid) -> Coordinate | None:
             and arrays.dtype(element).kind in "iuf"
         ):
             values = arrays.read(element, 1).astype(np.float64)
-            return Coordinate(name=AXIS_NAMES["t"], values=values, attributes=_units(element))
+            return positions(AXIS_NAMES["t"], values, _units(element))
     return None
 
 
@@ -383,15 +388,6 @@ def _numbers(text: str, count: int) -> npt.NDArray[np.float64]:
 VTKHDF_SUFFIXES = (".vtkhdf",)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Dataset:
-    """One dataset of the grid: the group that it is in, and whether it has a dimension of steps."""
-
-    place: str
-    dataset: Any
-    steps: bool
-
-
 def is_vtkhdf(head: bytes, path: Path) -> bool:
     """Whether this is an HDF5 file with a group VTKHDF, whatever its suffix."""
     if not is_hdf5(head):
@@ -407,8 +403,8 @@ def is_vtkhdf(head: bytes, path: Path) -> bool:
         return False  # the reader of HDF5 says what is wrong
 
 
-def open_vtkhdf(path: Path, request: Request) -> FileSeries:
-    """Open the series in a VTKHDF file of the type ImageData.
+def open_vtkhdf(path: Path, request: Request) -> Source:
+    """The arrays and components in a VTKHDF file of the type ImageData.
 
     Raises InputError for other types, turned grids, and sizes that do not fit together.
     """
@@ -419,13 +415,14 @@ def open_vtkhdf(path: Path, request: Request) -> FileSeries:
         file = h5py.File(path, "r")
     try:
         with naming(source):
-            return _series(source, path, stamp, file, request)
+            found = _datasets_of(source, path, file)
     except BaseException:
         file.close()
         raise
+    return file_source(path, found, stamp=stamp, close=file.close)
 
 
-def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
+def _datasets_of(source: str, path: Path, file: Any) -> list[Variable]:
     import h5py
 
     root = file.get("VTKHDF")
@@ -434,48 +431,15 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         raise InputError(f"it holds VTKHDF data of the type {kind or '?'}; ImageData can be read")
     extent = _extent(" ".join(f"{end:.0f}" for end in _row(root, "WholeExtent", 6)))
     times = _times(root)
-    variables = list(_datasets(root, extent, times))
-    variable = choose_component(source, variables, request)
-    array, component = variable.handle
-    require_filters(source, variable.name, array.dataset)
-    with Hdf5Sources(source) as behind:
-        parts = behind.parts(variable.name, array.dataset)
-    own = (AXES if array.steps else SPACE)[: len(variable.shape)]
-    axes = assign_axes(source, variable.shape, list(own), list(own), request.axes)
-    entries = _entries(root, array, variable.name, times)
-    vector = array.dataset.ndim > len(variable.shape)
-    chunks = array.dataset.chunks
-    never = None
-    if parts is not None:
-        shares = parts.along(0 if array.steps else None, {})
-        shares = 1 - (shares if entries is None else shares[entries])
-        never = NotStored(shares=shares, fill=parts.fill.item()) if shares.any() else None
-
-    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        space = ranges[-3:]
-        picked = (*space, component) if vector else space
-        if entries is None:
-            return np.asarray(array.dataset[picked])
-        steps = entries[ranges[0]]
-        first = int(steps[0])
-        if np.array_equal(steps, np.arange(first, first + len(steps))):
-            return np.asarray(array.dataset[(slice(first, first + len(steps)), *picked)])
-        return np.stack([array.dataset[(int(step), *picked)] for step in steps])
-
-    return FileSeries(
-        files=StoredFiles(source=source, stamp=stamp, close=file.close, beside=list(behind.files)),
-        name=variable.name.rpartition("/")[2],
-        values=StoredValues(
-            shape=variable.shape,
-            dtype=variable.dtype,
-            axes=axes,
-            fetch=fetch,
-            chunks=None if chunks is None else chunks[: len(variable.shape)],
-            not_stored=never,
-        ),
-        coords=_coordinates(root, extent, array, times) if axes == own else {},
-        attributes=json_attributes(array.dataset.attrs, without=PLUMBING),
-    )
+    return [
+        each
+        for place in PLACES
+        for each in placed(
+            _hdf_arrays(source, root, place, extent, times),
+            _hdf_positions(root, extent, place, times),
+            f"{HEADER}/{place}",
+        )
+    ]
 
 
 def _times(root: Any) -> npt.NDArray[np.float64] | None:
@@ -490,71 +454,98 @@ def _times(root: Any) -> npt.NDArray[np.float64] | None:
     return times
 
 
-def _datasets(
-    root: Any, extent: Extent, times: npt.NDArray[np.float64] | None
-) -> Iterator[Variable]:
-    """Arrays of points and cells; the place precedes a name that both have."""
+def _hdf_arrays(
+    source: str, root: Any, place: str, extent: Extent, times: npt.NDArray[np.float64] | None
+) -> list[Variable]:
+    """Arrays of points or of cells; the place precedes a name that both have."""
     import h5py
 
-    found = [
-        (place, name, root[place][name])
-        for place in PLACES
-        if isinstance(root.get(place), h5py.Group)
-        for name in root[place]
-    ]
-    names = [name for _, name, _ in found]
-    for place, name, dataset in found:
+    held = [root[each] for each in PLACES if isinstance(root.get(each), h5py.Group)]
+    names = [name for group in held for name in group]
+    space, leading = _shape(extent, place), int(times is not None)
+    found: list[Variable] = []
+    for name in root[place] if isinstance(root.get(place), h5py.Group) else ():
+        dataset = root[place][name]
         if not isinstance(dataset, h5py.Dataset):
             continue
-        space = _shape(extent, place)
-        leading = 0 if times is None else 1
         shape: tuple[int, ...] = dataset.shape or ()
-        error = ""
-        if shape[leading : leading + 3] != space or len(shape) - leading not in (3, 4):
+        fits = shape[leading : leading + 3] == space and len(shape) - leading in (3, 4)
+        full = f"{place}/{name}" if names.count(name) > 1 else name
+        if not fits:
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
-        components = 1 if error or len(shape) - leading == 3 else shape[-1]
-        full = space if times is None else (len(times), *space)
-        array = Variable(
-            name=name if names.count(name) == 1 else f"{place}/{name}",
-            shape=full,
+            found.append(Variable(name=full, shape=shape, dtype=dataset.dtype, error=error))
+            continue
+        entries = None if times is None else _entries(root, place, dataset, full, times)
+        dims = (*([AXIS_NAMES["t"]] if leading else []), *SPACE)
+        whole = Variable(
+            name=full,
+            shape=((len(times), *shape[1:]) if times is not None else shape),
             dtype=dataset.dtype,
+            dimensions=(*dims, *([None] if len(shape) > len(dims) else [])),
+            attributes=Attributes(dataset),
+            read=partial(_hdf_read, dataset, entries),
+            chunks=dataset.chunks,
             auxiliary=name in GHOSTS,
-            error=error,
-            handle=_Dataset(place=place, dataset=dataset, steps=times is not None),
+            behind=partial(_hdf_behind, source, full, dataset, entries),
+            require=partial(require_filters, source, full, dataset),
         )
-        yield from component_variables(array, components)
+        vector = len(shape) > len(dims)
+        found += components(whole, len(dims), interleaved=False) if vector else [whole]
+    return found
+
+
+def _hdf_read(
+    dataset: Any, entries: npt.NDArray[np.int64] | None, places: tuple[slice | int, ...]
+) -> npt.NDArray[Any]:
+    """Values of the entries that belong to some steps."""
+    if entries is None or isinstance(places[0], int):
+        return np.asarray(dataset[places if entries is None else (entries[places[0]], *places[1:])])
+    steps = entries[places[0]]
+    first = int(steps[0])
+    if np.array_equal(steps, np.arange(first, first + len(steps))):
+        return np.asarray(dataset[(slice(first, first + len(steps)), *places[1:])])
+    return np.stack([dataset[(int(step), *places[1:])] for step in steps])
+
+
+def _hdf_behind(
+    source: str, name: str, dataset: Any, entries: npt.NDArray[np.int64] | None
+) -> Behind:
+    with Hdf5Sources(source) as sources:
+        parts = sources.parts(name, dataset)
+        files = list(sources.files)
+    if parts is not None and entries is not None:
+        # an entry may serve several steps, and some serve none
+        borders = np.arange(len(entries) + 1)
+        share = parts.share[np.searchsorted(parts.edges[0], entries, side="right") - 1]
+        parts = replace(parts, edges=(borders, *parts.edges[1:]), share=share)
+    return Behind(parts=parts, files=files)
 
 
 def _entries(
-    root: Any, array: _Dataset, name: str, times: npt.NDArray[np.float64] | None
-) -> npt.NDArray[np.int64] | None:
-    """The entry of the dataset that belongs to each step; None without steps."""
-    if times is None:
-        return None
-    own = array.dataset.name.rpartition("/")[2]
-    offsets = root["Steps"].get(f"{array.place}Offsets/{own}")
+    root: Any, place: str, dataset: Any, name: str, times: npt.NDArray[np.float64]
+) -> npt.NDArray[np.int64]:
+    """The entry of the dataset that belongs to each step."""
+    own = dataset.name.rpartition("/")[2]
+    offsets = root["Steps"].get(f"{place}Offsets/{own}")
     entries = np.arange(len(times)) if offsets is None else np.asarray(offsets[()], np.int64)
-    if entries.shape != times.shape or entries.min() < 0 or entries.max() >= len(array.dataset):
-        raise InputError(f"the offsets of {name} do not fit its {len(array.dataset)} entries")
+    if entries.shape != times.shape or entries.min() < 0 or entries.max() >= len(dataset):
+        raise InputError(f"the offsets of {name} do not fit its {len(dataset)} entries")
     return entries
 
 
-def _coordinates(
-    root: Any,
-    extent: Extent,
-    array: _Dataset,
-    times: npt.NDArray[np.float64] | None,
-) -> dict[str, Coordinate]:
+def _hdf_positions(
+    root: Any, extent: Extent, place: str, times: npt.NDArray[np.float64] | None
+) -> dict[str, Variable]:
     origin, spacing = _row(root, "Origin", 3), _row(root, "Spacing", 3)
     direction = _row(root, "Direction", 9) if "Direction" in root.attrs else np.eye(3).ravel()
-    coords = _even(extent, array.place, origin, spacing, direction)
+    coords = _even(extent, place, origin, spacing, direction)
     stored = root["Steps/Values"] if times is not None else root.get("FieldData/TimeValue")
     if times is None and stored is not None and stored.size == 1:
         times = np.asarray(stored[()], dtype=np.float64).ravel()
     if times is not None:
         extra = json_attributes(stored.attrs)
         kept = {key: value for key, value in extra.items() if key in ("units", "calendar")}
-        coords["t"] = Coordinate(name=AXIS_NAMES["t"], values=times, attributes=kept)
+        coords["t"] = positions(AXIS_NAMES["t"], times, kept)
     return coords
 
 
@@ -583,7 +574,7 @@ class CollectionSeries(JoinedSeries):
 
     def __init__(self, path: Path, stamp: Stamp, entries: list[Entry], request: Request) -> None:
         def open_part(file: Path) -> FileSeries:
-            part = open_vtk(file, request).as_asked(request)
+            part = open_selected(open_vtk(file, request), request).as_asked(request)
             if part.shape[0] != 1:
                 raise InputError(f"{file} holds {part.shape[0]} steps; {path} lists one a file")
             if "t" in part.given:

@@ -18,9 +18,10 @@ from fhash_formats.native import crc32c
 from fhash_formats.readers.common.cf import Packing
 from fhash_formats.readers.common.file_series import FileSeries, Request, condense, refusing
 from fhash_formats.readers.common.layout import Layout, label
+from fhash_formats.readers.common.select import Selection
 from fhash_formats.readers.common.stored_parts import ABSENT
 from fhash_formats.readers.common.variables import Variable
-from fhash_formats.readers.zarr_store import ZarrTree, open_tree, series_in
+from fhash_formats.readers.zarr_store import open_zarr
 from fhash_formats.series import AXES
 from fhash_formats.transform.stream import MAX_TILE_VERTICES, NO_AXIS, TILE_AXES, ArrayAxes
 
@@ -45,19 +46,20 @@ def open_coded(path: Path, request: Request) -> Iterator[tuple[FileSeries, Coded
 
     Raises InputError as `open_series` does, and for an array of another codec or format.
     """
-    store, found = open_tree(path, request)
+    opened = open_zarr(path, request)
     try:
         with refusing(f"{path} cannot be read as zarr"):
-            variable = found.choose(request.var)
+            found = Selection(opened, request)
+            variable = found.choose(found.request.var)
             packed = _require_coded(found, variable)
             layout = found.arrange(variable)
-            series = series_in(found.root, store, found)
+            series = found.series()
         yield (
             series,
             CodedArray(found.source, variable, layout, () if packed is None else packed.fills),
         )
     finally:
-        store.close()
+        opened.close()
 
 
 def coded_names(path: Path) -> tuple[Path, dict[str, bool]]:
@@ -65,17 +67,17 @@ def coded_names(path: Path) -> tuple[Path, dict[str, bool]]:
 
     Of a path that is an array in a group this one alone. The folder of the group comes first.
     """
-    store, found = open_tree(path, Request())
+    opened = open_zarr(path, Request())
     try:
         names = {
-            variable.name: not variable.members and isinstance(_coding(variable.handle[1]), _Coding)
-            for variable in found.variables
+            variable.name: not variable.members and isinstance(_coding(variable.handle), _Coding)
+            for variable in Selection(opened, Request()).variables
             if not variable.error
         }
     finally:
-        store.close()
-    asked = found.request.var
-    return found.root, names if asked is None else {asked: names.get(asked, False)}
+        opened.close()
+    assert opened.path is not None
+    return opened.path, {opened.only: names.get(opened.only, False)} if opened.only else names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,14 +152,14 @@ def _inner_coding(
     )
 
 
-def _require_coded(found: ZarrTree, variable: Variable) -> Packing | None:
+def _require_coded(found: Selection, variable: Variable) -> Packing | None:
     """The packing of a variable, whose chunks can be the tiles of a container.
 
     Raises InputError for another one.
     """
     why = "has its steps in several groups" if variable.members else ""
     if not why:
-        coding = _coding(variable.handle[1])
+        coding = _coding(variable.handle)
         why = coding if isinstance(coding, str) else ""
     if why:
         raise InputError(_refusal(found.source, variable.name, why))
@@ -194,7 +196,7 @@ class CodedArray:
     def __init__(
         self, source: str, variable: Variable, layout: Layout, fills: Sequence[Any] = ()
     ) -> None:
-        path, array = variable.handle
+        path, array = variable.name, variable.handle
         coding = _coding(array)
         assert isinstance(coding, _Coding), "the caller has looked"
         self.name, self._source, self._path = variable.name, source, path

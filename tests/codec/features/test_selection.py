@@ -17,7 +17,6 @@ import zarr
 
 from fhash_codec import InputError
 from fhash_codec.config import EncodeConfig
-from fhash_codec.features import selection as lazy
 from fhash_codec.features.features import (
     Everything,
     Extent,
@@ -35,10 +34,6 @@ from fhash_codec.features.features import (
 )
 from fhash_codec.features.scan import scan
 from fhash_codec.features.selection import (
-    DaskSeries,
-    LazyFrames,
-    array_series,
-    labelled_series,
     open_source,
     resolve_selection,
     select_features,
@@ -46,6 +41,8 @@ from fhash_codec.features.selection import (
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
+from fhash_formats.readers.common import file_series
+from fhash_formats.readers.labelled import array_series, labelled_series
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate
 
@@ -236,16 +233,16 @@ def counted(chunks, computed: Counter) -> object:
 @pytest.mark.parametrize("steps", [1, 3, 7])
 def test_each_chunk_is_computed_once(steps) -> None:
     computed: Counter = Counter()
-    frames = LazyFrames(counted((steps, 2, 3, 4), computed))
+    frames = array_series(counted((steps, 2, 3, 4), computed))
     for step, frame in enumerate(VALUES):
         np.testing.assert_array_equal(frames.read(step), frame)
     assert set(computed.values()) == {1}
 
 
 def test_a_large_chunk_is_computed_in_slabs(monkeypatch) -> None:
-    monkeypatch.setattr(lazy, "SLAB_BYTES", 2 * VALUES[0].nbytes)
+    monkeypatch.setattr(file_series, "SLAB_BYTES", 2 * VALUES[0].nbytes)
     computed: Counter = Counter()
-    frames = LazyFrames(counted((5, 2, 3, 4), computed))
+    frames = array_series(counted((5, 2, 3, 4), computed))
     for step in (0, 1, 4, 6, 2, 3):
         np.testing.assert_array_equal(frames.read(step), VALUES[step])
     assert max(computed.values()) == 3  # slabs 0-1, 2-3 and 4 of the first chunk
@@ -257,7 +254,7 @@ def test_a_series_of_dask_is_that_of_its_values(axes, dtype) -> None:
     values = VALUES.astype(dtype) if axes == 4 else VALUES[0].astype(dtype)
     series = array_series(dask.from_array(values, chunks=2))
     plain = ArraySeries(values)
-    assert isinstance(series, DaskSeries)
+    assert series.lazy.shape == series.shape
     for name in ("shape", "dtype", "name", "units", "source", "attributes"):
         assert getattr(series, name) == getattr(plain, name)
     for step in range(plain.shape[0]):
@@ -270,8 +267,6 @@ def test_a_series_of_dask_is_that_of_its_values(axes, dtype) -> None:
 def test_lengths_that_are_not_known_are_refused() -> None:
     array = dask.from_array(VALUES, chunks=2)
     unknown = array[array[:, 0, 0, 0] > 30]
-    with pytest.raises(InputError, match="compute_chunk_sizes"):
-        LazyFrames(unknown)
     with pytest.raises(InputError, match="compute_chunk_sizes"):
         array_series(unknown)
 

@@ -339,9 +339,6 @@ TIME_NAMES = ("time", "forecast_period", "forecast_reference_time")
 """Standard names of CF for coordinates that count time."""
 
 
-MAX_LETTERS = 64
-"""Letters of a date."""
-
 NUMBERED = "step numbers stand for the times"
 
 LOSS = Fraction(1, 10**6)
@@ -487,29 +484,31 @@ def with_times(metadata: SourceMetadata, time: Coordinate) -> SourceMetadata:
 
 
 def texts_along(
-    dimension: str, length: int, arrays: Iterable[tuple[str, Any, Sequence[object]]]
-) -> Iterator[tuple[str, npt.NDArray[Any], Mapping[str, Any]]]:
-    """Arrays of texts along one dimension, or of letters: name, texts and attributes.
+    dimension: str | None, length: int, arrays: Iterable[Any]
+) -> Iterator[tuple[npt.NDArray[Any], Mapping[str, Any]]]:
+    """Texts along a dimension, or letters: the texts of each array, and its attributes.
 
-    arrays: name, array and names of the dimensions of each.
+    dimension: its name; None for one without, along which arrays with a name of times may lie.
+    arrays: Variables.
     """
-    for name, array, dimensions in arrays:
-        letters = array.ndim == 2 and array.dtype == "S1" and array.shape[1] <= MAX_LETTERS
-        texts = array.ndim == 1 and array.dtype.kind in "SUTO"
-        if (letters or texts) and dimensions[0] == dimension and array.shape[0] == length:
-            found = np.asarray(array[...])
-            rows = [b"".join(row) for row in found.tolist()] if letters else found
-            yield name, np.asarray(rows), array.attrs
+    for array in arrays:
+        along, name = array.dimension(0), array.name.rpartition("/")[2].lower()
+        if array.shape[:1] != (length,) or array.error:
+            continue
+        texts = len(array.shape) == 1 and array.dtype.kind in "SUTO"
+        fits = along == dimension if along is not None else name in NAMES["t"].split()
+        if (array.is_letters or texts) and fits:
+            yield array.texts(), array.attributes
 
 
 def written_times(
-    dimension: str, columns: Iterable[tuple[str, npt.NDArray[Any], Mapping[str, Any]]]
+    dimension: str, columns: Iterable[tuple[npt.NDArray[Any], Mapping[str, Any]]]
 ) -> Coordinate | None:
     """The times that a column of texts along a dimension gives, None without such a column.
 
-    columns: name, texts (n,) and attributes of each.
+    columns: texts (n,) and attributes of each.
     """
-    for _, texts, attributes in columns:
+    for texts, attributes in columns:
         calendar = str(attributes.get("calendar") or "proleptic_gregorian").strip().lower()
         if calendar in CALENDARS:
             known = CALENDARS[calendar]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -317,7 +318,7 @@ of several frames of 128^3 float64 are decompressed once, and memory stays small
 encoder's own.
 """
 
-Fetch = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
+Fetch = Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
 
 
 def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -331,14 +332,14 @@ class StoredFiles:
 
     Attributes:
         source: name for messages, that of the first file.
-        stamp: checked before and after every fetch.
+        stamp: checked before and after every fetch; None for values in memory.
         beside: further files that hold values, checked likewise.
         folder: stamp of all files, which `FileSeries.check` alone looks at.
         close: lets go of all that is open.
     """
 
     source: str
-    stamp: Stamp
+    stamp: Stamp | None = None
     beside: Sequence[Path] = ()
     folder: FolderStamp | None = None
     close: Callable[[], None] = lambda: None
@@ -352,9 +353,9 @@ class StoredValues:
         shape, axes: lengths and axes of the dimensions, in the file's order.
         dtype: type of the physical values, in any byte order.
         fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
-        chunks: shape of a stored chunk, None without chunks. As many steps of one chunk as fit
-            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame
-            at a time.
+        chunks: shape of a stored chunk, or the lengths of all along a dimension; None without
+            chunks. As many steps of one chunk as fit SLAB_BYTES are fetched at once and kept until
+            the next fetch; without chunks, one frame at a time.
         packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
         not_stored: what nobody wrote, with the number that stands there as it is stored.
         default_fill: value as it is read that stands for one that nobody wrote, see
@@ -365,7 +366,7 @@ class StoredValues:
     axes: Sequence[str]
     dtype: np.dtype[Any]
     fetch: Fetch
-    chunks: Sequence[int] | None = None
+    chunks: Sequence[int | Sequence[int]] | None = None
     packing: Packing | None = None
     not_stored: NotStored | None = None
     default_fill: float | None = None
@@ -393,7 +394,7 @@ class FileSeries(Series):
     ) -> None:
         lengths = dict(zip(values.axes, values.shape, strict=True))
         self.source, self.name, self.dtype = files.source, plain_text(name), native(values.dtype)
-        self.files = (Path(files.source), *files.beside)
+        self.files = () if files.stamp is None else (Path(files.source), *files.beside)
         self.shape = check_values(self.source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
@@ -406,14 +407,15 @@ class FileSeries(Series):
             for axis, length in zip(AXES, self.shape, strict=True)
         } | {axis: replace(each, name=plain_form(each.name)) for axis, each in coords.items()}
         self._axes, self._fetch, self._close = tuple(values.axes), values.fetch, files.close
-        self._quick = (files.stamp, *map(Stamp.of, files.beside))
+        opened = () if files.stamp is None else (files.stamp,)
+        self._quick = (*opened, *map(Stamp.of, files.beside))
         self.stamps: tuple[Stamp | FolderStamp, ...] = (
             self._quick if files.folder is None else (*self._quick, files.folder)
         )
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
-        together = _steps_of_a_chunk(self._axes, values.shape, values.chunks)
-        self._together = max(1, min(together, SLAB_BYTES // frame_bytes))
-        self._slab: tuple[int, npt.NDArray[Any]] | None = None
+        most = max(1, SLAB_BYTES // frame_bytes)
+        self._starts = _slabs(_steps_of_chunks(self._axes, values.shape, values.chunks), most)
+        self._held_slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
         self._sought: dict[float, Any] = {}
         self._met: set[float] = set()
@@ -467,38 +469,39 @@ class FileSeries(Series):
     def read_steps(self, steps: range) -> npt.NDArray[Any]:
         self.require_step(steps.start)
         self.require_step(steps.stop - 1)
-        if self._together == 1:
+        if len(self._starts) > self.shape[0]:  # a slab is a step
             return np.ascontiguousarray(self._block(steps.start, steps.stop), dtype=self.dtype)
         result = np.empty((len(steps), *self.shape[1:]), self.dtype)
         place = steps.start
         while place < steps.stop:
-            inside = place % self._together
-            whole = (steps.stop - place) // self._together * self._together
-            if inside or not whole:
-                values = self._slab_from(place - inside)[inside:][: steps.stop - place]
+            number = bisect_right(self._starts, place) - 1
+            last = bisect_right(self._starts, steps.stop) - 1
+            if place != self._starts[number] or last == number:
+                inside = place - self._starts[number]
+                values = self._slab(number)[inside:][: steps.stop - place]
             else:  # whole chunks, of which nothing is read again
-                values = self._block(place, place + whole)
+                values = self._block(place, self._starts[last])
             result[place - steps.start :][: len(values)] = values
             place += len(values)
         return result
 
-    def _slab_from(self, start: int) -> npt.NDArray[Any]:
-        """The steps of a chunk from `start` on, which are kept."""
-        slab = self._slab
-        if slab is None or slab[0] != start:
-            self._slab = None  # before the fetch, so that two slabs are never held
-            stop = min(start + self._together, self.shape[0])
-            slab = self._slab = (start, self._block(start, stop))
+    def _slab(self, number: int) -> npt.NDArray[Any]:
+        """The steps of a slab, which are kept."""
+        held = self._held_slab
+        if held is None or held[0] != number:
+            self._held_slab = None  # before the fetch, so that two slabs are never held
+            read = self._block(self._starts[number], self._starts[number + 1])
+            held = self._held_slab = (number, read)
         else:
             self._check_files()
-        return slab[1]
+        return held[1]
 
     def check(self) -> None:
         for stamp in self.stamps:
             stamp.check()
 
     def close(self) -> None:
-        self._slab = None
+        self._held_slab = None
         self._close()
 
     def _check_files(self) -> None:
@@ -539,16 +542,29 @@ class FileSeries(Series):
         )
 
 
-def _steps_of_a_chunk(
-    axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None
-) -> int:
-    """Steps in one chunk.
+def _steps_of_chunks(
+    axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int | Sequence[int]] | None
+) -> list[int]:
+    """Steps in each chunk.
 
-    Without chunks it is 1, or all steps where time is not the slowest dimension.
+    Without chunks one in each, or all steps where time is not the slowest dimension.
     """
     if "t" not in axes:
-        return 1
+        return [1]
     place = axes.index("t")
-    if chunks is not None:
-        return chunks[place]
-    return 1 if place == 0 else shape[place]
+    if chunks is None:
+        return [1] * shape[0] if place == 0 else [shape[place]]
+    told = chunks[place]
+    if isinstance(told, int | np.integer):
+        whole, rest = divmod(shape[place], int(told))
+        return [int(told)] * whole + [rest] * (rest > 0)
+    return [int(each) for each in told]
+
+
+def _slabs(chunks: Sequence[int], most: int) -> list[int]:
+    """First steps of slabs of at most so many steps, none of two chunks, and the end of all."""
+    starts, first = [], 0
+    for length in chunks:
+        starts += range(first, first + length, most)
+        first += length
+    return [*starts, first]

@@ -21,7 +21,8 @@ from fhash_formats.readers.common.file_series import Request
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.support.values import text_of
 
-Read = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
+Read = Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
+"""Values at a slice or an index along each dimension."""
 
 FEWEST_COMPONENTS = 2
 """Length of a last dimension from which on it may hold the components of a vector."""
@@ -135,7 +136,9 @@ class Layout:
         """Lengths of the axes, in the file's order."""
         return tuple(dimension.length for dimension in self.kept)
 
-    def chunks(self, chunks: Sequence[int] | None) -> tuple[int, ...] | None:
+    def chunks(
+        self, chunks: Sequence[int | Sequence[int]] | None
+    ) -> tuple[int | Sequence[int], ...] | None:
         """Shape of a stored chunk along the axes."""
         if chunks is None:
             return None
@@ -146,7 +149,7 @@ class Layout:
         if not self.picked:
             return read
 
-        def fetched(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        def fetched(ranges: tuple[slice | int, ...]) -> npt.NDArray[Any]:
             axes = iter(ranges)
             values = read(
                 tuple(

@@ -114,7 +114,7 @@ def listing(
         declares, whatever the request is.
     """
     shown = [variable for variable in variables if not variable.auxiliary]
-    good = [variable for variable in shown if not variable.problem(request.booleans)]
+    good = [each for each in shown if not each.problem(request.booleans) and not each.note]
     several = len(good) > 1
     found = []
     plain = Counter(plain_name(variable.name) for variable in shown)
@@ -122,6 +122,7 @@ def listing(
         shown = [named(source, variables, good or shown, request.var)]
     for variable in shown:
         name, problem = plain_text(variable.name), variable.problem(request.booleans)
+        problem = problem or ("" if request.var else variable.note)
         entry = Listed(
             name=name,
             shape=variable.shape,

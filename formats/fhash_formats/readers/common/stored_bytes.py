@@ -6,7 +6,6 @@ import bz2
 import re
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -15,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.file_series import Request
-from fhash_formats.readers.common.variables import Variable, choose
-from fhash_formats.series import AXIS_NAMES, Coordinate
+from fhash_formats.readers.common.variables import Variable, positions
+from fhash_formats.series import AXIS_NAMES
 
 BLOCK_BYTES = 8 * 2**20
 """Bytes read at once where the requested values are scattered, as with time fastest."""
@@ -43,11 +41,20 @@ class FlatArray:
         """The byte after the last value, which is the expected size of the file."""
         return self.offset + prod(self.shape) * self.dtype.itemsize
 
-    def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Values in ranges of the dimensions, one for each.
+    def read(self, places: Sequence[slice | int]) -> npt.NDArray[Any]:
+        """Values at a range or an index along each dimension.
 
         Raises InputError where the file ends too early.
         """
+        if any(isinstance(each, int) for each in places):
+            whole = [slice(each, each + 1) if isinstance(each, int) else each for each in places]
+            kept = tuple(0 if isinstance(each, int) else slice(None) for each in places)
+            return self.read(whole)[kept]
+        ranges = tuple(
+            slice(*each.indices(length)[:2])
+            for each, length in zip(places, self.shape, strict=True)
+            if isinstance(each, slice)
+        )
         parts = [
             place
             for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
@@ -444,17 +451,20 @@ class CompressedFile:
         return b""
 
 
-LETTERS = ("x", "y", "z")
-"""Names of the components of a vector with three of them."""
-
 IDENTITY_TOLERANCE = 1e-9
 """Largest difference from 1 or 0 of a direction that still is that of an axis."""
 
 
 def lattice(
-    axis: str, origin: float, spacing: float, count: int, *, first: float = 0
-) -> Coordinate:
-    """The coordinate of an even axis: origin + (first + i) * spacing for i below `count`.
+    axis: str,
+    origin: float,
+    spacing: float,
+    count: int,
+    *,
+    first: float = 0,
+    units: str = "",
+) -> Variable:
+    """The positions of an even axis: origin + (first + i) * spacing for i below `count`.
 
     `first` is the index of the first position; a half stands for the centre of a cell. Raises
     InputError for an origin or a spacing that is not finite, and for a spacing of 0.
@@ -465,7 +475,7 @@ def lattice(
             " finite, and the spacing not 0"
         )
     values = origin + (first + np.arange(count, dtype=np.float64)) * spacing
-    return Coordinate(name=AXIS_NAMES[axis], values=values)
+    return positions(AXIS_NAMES[axis], values, {"units": units} if units else {})
 
 
 def axis_steps(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -481,53 +491,3 @@ def axis_steps(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
             " grids along x, y and z can be read; resample it first"
         )
     return steps
-
-
-def component_names(count: int, given: Sequence[str | None] = ()) -> list[str]:
-    """Names of `count` components: those given, where all are and they differ; x, y, z; or 0, 1."""
-    names = [name for name in given if name]
-    if len(names) == count and len(set(names)) == count:
-        return names
-    return list(LETTERS) if count == len(LETTERS) else [str(number) for number in range(count)]
-
-
-def component_variables(
-    array: Variable, count: int, given: Sequence[str | None] = ()
-) -> list[Variable]:
-    """The variables of an array: itself, or one for each component, such as `velocity.x`.
-
-    The handle of each is (handle of the array, number of the component).
-    """
-    names = [""] if count == 1 else [f".{part}" for part in component_names(count, given)]
-    return [
-        replace(array, name=f"{array.name}{part}", handle=(array.handle, number))
-        for number, part in enumerate(names)
-    ]
-
-
-def choose_component(source: str, variables: Sequence[Variable], request: Request) -> Variable:
-    """The variable that the user wants; a component may be given by its number."""
-    var = component_by_number(request.var, variables)
-    return choose(source, variables, var, booleans=request.booleans)
-
-
-def component_by_number(var: str | None, variables: Sequence[Variable]) -> str | None:
-    """The name of a component that was given by its number: `velocity.x` for `velocity.0`.
-
-    It is the given name where that is a variable, or no number of a component.
-    """
-    if var is None or any(var in (each.name, _last(each.name)) for each in variables):
-        return var
-    stem, _, number = var.rpartition(".")
-    parts = [
-        each
-        for each in variables
-        if stem and stem in (each.name.rpartition(".")[0], _last(each.name).rpartition(".")[0])
-    ]
-    if number.isascii() and number.isdigit() and int(number) < len(parts):
-        return parts[int(number)].name
-    return var
-
-
-def _last(name: str) -> str:
-    return name.rpartition("/")[2]

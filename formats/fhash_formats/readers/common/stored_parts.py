@@ -88,6 +88,21 @@ class StoredParts:
         each: npt.NDArray[np.float64] = np.reshape(share, -1)
         return each
 
+    def taken(self, key: Mapping[int, Any]) -> StoredParts:
+        """The parts of some indices along each dimension; a number takes its dimension away.
+
+        key: a number, a slice or an array of indices by dimension.
+        """
+        edges, share = [], self.share
+        for place in reversed(range(share.ndim)):
+            borders = self.edges[place]
+            chosen = np.arange(borders[-1])[key.get(place, slice(None))]
+            boxes = np.searchsorted(borders, chosen, side="right") - 1
+            share = share.take(boxes, axis=place)
+            if np.ndim(boxes):
+                edges.insert(0, np.arange(len(boxes) + 1))
+        return StoredParts(edges=tuple(edges), share=share, fill=self.fill)
+
 
 def warn_of_column(name: str, parts: StoredParts | None) -> None:
     """Warn (FhashWarning) of positions that nobody wrote.
@@ -437,26 +452,6 @@ def require_inside(path: Path, seen: set[Path] | None = None) -> None:
             if place.resolve() not in seen and place.is_file() and h5py.is_hdf5(place):
                 seen.add(place.resolve())
                 require_inside(place, seen)
-
-
-def hdf5_parts(
-    source: str, path: Path, names: Sequence[str]
-) -> tuple[list[StoredParts | None], list[Path]]:
-    """The stored parts of some datasets of a file, and the other files that hold their values.
-
-    Nothing is known of a file of another format.
-    """
-    import h5py
-
-    if not h5py.is_hdf5(path):
-        return [None] * len(names), []
-    with h5py.File(path, "r") as file, Hdf5Sources(source) as behind:
-        found = [(name, file.get(name)) for name in names]
-        parts = [
-            behind.parts(name, each) if isinstance(each, h5py.Dataset) else None
-            for name, each in found
-        ]
-        return parts, list(behind.files)
 
 
 def _numbered_name(text: str, number: int) -> str:

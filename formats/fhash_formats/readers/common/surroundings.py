@@ -10,20 +10,19 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning
 from fhash_formats.readers.common.cf import Packing, with_times
 from fhash_formats.readers.common.file_series import Request, condense
 from fhash_formats.readers.common.layout import Layout, picks
-from fhash_formats.readers.common.variables import MIN_DIMENSIONS
+from fhash_formats.readers.common.variables import FIELD_DIMENSIONS, Variable
 from fhash_formats.series import (
     COORDINATES,
     NO_AXIS,
@@ -57,20 +56,6 @@ DIGEST_BYTES = 256 << 20
 costs little beside an encoding, but minutes where the file lies on a slow disk."""
 TEXT_BYTES = 32
 """Bytes that a text is counted as."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stored:
-    """An array as a file has it: nothing is decoded.
-
-    `read` takes a slice or an index along each dimension.
-    """
-
-    dimensions: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    attributes: Mapping[str, Any]
-    read: Callable[[tuple[slice | int, ...]], npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +117,7 @@ def named_dimensions(layout: Layout, coords: Mapping[str, Coordinate]) -> list[s
 
 
 def surroundings(
-    wanted: Wanted, variables: Mapping[str, Stored], attributes: Mapping[str, Any]
+    wanted: Wanted, variables: Mapping[str, Variable], attributes: Mapping[str, Any]
 ) -> SourceMetadata:
     """All that belongs to a variable; warns (FhashWarning) once, of all that is left out.
 
@@ -150,7 +135,7 @@ def surroundings(
             continue  # another field can be encoded itself
         if SMALL * _size(other.shape, other.dtype) < limit:
             found.add(name, False)
-        elif len(other.shape) < MIN_DIMENSIONS:
+        elif len(other.shape) < FIELD_DIMENSIONS:
             left_out[name] = "large, and nothing refers to it"
     kept = {key: value for key, value in own.attributes.items() if key not in (*wanted.without, "")}
     of_file = {key: value for key, value in attributes.items() if key != COORDINATES}
@@ -196,7 +181,7 @@ class Arranged:
 
 def metadata_of(
     wanted: Wanted,
-    variables: Mapping[str, Stored],
+    variables: Mapping[str, Variable],
     attributes: Mapping[str, Any],
     arranged: Arranged,
 ) -> SourceMetadata:
@@ -229,8 +214,8 @@ def digest_of(path: Path) -> str | None:
 
 def _named(
     wanted: Wanted,
-    own: Stored,
-    variables: Mapping[str, Stored],
+    own: Variable,
+    variables: Mapping[str, Variable],
     attributes: Mapping[str, Any],
 ) -> dict[str, bool]:
     """Names of all that belongs to a variable, in order, and whether each is a coordinate."""
@@ -259,7 +244,7 @@ def _texts(attributes: Mapping[str, Any], key: str) -> list[str]:
     return text.split() if isinstance(text, str) else []
 
 
-def _references(stored: Stored) -> list[str]:
+def _references(stored: Variable) -> list[str]:
     """Names in the attributes of a variable that name others, its coordinates excepted."""
     found = references(stored.attributes, loosely=True)
     return [name for key, name in found if key != COORDINATES]
@@ -269,7 +254,7 @@ class _Collected:
     """The arrays beside the data that were read, and what was left out and why."""
 
     def __init__(
-        self, wanted: Wanted, variables: Mapping[str, Stored], left_out: dict[str, str]
+        self, wanted: Wanted, variables: Mapping[str, Variable], left_out: dict[str, str]
     ) -> None:
         self.variables: list[SourceVariable] = []
         self._wanted, self._stored, self._left_out = wanted, variables, left_out
@@ -307,7 +292,7 @@ class _Collected:
             )
         )
 
-    def _problem(self, name: str, stored: Stored) -> str:
+    def _problem(self, name: str, stored: Variable) -> str:
         """Why a variable is left out, as far as is known before it is read; "" if it is not."""
         kept = [
             (each, length)

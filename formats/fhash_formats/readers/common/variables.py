@@ -1,34 +1,32 @@
-"""Variables of a file: choice of one, fields of records, steps in groups."""
+"""Labelled variables, what every reader makes of a file: choice of one, fields, steps in groups."""
 
 from __future__ import annotations
 
 import difflib
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import Column, Packing, beside
-from fhash_formats.readers.common.file_series import Request
-from fhash_formats.readers.common.layout import (
-    Dimension,
-    Layout,
-    Read,
-    arrange,
-    shared_roles,
-    with_roles,
-)
-from fhash_formats.series import Coordinate, meant
-from fhash_formats.support.values import json_attributes
+from fhash_formats.readers.common.file_series import Stamp
+from fhash_formats.readers.common.layout import Read
+from fhash_formats.readers.common.stored_parts import StoredParts
+from fhash_formats.series import AXIS_NAMES, Coordinate, meant
+from fhash_formats.support.values import json_attributes, text_of
 
 MAX_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
+
+MADE_UP = "phony_dim_"
+"""Beginning of the names that h5netcdf makes up for dimensions without one."""
+MAX_LETTERS = 64
+"""Letters of a date, or of a label."""
 
 KINDS = {
     "b": "boolean",
@@ -41,8 +39,12 @@ KINDS = {
 }
 
 
-MIN_DIMENSIONS = 3
+MIN_DIMENSIONS = 2
 """Dimensions of an array that may be a series; those beyond 4 are selected (layout.py)."""
+
+
+FIELD_DIMENSIONS = 3
+"""Dimensions from which on an array is a field of its own, and not something beside one."""
 
 
 class SeveralVariablesError(InputError):
@@ -60,18 +62,48 @@ def kind_of(dtype: np.dtype[Any]) -> str:
     return KINDS[dtype.kind] if dtype.kind in KINDS else dtype.newbyteorder("=").name
 
 
+def _unread(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+    raise AssertionError("nobody said how the values are read")
+
+
 @dataclass(frozen=True, kw_only=True)
+class Behind:
+    """What is behind a variable: the parts of it that somebody wrote, and the files that hold them.
+
+    Attributes:
+        parts: None where all are stored.
+        files: beside the file that was opened.
+        stamp: of what says the shape, where it is not the file that was opened.
+        folder: all files that hold values.
+    """
+
+    parts: StoredParts | None = None
+    files: Sequence[Path] = ()
+    stamp: Stamp | None = None
+    folder: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Variable:
-    """One array of a file.
+    """One lazy labelled array of a source.
 
     Attributes:
         name: full name, "group/density".
-        shape: lengths in the file's order.
-        dtype: type of the values.
+        shape: lengths in the source's order.
+        dtype: type of the stored values.
+        dimensions: name of each, None for one without; fewer than there are where none is named.
+        attributes: as they are stored.
+        read: gives stored values.
+        chunks: lengths of a stored chunk, or of each chunk along a dimension; None without chunks.
         auxiliary: it only describes others (coordinates, bounds).
         error: why a library cannot open it, "" if it can.
-        handle: whatever the reader needs to find it again.
-        units: of the values, "" where unknown.
+        note: why nobody means it who does not name it, "" if somebody may.
+        values: type of what `read` gives, where it is unpacked already; None for stored values.
+        scales: full names of the variables that the source ties to dimensions, by name of these.
+        behind: looks at what was stored; None where all was.
+        require: raises what is missing where the values cannot be read here.
+        computed: whether its values follow from a header, so that they are not kept beside others.
+        handle: whatever else the reader needs.
         field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
             (`join`).
@@ -80,12 +112,50 @@ class Variable:
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
+    dimensions: tuple[str | None, ...] = ()
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    read: Read = _unread
+    chunks: Sequence[int | Sequence[int]] | None = None
     auxiliary: bool = False
     error: str = ""
+    note: str = ""
+    values: np.dtype[Any] | None = None
+    scales: Mapping[str, str] = field(default_factory=dict)
+    behind: Callable[[], Behind] | None = None
+    require: Callable[[], None] | None = None
+    computed: bool = False
     handle: Any = None
-    units: str = ""
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()
+
+    @property
+    def units(self) -> str:
+        """Units of the values, "" where unknown."""
+        units = self.attributes.get("units", "")
+        return text_of(units) if isinstance(units, str | bytes) else ""
+
+    def dimension(self, place: int) -> str | None:
+        """Name of a dimension, None for one without, or with one that a library made up."""
+        name = self.dimensions[place] if place < len(self.dimensions) else None
+        return None if name is None or name.startswith(MADE_UP) else name
+
+    @property
+    def is_letters(self) -> bool:
+        """Whether it holds texts as an array of letters, the last dimensions of which are one."""
+        count = prod(self.shape[1:])
+        return self.dtype == "S1" and len(self.shape) > 1 and 0 < count <= MAX_LETTERS
+
+    def texts(self) -> npt.NDArray[Any]:
+        """All texts, of letters too, (n,)."""
+        stored = self.whole()
+        if not self.is_letters:
+            return stored
+        rows = stored.reshape(len(stored), -1).tolist()
+        return np.array([b"".join(row) for row in rows])
+
+    def whole(self) -> npt.NDArray[Any]:
+        """All stored values."""
+        return np.asarray(self.read((slice(None),) * len(self.shape)))
 
     def __str__(self) -> str:
         return f"{self.name} {self.shape}"
@@ -110,7 +180,7 @@ class Variable:
                 " integers and floats up to 64 bits can be read"
             )
         if len(self.shape) < MIN_DIMENSIONS:
-            return f"{len(self.shape)} dimensions {self.shape}; 3 or 4 can be read"
+            return f"{len(self.shape)} dimensions {self.shape}; 2 to 4 can be read"
         if 0 in self.shape:
             return f"an axis of length 0, shape {self.shape}; there is nothing to read"
         return ""
@@ -137,10 +207,11 @@ def choose(
     to choose from, or none.
     """
     suitable = [variable for variable in variables if not variable.problem(booleans)]
-    candidates = [variable for variable in suitable if not variable.auxiliary]
-    fitting = [variable for variable in candidates if len(variable.shape) - selected in (3, 4)]
+    candidates = [each for each in suitable if not each.auxiliary and not each.note]
     if var is None:
-        candidates = fitting or candidates
+        fields = [each for each in candidates if len(each.shape) - selected > 2]
+        fitting = [each for each in fields if len(each.shape) - selected <= 4]
+        candidates = fitting or fields or candidates
     if var is not None:
         variable = named(source, variables, candidates or suitable, var)
         problem = variable.problem(booleans)
@@ -160,14 +231,17 @@ def choose(
     # the parts of a complex array are told of by the array itself
     found = [variable for variable in variables if not (variable.field and variable.auxiliary)]
     problems = "; ".join(
-        f"{variable.name}: {variable.problem(booleans) or 'a coordinate or its bounds'}"
+        f"{variable.name}: {variable.problem(booleans) or variable.note or A_COORDINATE}"
         for variable in found[:MAX_LISTED]
     )
     rest = f"; and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
     raise InputError(
-        f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found"
+        f"{source} holds no variable of 2 to 4 dimensions with integer or float values; found"
         f" {problems}{rest}"
     )
+
+
+A_COORDINATE = "a coordinate or its bounds"
 
 
 def parent(name: str) -> str:
@@ -261,6 +335,8 @@ def expand(variables: Sequence[Variable]) -> list[Variable]:
                 name=".".join((variable.name, *path)),
                 shape=(*variable.shape, *shape),
                 dtype=dtype,
+                read=_field_read(variable, path),
+                chunks=variable.chunks and (*variable.chunks, *shape),
                 field=path,
                 auxiliary=variable.auxiliary or variable.dtype.kind == "c",
             )
@@ -269,19 +345,18 @@ def expand(variables: Sequence[Variable]) -> list[Variable]:
     return expanded
 
 
-def field_reading(read: Read, variable: Variable, stored: int) -> Read:
-    """`read` of an array of `stored` dimensions as that of a variable's field of it."""
-    if not variable.field:
-        return read
+def _field_read(whole: Variable, path: tuple[str, ...]) -> Read:
+    """The read of a field of an array."""
+    stored = len(whole.shape)
 
-    def field(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        values: Any = read(ranges[:stored])
-        for name in variable.field:
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        values: Any = whole.read(places[:stored])
+        for name in path:
             values = getattr(values, name) if values.dtype.kind == "c" else values[name]
         # a copy, so that the other fields are not held in memory
-        return np.array(values[(..., *ranges[stored:])])
+        return np.array(values[(..., *places[stored:])])
 
-    return field
+    return read
 
 
 STEP_NAMES = """step steps timestep timesteps time_step ts time times t it iter iteration iterations
@@ -364,6 +439,8 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
                 first,
                 name=template,
                 shape=shape,
+                dimensions=("step", *(first.dimension(n) for n in range(len(first.shape)))),
+                chunks=first.chunks and (1, *first.chunks),
                 error=next((why for key, why in broken if template.startswith(key)), ""),
                 members=tuple(member for _, member in members),
             )
@@ -448,118 +525,157 @@ def times(
     )
 
 
-class FileOfArrays(ABC):
-    """The variables of an open file, what their dimensions are, and how they are read.
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """An open source: its variables, and what belongs to all of them.
 
-    A format says how one of its arrays is described and read. What holds for arrays with one group
-    a step is said here.
+    Attributes:
+        name: for messages.
+        variables: in the source's order.
+        path: of the file; None for data in memory.
+        groups: attributes of each group by path, "" is the source itself.
+        close: lets go of all that is open.
+        stamp: of the file, or of what says the shapes.
+        folder: that holds all of the source; None for a file.
+        files: further files that hold values.
+        naming: whether dimensions have names by which positions and all else are found, as in
+            NetCDF. Elsewhere names of coordinates count, and nothing is kept but what is beside.
+        spread: whether all groups belong together, as in an HDF5 file of any program.
+        aliases: full names by others that a user may call variables.
+        only: the variable that the path means; "" for any.
+        coordinates: names of coordinates that no attribute tells.
+        computed: whether values were computed, so that what packs them in a file tells nothing.
+        default_fill: gives the number that the format's library puts where nobody wrote, as stored.
     """
 
-    def __init__(self, source: str, request: Request, arrays: Sequence[Variable]) -> None:
-        """arrays: of the file. What the abstract methods need is there already."""
-        self.source, self.request = source, request
-        self.variables = join(arrays, self._attributes)
-
-    @abstractmethod
-    def packing(self, variable: Variable) -> Packing | None:
-        """The packing of the values, None where the user wants them as stored."""
-
-    @abstractmethod
-    def _stated(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of an array, with what the file says about each."""
-
-    @abstractmethod
-    def _reading(self, variable: Variable) -> Read:
-        """The function that reads the values of an array."""
-
-    @abstractmethod
-    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
-        """Coordinates of the axes of an array."""
-
-    @abstractmethod
-    def _attributes(self, path: str) -> Mapping[str, Any]:
-        """Attributes of a group or an array by its path."""
-
-    @abstractmethod
-    def _scalar(self, path: str) -> tuple[float, str] | None:
-        """Value and unit of a number by its path, None if there is no number."""
-
-    @abstractmethod
-    def _columns(self, group: str) -> Mapping[str, Column]:
-        """Candidates for coordinates in a group, by lower-case name."""
-
-    def choose(self, var: str | None) -> Variable:
-        """The variable that is wanted; see `choose`."""
-        request = self.request
-        return choose(
-            self.source,
-            self.variables,
-            var,
-            booleans=request.booleans,
-            selected=len(request.select),
-        )
-
-    def arrange(self, variable: Variable) -> Layout:
-        """The reading of a variable; see `layout.arrange`."""
-        return arrange(self.source, variable.name, self.dimensions(variable), self.request)
-
-    def dimensions(self, variable: Variable) -> list[Dimension]:
-        """The dimensions of a variable, with what the file says about each."""
-        return with_roles(self._dimensions(variable), self._roles)
-
-    @cached_property
-    def _roles(self) -> dict[str, str]:
-        return shared_roles(map(self._dimensions, series_like(self.variables)))
-
-    def _dimensions(self, variable: Variable) -> list[Dimension]:
-        if variable.members:
-            steps = Dimension(name="step", length=len(variable.members), role="t")
-            return [steps, *self._stated(variable.members[0])]
-        return self._stated(variable)
-
-    def reading(self, variable: Variable) -> Read:
-        """The function that reads the values of a variable."""
-        if not variable.members:
-            return self._reading(variable)
-        types = {
-            member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
-            for member, made in ((member, self.packing(member)) for member in variable.members)
-        }
-        first = variable.members[0].name
-        for name, dtype in types.items():
-            if dtype != types[first]:
-                raise InputError(
-                    f"{self.source}: {name} has values of type {dtype}, {first} of type"
-                    f" {types[first]}; the steps of one series must be alike, --raw-values reads"
-                    " the numbers as stored"
-                )
-        return stacked([self._reading(member) for member in variable.members])
-
-    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
-        """Coordinates of the axes of a variable.
-
-        Raises InputError if a step has positions of its own that differ from those of the first.
-        """
-        coords = self._positions(variable, layout)
-        if not variable.members or "t" not in layout.axes or 0 in layout.picked:
-            return coords
-        coords["t"] = times(variable.members, self._attributes, self._scalar)
-        for member in variable.members[1:]:
-            place = self._columns(parent(member.name))
-            own = beside(self.source, layout.axes, layout.shape, [place], certain=True, tied="t")
-            for axis, coordinate in own.items():
-                if not np.array_equal(coordinate.values, coords[axis].values):
-                    raise InputError(
-                        f"{self.source}: {member.name} has other coordinates along {axis} than"
-                        f" {variable.members[0].name}; the steps of one series must be alike"
-                    )
-        return coords
+    name: str
+    variables: Sequence[Variable]
+    path: Path | None = None
+    groups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    close: Callable[[], None] = lambda: None
+    stamp: Stamp | None = None
+    folder: Path | None = None
+    files: Sequence[Path] = ()
+    naming: bool = False
+    spread: bool = False
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    only: str = ""
+    coordinates: Sequence[str] = ()
+    computed: bool = False
+    default_fill: Callable[[np.dtype[Any]], Any] = lambda dtype: None
 
 
 def stacked(reads: Sequence[Read]) -> Read:
     """A read of several arrays as one, with their number as the first dimension."""
 
-    def read(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        return np.stack([one(ranges[1:]) for one in reads[ranges[0]]])
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        first = places[0]
+        assert isinstance(first, slice)
+        return np.stack([one(places[1:]) for one in reads[first]])
 
     return read
+
+
+def components(
+    whole: Variable, place: int, given: Sequence[str | None] = (), *, interleaved: bool = True
+) -> list[Variable]:
+    """One variable for each index along a dimension of components, such as `velocity.x`.
+
+    A single one has the name of the array.
+
+    given: names of the components, which count where all are there and differ; else x, y, z, or
+        numbers. interleaved: whether the components of a vertex lie together in the file, so that
+        all are read for one.
+    """
+    count = whole.shape[place]
+
+    def one(number: int, name: str) -> Variable:
+        def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+            part = slice(0, count) if interleaved else slice(number, number + 1)
+            values = whole.read((*places[:place], part, *places[place:]))
+            taken: npt.NDArray[Any] = values.take(number if interleaved else 0, axis=place)
+            return taken
+
+        return replace(
+            whole,
+            name=whole.name + name,
+            shape=_without(whole.shape, place),
+            dimensions=_without(whole.dimensions, place),
+            chunks=None if whole.chunks is None else _without(whole.chunks, place),
+            read=read,
+        )
+
+    names = [""] if count == 1 else [f".{name}" for name in _component_names(count, given)]
+    return [one(number, name) for number, name in enumerate(names)]
+
+
+def _without(items: Sequence[Any], place: int) -> tuple[Any, ...]:
+    return (*items[:place], *items[place + 1 :])
+
+
+def _component_names(count: int, given: Sequence[str | None]) -> list[str]:
+    names = [name for name in given if name]
+    if len(names) == count and len(set(names)) == count:
+        return names
+    return list(LETTERS) if count == len(LETTERS) else [str(number) for number in range(count)]
+
+
+LETTERS = ("x", "y", "z")
+"""Names of the components of a vector with three of them."""
+
+
+def component_by_number(var: str | None, variables: Sequence[Variable]) -> str | None:
+    """The name of a component that was given by its number: `velocity.x` for `velocity.0`.
+
+    It is the given name where that is a variable, or no number of a component.
+    """
+    if var is None or any(var in (each.name, plain_name(each.name)) for each in variables):
+        return var
+    stem, _, number = var.rpartition(".")
+    parts = [
+        each
+        for each in variables
+        if stem and stem in (each.name.rpartition(".")[0], plain_name(each.name).rpartition(".")[0])
+    ]
+    if number.isascii() and number.isdigit() and int(number) < len(parts):
+        return parts[int(number)].name
+    return var
+
+
+def positions(
+    name: str, values: npt.ArrayLike, attributes: Mapping[str, Any] | None = None
+) -> Variable:
+    """A coordinate that a reader computes, (n,), along the dimension of its name."""
+    made = np.asarray(values)
+    return Variable(
+        name=name,
+        shape=made.shape,
+        dtype=made.dtype,
+        dimensions=(plain_name(name),) if made.ndim else (),
+        attributes=attributes or {},
+        read=lambda places: made[places],
+        auxiliary=True,
+        computed=True,
+    )
+
+
+def file_source(path: Path, variables: Sequence[Variable], **more: Any) -> Source:
+    """The source of a file; `more` is what `Source` takes beside."""
+    return Source(name=str(path), path=path, variables=variables, **more)
+
+
+HEADER = "header"
+"""Group of the positions that a header says."""
+
+
+def placed(
+    arrays: Sequence[Variable], coords: Mapping[str, Variable], group: str = HEADER
+) -> list[Variable]:
+    """Variables of a format whose header places the axes, and these positions.
+
+    arrays: their dimensions have the names of AXIS_NAMES. coords: positions by axis, one of an axis
+        that they lack. group: of the positions.
+    """
+    found = [replace(each, name=f"{group}/{each.name}") for each in coords.values()]
+    tied = {AXIS_NAMES[axis]: each.name for axis, each in zip(coords, found, strict=True)}
+    return [*found, *(replace(each, scales={**each.scales, **tied}) for each in arrays)]

@@ -506,17 +506,17 @@ def test_a_chunk_of_many_steps_is_kept_as_far_as_it_fits(
         assert isinstance(series, FileSeries)
         for step in (1, 0, 3, 2):
             np.testing.assert_array_equal(series.read(step), values[step])
-            assert (series._slab is None) == (held is None)
+            assert (series._held_slab is None) == (held is None)
         series.read(1)
-        assert series._slab is None or series._slab[1].shape[0] == held
+        assert series._held_slab is None or series._held_slab[1].shape[0] == held
 
 
 def test_time_as_the_fastest_axis_reads_many_steps_at_once(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.ascontiguousarray(VALUES.transpose(1, 2, 3, 0)))
     with open_series(tmp_path / "a.npy", axes="z,y,x,t") as series:
         np.testing.assert_array_equal(series.read(2), VALUES[2])
-        assert series._slab is not None
-        assert series._slab[1].shape == VALUES.shape
+        assert series._held_slab is not None
+        assert series._held_slab[1].shape == VALUES.shape
 
 
 @pytest.mark.parametrize(

@@ -32,13 +32,14 @@ from fhash_formats.readers.common.stored_bytes import (
     PlainFile,
     StoredBytes,
     axis_steps,
-    component_by_number,
-    component_names,
-    component_variables,
     lattice,
     numbers_of_words,
 )
-from fhash_formats.readers.common.variables import Variable
+from fhash_formats.readers.common.variables import (
+    Variable,
+    component_by_number,
+    components,
+)
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import NotStored, Series, spans_text
 
@@ -149,9 +150,9 @@ FLOAT = np.dtype("f4")
 
 
 def test_positions_are_origin_and_multiples_of_the_spacing() -> None:
-    assert lattice("x", 0.1, 0.1, 4).values.tolist() == [0.1 + i * 0.1 for i in range(4)]
-    assert lattice("t", 1, -2, 3, first=0.5).values.tolist() == [0, -2, -4]
-    assert (lattice("t", 0, 1, 1).name, lattice("y", 5, 0, 1).values.tolist()) == ("time", [5])
+    assert lattice("x", 0.1, 0.1, 4).whole().tolist() == [0.1 + i * 0.1 for i in range(4)]
+    assert lattice("t", 1, -2, 3, first=0.5).whole().tolist() == [0, -2, -4]
+    assert (lattice("t", 0, 1, 1).name, lattice("y", 5, 0, 1).whole().tolist()) == ("time", [5])
 
 
 @pytest.mark.parametrize(
@@ -175,29 +176,44 @@ def test_directions_along_the_axes() -> None:
         axis_steps(nearly)
 
 
-def test_names_of_components() -> None:
-    assert component_names(3) == ["x", "y", "z"]
-    assert component_names(2) == ["0", "1"]
-    assert component_names(2, ["u", "v"]) == ["u", "v"]
-    assert component_names(2, ["u", None]) == ["0", "1"]
-    assert component_names(2, ["u", "u"]) == ["0", "1"]
+def test_components_are_variables_with_names() -> None:
+    values = np.arange(72.0).reshape(2, 3, 4, 3)
+
+    def whole(name: str, count: int) -> Variable:
+        return Variable(
+            name=name,
+            shape=(2, 3, 4, count),
+            dtype=values.dtype,
+            dimensions=("z", "y", "x", None),
+            read=lambda places: values[..., :count][places],
+        )
+
+    for count, given, names in (
+        (1, [], ["v"]),
+        (3, [], ["v.x", "v.y", "v.z"]),
+        (2, [], ["v.0", "v.1"]),
+        (2, ["u", "w"], ["v.u", "v.w"]),
+        (2, ["u", None], ["v.0", "v.1"]),
+        (2, ["u", "u"], ["v.0", "v.1"]),
+    ):
+        for interleaved in (True, False):
+            found = components(whole("v", count), 3, given, interleaved=interleaved)
+            assert [each.name for each in found] == names
+            for number, each in enumerate(found):
+                assert (each.shape, each.dimensions) == ((2, 3, 4), ("z", "y", "x"))
+                np.testing.assert_array_equal(each.whole(), values[..., number])
 
 
 def test_components_are_found_by_number() -> None:
     arrays = [
-        Variable(name=name, shape=(2, 3, 4), dtype=FLOAT, handle=handle)
-        for name, handle in (("u", "a"), ("v", "b"), ("CellData/w", "c"))
+        Variable(name=name, shape=(2, 3, count), dtype=FLOAT)
+        for name, count in (("u", 1), ("v", 3), ("CellData/w", 2))
     ]
-    found = [
-        *component_variables(arrays[0], 1),
-        *component_variables(arrays[1], 3),
-        *component_variables(arrays[2], 2),
-    ]
+    found = [each for array in arrays for each in components(array, 2)]
     assert [each.name for each in found[:4]] == ["u", "v.x", "v.y", "v.z"]
-    assert found[2].handle == ("b", 1)
     assert component_by_number("v.1", found) == "v.y"
     assert component_by_number("v.y", found) == "v.y"
-    assert component_by_number("w.1", found) == "w.1"
+    assert component_by_number("w.1", found) == "CellData/w.1"
     assert component_by_number("v.3", found) == "v.3"
     assert component_by_number("u.0", found) == "u.0"
     assert component_by_number(None, found) is None

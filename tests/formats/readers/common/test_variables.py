@@ -19,7 +19,6 @@ from fhash_formats.readers.common.file_series import RawLayout, Request
 from fhash_formats.readers.common.layout import Dimension, Layout
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.surroundings import (
-    Stored,
     Wanted,
     digest_of,
     kept_dimensions,
@@ -28,7 +27,6 @@ from fhash_formats.readers.common.surroundings import (
 from fhash_formats.readers.common.variables import (
     Variable,
     expand,
-    field_reading,
     group_time,
     join,
     times,
@@ -55,13 +53,13 @@ def test_every_leaf_reads_as_numpy_reads_it() -> None:
         "s.c.real": state["c"].real,
         "s.c.imag": state["c"].imag,
     }
-    variables = expand([Variable(name="s", shape=state.shape, dtype=NESTED)])
+    whole = Variable(name="s", shape=state.shape, dtype=NESTED, read=lambda ranges: state[ranges])
+    variables = expand([whole])
     assert [variable.name for variable in variables] == list(expected)
     for variable in variables:
-        read = field_reading(lambda ranges: state[ranges], variable, state.ndim)
         assert variable.shape == expected[variable.name].shape
         ranges = (slice(1, 2), slice(0, 5), slice(2, 4), *[slice(1, 2)] * (len(variable.shape) - 3))
-        got = read(ranges)
+        got = variable.read(ranges)
         np.testing.assert_array_equal(got, expected[variable.name][ranges])
         assert got.base is None
 
@@ -80,7 +78,7 @@ def listed(*variables: Variable, request: Request | None = None) -> list[Listed]
 
 def test_raw_values_have_the_stored_type_and_no_unit_of_others() -> None:
     attributes = {"scale_factor": np.float32(0.1), "_FillValue": -9}
-    one = variable("a", 4, 12, 13, 14, dtype="i2", units="K")
+    one = variable("a", 4, 12, 13, 14, dtype="i2", attributes={"units": "K"})
     for raw, scaled, dtype, units in (
         (True, True, "int16", ""),
         (True, False, "int16", "K"),
@@ -107,7 +105,7 @@ def test_auxiliary_variables_are_left_out_and_others_are_named() -> None:
         ("b", (("--var", "b"),)),
         ("line", ()),
     ]
-    assert found[2].problem == "1 dimensions (12,); 3 or 4 can be read"
+    assert found[2].problem == "1 dimensions (12,); 2 to 4 can be read"
     # a variable that cannot be read does not make the name of the other necessary
     assert listed(variable("a", 4, 12, 13, 14), variable("line", 12))[0].options == ((),)
 
@@ -307,7 +305,7 @@ def test_several_datasets_need_a_choice(tmp_path: Path) -> None:
 )
 def test_unsuitable_datasets_are_described(tmp_path: Path, array: Any, words: str) -> None:
     path = write_hdf5(tmp_path / "a.h5", odd=array)
-    with pytest.raises(InputError, match=rf"no variable of 3 or 4 dimensions.*odd: .*({words})"):
+    with pytest.raises(InputError, match=rf"no variable of 2 to 4 dimensions.*odd: .*({words})"):
         open_series(path)
     with pytest.raises(InputError, match=rf"variable odd has .*({words})"):
         open_series(path, var="odd")
@@ -321,9 +319,10 @@ def test_a_file_without_datasets(tmp_path: Path) -> None:
 DIMENSIONS = {"time": "t", "lat": "y", "lon": "x"}
 
 
-def stored(dimensions: tuple[str, ...], values: Any, **attributes: Any) -> Stored:
+def stored(dimensions: tuple[str, ...], values: Any, **attributes: Any) -> Variable:
     array = np.asarray(values)
-    return Stored(
+    return Variable(
+        name="",
         dimensions=dimensions,
         shape=array.shape,
         dtype=array.dtype,
@@ -332,13 +331,13 @@ def stored(dimensions: tuple[str, ...], values: Any, **attributes: Any) -> Store
     )
 
 
-def found(variables: dict[str, Stored], picked: Any = None, **more: Any) -> SourceMetadata:
+def found(variables: dict[str, Variable], picked: Any = None, **more: Any) -> SourceMetadata:
     dimensions = {key: axis for key, axis in DIMENSIONS.items() if key not in (picked or {})}
     wanted = Wanted(source="a.nc", name="u", dimensions=dimensions, picked=picked or {}, **more)
     return surroundings(wanted, variables, {"coordinates": "month other", "title": "a"})
 
 
-def some(**attributes: Any) -> dict[str, Stored]:
+def some(**attributes: Any) -> dict[str, Variable]:
     """A variable of 2 steps of 3 x 4 vertices, with everything beside it."""
     return {
         "u": stored(("time", "lat", "lon"), np.zeros((2, 3, 4)), **attributes),
@@ -446,7 +445,14 @@ def test_a_coordinate_that_cannot_be_read_does_not_bar_the_values() -> None:
     def fail(places: Any) -> Any:
         raise OSError("no such filter")
 
-    lat2d = Stored(dimensions=("lat",), shape=(3,), dtype=np.dtype("f4"), attributes={}, read=fail)
+    lat2d = Variable(
+        name="lat2d",
+        dimensions=("lat",),
+        shape=(3,),
+        dtype=np.dtype("f4"),
+        attributes={},
+        read=fail,
+    )
     with pytest.warns(FhashWarning, match="lat2d .cannot be read: .*no such filter"):
         found({**some(coordinates="lat2d"), "lat2d": lat2d})
 

@@ -1,0 +1,658 @@
+"""One variable of an open source as a series: its axes, steps, packing, positions, surroundings.
+
+Every format comes here as labelled variables (`Source`). What names, coordinates and attributes
+mean is decided once, by the CF conventions (1.11) where a source follows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, cached_property, partial
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf import (
+    SCALING,
+    Column,
+    Packing,
+    beside,
+    coordinate,
+    counts_steps,
+    only_counts,
+    packing,
+    real_time,
+    role_of_coordinate,
+    role_of_name,
+    texts_along,
+    usable,
+    written_times,
+)
+from fhash_formats.readers.common.file_series import (
+    FileSeries,
+    FolderStamp,
+    Request,
+    StoredFiles,
+    StoredValues,
+    refusing,
+)
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    Layout,
+    arrange,
+    shared_roles,
+    with_roles,
+)
+from fhash_formats.readers.common.listing import Listed, listing
+from fhash_formats.readers.common.stored_parts import not_stored, warn_of_column
+from fhash_formats.readers.common.surroundings import (
+    MAX_ARRAYS,
+    Arranged,
+    Wanted,
+    metadata_of,
+    named_dimensions,
+    warn_left_out,
+)
+from fhash_formats.readers.common.variables import (
+    FIELD_DIMENSIONS,
+    Behind,
+    Read,
+    Source,
+    Variable,
+    choose,
+    component_by_number,
+    expand,
+    join,
+    parent,
+    plain_name,
+    series_like,
+    stacked,
+    times,
+)
+from fhash_formats.series import (
+    AXES,
+    AXIS_NAMES,
+    COORDINATES,
+    Coordinate,
+    SourceMetadata,
+    references,
+    shown_name,
+)
+from fhash_formats.support.values import STORED, json_attributes
+
+
+class Selection:
+    """The variables of an open source, what their dimensions are, and how they are read."""
+
+    def __init__(self, opened: Source, request: Request) -> None:
+        request = replace(request, var=request.var or opened.only or None)
+        self.opened, self.request, self.source = opened, request, opened.name
+        self._groups: dict[str, dict[str, Variable]] = {}
+        for each in opened.variables:
+            self._groups.setdefault(parent(each.name), {})[plain_name(each.name)] = each
+        self._by_name = {each.name: each for each in opened.variables}
+        self._lists: dict[tuple[str, str, str | None], list[Variable]] = {}
+        self._columns: dict[str, Column] = {}
+        self._auxiliary = self._describing()
+        self._auxiliary |= {each.name for each in opened.variables if each.auxiliary}
+        marked = [
+            replace(each, auxiliary=each.name in self._auxiliary) for each in opened.variables
+        ]
+        found = join(expand(marked), self.attributes)
+        fields = any(len(each.shape) > 2 for each in series_like(found))
+        self.variables = [
+            replace(each, note=self._no_map(each, fields)) if len(each.shape) == 2 else each
+            for each in found
+        ]
+
+    def _describing(self) -> set[str]:
+        """Full names of the variables that only describe others.
+
+        They are what a dimension is called, and what attributes of CF name, if all that one
+        attribute names is there.
+        """
+        found = set()
+        for group, arrays in self._groups.items():
+            large = [each for each in arrays.values() if each.shape and not each.error]
+            names = {
+                name
+                for each in large
+                for name in each.dimensions
+                if name in arrays and len(arrays[name].shape) < FIELD_DIMENSIONS
+            }
+            of_group = {COORDINATES: self.opened.groups.get(group, {}).get(COORDINATES)}
+            for told in (of_group, *(each.attributes for each in large)):
+                for key, pairs in groupby(references(told), itemgetter(0)):
+                    named = {name for _, name in pairs}
+                    whole = named <= arrays.keys() and key != "ancillary_variables"
+                    if key == COORDINATES or whole:
+                        names |= named
+            found |= {arrays[name].name for name in names if name in arrays}
+        return found
+
+    def _no_map(self, variable: Variable, fields: bool) -> str:
+        """Why an array of two dimensions is no map that anybody meant, "" if it is one.
+
+        fields: whether there are arrays of three and more; other arrays are then their tables.
+        """
+        names = [variable.dimension(place) for place in range(2)]
+        roles = [None if name is None else self._role(name, variable) for name in names]
+        if set(roles) == {"y", "x"}:
+            return ""
+        if fields or not {*roles} <= {"y", "x", None}:
+            return (
+                f"2 dimensions {variable.shape} that are no y and x; --var {variable.name} reads it"
+            )
+        return ""
+
+    def attributes(self, path: str) -> Mapping[str, Any]:
+        """Attributes of a group or a variable by its path."""
+        known = self.opened.groups.get(path)
+        if known is None:
+            known = self._by_name[path].attributes if path in self._by_name else {}
+        return known
+
+    def choose(self, var: str | None) -> Variable:
+        """The variable that is wanted; see `variables.choose`."""
+        request = self.request
+        return choose(
+            self.source,
+            self.variables,
+            component_by_number(self.opened.aliases.get(str(var), var), self.variables),
+            booleans=request.booleans,
+            selected=len(request.select),
+        )
+
+    def packing(self, variable: Variable) -> Packing | None:
+        """The packing of the values, None where the user wants them as stored."""
+        return None if self.request.raw_values else self.declared(variable)
+
+    def declared(self, variable: Variable) -> Packing | None:
+        """The packing that the attributes say; None for types that cannot be packed."""
+        if variable.field or variable.dtype.kind not in "iuf":
+            return None
+        return packing(self.source, variable.dtype, variable.attributes)
+
+    def _unpacking(self, variable: Variable) -> Read:
+        """The function that reads values in physical units."""
+        packed = self.packing(variable)
+        if packed is None or variable.values is not None:
+            return variable.read
+        return lambda places: packed.unpack(np.asarray(variable.read(places)))
+
+    def reading(self, variable: Variable) -> Read:
+        """The function that reads the values of a variable, of all its steps."""
+        if not variable.members:
+            return self._unpacking(variable)
+        types = {
+            member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
+            for member, made in ((member, self.packing(member)) for member in variable.members)
+        }
+        first = variable.members[0].name
+        for name, dtype in types.items():
+            if dtype != types[first]:
+                raise InputError(
+                    f"{self.source}: {name} has values of type {dtype}, {first} of type"
+                    f" {types[first]}; the steps of one series must be alike, --raw-values reads"
+                    " the numbers as stored"
+                )
+        return stacked([self._unpacking(member) for member in variable.members])
+
+    def arrange(self, variable: Variable) -> Layout:
+        """The reading of a variable; see `layout.arrange`."""
+        return arrange(self.source, variable.name, self.dimensions(variable), self.request)
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable, with what the source says about each.
+
+        Raises InputError for those of a mesh, unless the user says what they are.
+        """
+        found = with_roles(self._dimensions(variable), self._roles)
+        if self.request.axes is None:
+            self._require_grid(variable, found)
+        return found
+
+    def _require_grid(self, variable: Variable, dimensions: Sequence[Dimension]) -> None:
+        """Raise InputError for a variable on the cells, edges or nodes of a mesh.
+
+        Conventions: UGRID 1.0 (mesh, location), CDI_grid_type of CDO and ICON, dimensions of MPAS;
+        else two positions of horizontal axes along one dimension.
+        """
+        told = {key.lower(): str(each) for key, each in variable.attributes.items()}
+        ugrid = "mesh" in told and "location" in told
+        if ugrid or told.get("cdi_grid_type", "") == "unstructured":
+            raise InputError(_mesh(variable, dimensions[-1]))
+        for each in dimensions:
+            if each.name is None or each.role is not None:
+                continue
+            along = self._along(each.name, variable)
+            roles = {role_of_coordinate(plain_name(n.name), n.attributes) for n in along}
+            if each.name in MESH_DIMENSIONS or {"y", "x"} <= roles:
+                raise InputError(_mesh(variable, each))
+
+    @cached_property
+    def _roles(self) -> dict[str, str]:
+        return shared_roles(map(self._dimensions, series_like(self.variables)))
+
+    def _dimensions(self, variable: Variable) -> list[Dimension]:
+        if variable.members:
+            steps = Dimension(name="step", length=len(variable.members), role="t")
+            return [steps, *self._dimensions(variable.members[0])]
+        return [
+            Dimension(
+                name=name,
+                length=length,
+                role=None if name is None else self._role(name, variable),
+                column=None if name is None else self._labels(name, length, variable),
+            )
+            for name, length in (
+                (variable.dimension(place), length) for place, length in enumerate(variable.shape)
+            )
+        ]
+
+    def _scope(self, variable: Variable) -> list[str]:
+        """The group of a variable and those around it, the nearest first."""
+        parts = parent((variable.members or (variable,))[0].name).split("/")
+        around = ("/".join(parts[:count]) for count in range(len(parts), -1, -1))
+        return list(dict.fromkeys(around))
+
+    def _near(self, variable: Variable) -> Iterator[tuple[str, Variable]]:
+        """Variables in the group of one and around it, by name, those of the nearest group first.
+
+        Names of one variable come but once.
+        """
+        seen = set()
+        for group in self._scope(variable):
+            for name, each in self._groups.get(group, {}).items():
+                if each.name not in seen:
+                    seen.add(each.name)
+                    yield name, each
+
+    def _along(self, dimension: str, variable: Variable) -> list[Variable]:
+        """Number variables along one dimension: its namesake, then coordinates, then the rest."""
+        owner = (variable.members or (variable,))[0]
+        key = (dimension, parent(owner.name), owner.scales.get(dimension))
+        if key not in self._lists:
+            ranked: tuple[list[Variable], ...] = ([], [], [])
+            tied = self._by_name.get(owner.scales.get(dimension, ""))
+            if tied is not None and usable(tied.dtype) and len(tied.shape) == 1:
+                ranked[0].append(tied)
+            for name, each in self._near(owner):
+                alone = name == dimension and each.dimensions in ((), (None,))
+                if not usable(each.dtype) or len(each.shape) != 1 or each is tied:
+                    continue
+                if each.dimensions == (dimension,) or alone:
+                    rank = 0 if name == dimension else 1 if each.name in self._auxiliary else 2
+                    ranked[rank].append(each)
+            self._lists[key] = [each for rank in ranked for each in rank]
+        return self._lists[key]
+
+    def _named(self, dimension: str, variable: Variable) -> Variable | None:
+        """The variable that a dimension is named after, or tied to; it may hold texts."""
+        owner = (variable.members or (variable,))[0]
+        if dimension in owner.scales:
+            return self._by_name.get(owner.scales[dimension])
+        near = self._near(owner)
+        return next((each for name, each in near if name == dimension), None)
+
+    def _role(self, dimension: str, variable: Variable) -> str | None:
+        for each in self._along(dimension, variable):
+            role = role_of_coordinate(plain_name(each.name), each.attributes)
+            if role is not None:
+                return role
+        return role_of_name(dimension)
+
+    def _labels(self, dimension: str, length: int, variable: Variable) -> Column | None:
+        """The column along a dimension: its namesake, also of texts, else numbers along it."""
+        named = self._named(dimension, variable)
+        if (
+            named is not None
+            and named.shape[:1] == (length,)
+            and named.dtype.kind in "iufMSUTO"
+            and (len(named.shape) == 1 or named.is_letters)
+        ):
+            return self._column(named)
+        return next(
+            (
+                self._column(one)
+                for one in self._along(dimension, variable)
+                if one.shape == (length,)
+            ),
+            None,
+        )
+
+    def _column(self, variable: Variable) -> Column:
+        """A variable of at most one dimension, or of letters, as positions or labels.
+
+        It is read but once.
+        """
+        if variable.name not in self._columns:
+            self._columns[variable.name] = self._made_column(variable)
+        return self._columns[variable.name]
+
+    def _made_column(self, variable: Variable) -> Column:
+        @cache
+        def read() -> npt.NDArray[Any]:
+            behind = Behind() if variable.behind is None else variable.behind()
+            parts = behind.parts
+            if parts is not None and parts.fill == parts.fill:
+                warn_of_column(variable.name, parts)
+            if variable.is_letters:
+                return variable.texts()
+            packed = self.declared(variable)
+            stored = variable.whole()
+            unpacked = packed is None or variable.values is not None
+            return stored if unpacked else packed.unpack(np.array(stored))
+
+        return Column(
+            name=variable.name,
+            length=variable.shape[0] if variable.shape else 1,
+            read=read,
+            attributes=variable.attributes,
+            numeric=usable(variable.dtype),
+        )
+
+    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes of a variable.
+
+        Raises InputError if a step has positions of its own that differ from those of the first.
+        """
+        coords = self._positions(variable, layout)
+        if not variable.members or "t" not in layout.axes or 0 in layout.picked:
+            return coords
+        coords["t"] = times(variable.members, self.attributes, self._scalar)
+        for member in variable.members[1:]:
+            place = self._candidates(parent(member.name), owned=True)
+            own = beside(self.source, layout.axes, layout.shape, [place], certain=True, tied="t")
+            for axis, one in own.items():
+                if axis in coords and not np.array_equal(one.values, coords[axis].values):
+                    raise InputError(
+                        f"{self.source}: {member.name} has other coordinates along {axis} than"
+                        f" {variable.members[0].name}; the steps of one series must be alike"
+                    )
+        return coords
+
+    def _scalar(self, path: str) -> tuple[float, str] | None:
+        """Value and unit of a number by its path, None if there is no number."""
+        each = self._by_name.get(path)
+        if each is None or set(each.shape) - {1} or each.dtype.kind not in "iuf":
+            return None
+        return float(each.whole().reshape(-1)[0]), each.units
+
+    def _candidates(self, group: str, *, owned: bool) -> dict[str, Column]:
+        """Variables of a group that may be positions of a dimension without a name.
+
+        They are scalars and along no named dimension; those along their own one if `owned`.
+        """
+        found = {}
+        for name, each in self._groups.get(group, {}).items():
+            free = all(one is None or (owned and one == name) for one in each.dimensions)
+            if len(each.shape) < 2 and free and usable(each.dtype) and not each.error:
+                found[name.lower()] = self._column(each)
+        return found
+
+    def _positions(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes: what is along a dimension by its name, else by conventions."""
+        coords = layout.coordinates(self.source, {})
+        named = dict(zip(layout.axes, layout.kept, strict=True))
+        for axis, dimension in named.items():
+            if dimension.name is not None:
+                coords |= self._along_axis(axis, dimension, variable)
+        counted = "t" in coords and not coords["t"].attributes.get("units")
+        if counted and counts_steps(coords["t"].values):
+            steps = coords.pop("t")  # a time beside the numbers of steps comes first
+            return {"t": steps, **self._by_convention(variable, layout, coords)}
+        return self._by_convention(variable, layout, coords)
+
+    def _by_convention(
+        self, variable: Variable, layout: Layout, coords: dict[str, Coordinate]
+    ) -> dict[str, Coordinate]:
+        """The coordinates, and those that the names of variables without dimensions tell."""
+        named = dict(zip(layout.axes, layout.kept, strict=True))
+        certain = self.request.axes is not None or all(each.role for each in layout.kept)
+        unnamed = [axis for axis, each in named.items() if each.name is None]
+        for owned, open_axes in (
+            (False, [axis for axis in AXES if axis not in unnamed]),
+            (True, unnamed),
+        ):
+            places = [self._candidates(group, owned=owned) for group in self._scope(variable)]
+            tied = [axis for axis in AXES if axis in coords or axis not in open_axes]
+            found = beside(
+                self.source, layout.axes, layout.shape, places, certain=certain, tied=tied
+            )
+            coords = found | coords
+        coords |= self._scalars(variable, layout, coords)
+        if "t" in layout.axes:
+            coords |= self._written(variable, named["t"], coords)
+        return coords
+
+    def _along_axis(
+        self, axis: str, dimension: Dimension, variable: Variable
+    ) -> dict[str, Coordinate]:
+        """The positions along a named dimension: its namesake's, or of one with the role."""
+        name = str(dimension.name)
+        role_differs = dimension.role is not None and dimension.role != axis
+        if not self.opened.naming and self.request.axes is not None and role_differs:
+            return {}  # positions of another axis than the user says that it is
+        along = [
+            self._column(each)
+            for each in self._along(name, variable)
+            if each.shape == (dimension.length,)
+        ]
+        tied = self._named(name, variable)
+        first = next((each for each in along if tied is not None and each.name == tied.name), None)
+        others = [each for each in along if each is not first]
+        roles = (
+            each
+            for each in others
+            if role_of_coordinate(plain_name(each.name), each.attributes) == axis
+        )
+        found = real_time(first, others) if axis == "t" else first
+        found = found or next(roles, None)
+        if found is None or (
+            axis == "t" and only_counts(found) and self._texts(variable, dimension)
+        ):
+            return {}
+        return {axis: coordinate(self.source, found.name, found.read(), found.attributes)}
+
+    def _texts(self, variable: Variable, dimension: Dimension) -> Coordinate | None:
+        """Times that are texts along a dimension; None without."""
+        near = [each for _, each in self._near(variable)]
+        texts = texts_along(dimension.name, dimension.length, near)
+        return written_times(dimension.name or AXIS_NAMES["t"], texts)
+
+    def _written(
+        self, variable: Variable, dimension: Dimension, coords: Mapping[str, Coordinate]
+    ) -> dict[str, Coordinate]:
+        """Times that are texts, where no numbers are times."""
+        plain = dimension.name is None and "t" in coords and not coords["t"].attributes
+        found = self._texts(variable, dimension) if "t" not in coords or plain else None
+        return {} if found is None else {"t": found}
+
+    def _scalars(
+        self, variable: Variable, layout: Layout, coords: Mapping[str, Coordinate]
+    ) -> dict[str, Coordinate]:
+        """Positions of axes that a variable lacks: scalar coordinates of its group."""
+        found: dict[str, Coordinate] = {}
+        owner = (variable.members or (variable,))[0]
+        for axis in (each for each in AXES if each not in (*layout.axes, *coords)):
+            tied = self._by_name.get(owner.scales.get(AXIS_NAMES[axis], ""))
+            if tied is not None and tied.shape == (1,):
+                found[axis] = coordinate(self.source, tied.name, tied.whole(), tied.attributes)
+        for name, each in self._groups.get(self._scope(variable)[0], {}).items():
+            if each.shape or not usable(each.dtype) or each.name not in self._auxiliary:
+                continue
+            role = role_of_coordinate(name, each.attributes)
+            if role in AXES and role not in (*layout.axes, *coords, *found):
+                column = self._column(each)
+                found[role] = coordinate(self.source, name, column.read(), each.attributes)
+        return found
+
+    def series(self) -> FileSeries:
+        """The series of the wanted variable, which closes the source with it."""
+        opened, request = self.opened, self.request
+        variable = self.choose(request.var)
+        members = variable.members or (variable,)
+        for member in members:
+            if member.require is not None:
+                member.require()
+        layout = self.arrange(variable)
+        declared, packed = self.declared(variable), self.packing(variable)
+        dtype = variable.values or (variable.dtype if packed is None else packed.dtype)
+        # counts have not the unit of the values
+        scaled = request.raw_values and SCALING & set(variable.attributes)
+        without = STORED | ({"units"} if scaled else frozenset())
+        behind = [Behind() if one.behind is None else one.behind() for one in members]
+        parts = [each.parts for each in behind]
+        folder = opened.folder if variable.members else behind[0].folder
+        coords = self.coordinates(variable, layout)
+        names = {
+            word
+            for axis, each in zip(layout.axes, layout.kept, strict=True)
+            for word in ((each.name,) if each.name else (axis, AXIS_NAMES[axis]))
+        }
+        if not opened.naming:
+            names |= {each.name for each in coords.values()}
+        fill = opened.default_fill(variable.dtype)
+        told = {"_FillValue", "missing_value"} & variable.attributes.keys()
+        default = None
+        if fill is not None and packed is not None and not told:
+            default = packed.unpack(np.array([fill], packed.stored))[0].item()
+        series = FileSeries(
+            files=StoredFiles(
+                source=self.source,
+                stamp=(None if variable.members else behind[0].stamp) or opened.stamp,
+                folder=None if folder is None else FolderStamp.of(folder),
+                close=opened.close,
+                beside=[*opened.files, *dict.fromkeys(n for each in behind for n in each.files)],
+            ),
+            name=plain_name(shown_name(variable.name, {name for name in names if name})),
+            values=StoredValues(
+                shape=layout.shape,
+                dtype=dtype,
+                axes=layout.axes,
+                fetch=layout.fetch(self.reading(variable)),
+                chunks=layout.chunks(variable.chunks),
+                packing=None if opened.computed else packed,
+                not_stored=not_stored(parts, layout, joined=bool(variable.members)),
+                default_fill=default,
+            ),
+            coords=coords,
+            attributes=json_attributes(variable.attributes, without=without) | layout.attributes(),
+        )
+        if not variable.members and not variable.field:
+            arranged = Arranged(layout=layout, request=request, packed=packed, coords=series.coords)
+            unfit = without if request.raw_values and declared is not None else ()
+            series.metadata = partial(self._metadata, variable, arranged, unfit)
+        return series
+
+    def _metadata(
+        self, variable: Variable, arranged: Arranged, without: Sequence[str] | frozenset[str]
+    ) -> SourceMetadata | None:
+        """All that belongs to a variable.
+
+        None where its dimensions have no names and nothing but positions is beside it. They then
+        have the names of the axes, and in what is beside it names of their own.
+        """
+        layout, coords, opened = arranged.layout, arranged.coords, self.opened
+        beside_it = self._beside(variable)
+        taken = {plain_name(each.name) for each in coords.values()}
+        axes = named_dimensions(layout, coords)
+        names = [variable.dimension(place) or name for place, name in enumerate(axes)]
+        named = opened.naming and all(each.name for each in layout.dimensions)
+        arrays, positions = {}, 0
+        for name, each in beside_it.items():
+            free = None in (each.dimension(n) for n in range(len(each.shape)))
+            is_position = name in taken and each.shape in ((), *((n,) for n in layout.shape))
+            positions += is_position
+            if len(each.shape) >= FIELD_DIMENSIONS and not named:
+                continue  # what has so many dimensions can be encoded itself
+            own = [
+                each.dimension(n) or (name if is_position else f"{name}_dim_{n}")
+                for n in range(len(each.shape))
+            ]
+            arrays[name] = replace(each, dimensions=tuple(own)) if free else each
+        if not named and len(arrays) == positions:
+            return None
+        if len(arrays) > MAX_ARRAYS and not named:
+            more = len(arrays) - MAX_ARRAYS
+            warn_left_out(
+                f"{self.source}: not everything beside {variable.name} is kept",
+                {f"{more} datasets": f"more than {MAX_ARRAYS}"},
+            )
+            arrays = dict(list(arrays.items())[:MAX_ARRAYS])
+        own_name = self._flat(variable, variable.name)
+        whole = replace(variable, name=own_name, dimensions=tuple(names))
+        wanted = Wanted(
+            source=self.source,
+            name=own_name,
+            coordinates=opened.coordinates,
+            used=[*taken],
+            without=without,
+            path=opened.path,
+        )
+        groups = opened.groups
+        of_file = groups.get(self._scope(variable)[0], {}) if opened.naming else groups.get("", {})
+        with refusing(f"{self.source} cannot be read"):
+            return metadata_of(wanted, {own_name: whole, **arrays}, of_file, arranged)
+
+    def _flat(self, variable: Variable, path: str) -> str:
+        """A name without groups for what lies beside a variable."""
+        if self.opened.naming:
+            return plain_name(path)
+        return path.removeprefix(f"{parent(variable.name)}/").replace("/", "_")
+
+    def _beside(self, variable: Variable) -> dict[str, Variable]:
+        """What lies beside a variable, by names without groups; of two names the nearest."""
+        near = {each.name: each for _, each in self._near(variable)}
+        if self.opened.spread:
+            near |= {each.name: each for each in self.opened.variables if each.name not in near}
+        found: dict[str, Variable] = {}
+        for each in near.values():
+            if each.name != variable.name and not each.error and not each.computed:
+                found.setdefault(self._flat(variable, each.name), each)
+        return found
+
+    def listed(self) -> list[Listed]:
+        """What is said of each variable; see `listing`."""
+        return listing(self.source, self.variables, self.dimensions, self.request, self.declared)
+
+
+MESH_NAMES = "nCells nEdges nVertices ncells ncol nMesh2_face nface nnode"
+MESH_DIMENSIONS = frozenset(MESH_NAMES.split())
+"""Names of dimensions of meshes in MPAS, ICON, CESM and FVCOM."""
+
+
+def _mesh(variable: Variable, dimension: Dimension) -> str:
+    """The message for a variable on a mesh."""
+    return (
+        f"{variable.name} lies on the {dimension.length} places of a mesh ({dimension.name}), not"
+        " on a grid of z, y and x; resample it first, such as with cdo remapcon or uxarray"
+    )
+
+
+def open_selected(opened: Source, request: Request) -> FileSeries:
+    """The series of the wanted variable of an open source, which is closed with it, or on errors.
+
+    Raises InputError where it is not clear what is wanted.
+    """
+    try:
+        with refusing(f"{opened.name} cannot be read"):
+            return Selection(opened, request).series()
+    except BaseException:
+        opened.close()
+        raise
+
+
+def list_selected(opened: Source, request: Request) -> list[Listed]:
+    """The variables of an open source, which is closed."""
+    try:
+        with refusing(f"{opened.name} cannot be read"):
+            return Selection(opened, request).listed()
+    finally:
+        opened.close()
