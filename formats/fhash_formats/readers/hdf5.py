@@ -257,10 +257,10 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
     netcdf: whether the rules of NetCDF hold: dimensions belong to groups, and values that nobody
     wrote are the format's fill values.
     """
-    import h5py
-
     source, stamp = str(path), Stamp.of(path)
     with refusing(f"{source} cannot be read as {'NetCDF' if netcdf else 'HDF5'}"):
+        import h5py
+
         file = h5py.File(path, "r")
         try:
             tree = walk(file)

@@ -15,7 +15,6 @@ from fhash_formats.readers.common.file_series import FileSeries, Request, conden
 from fhash_formats.readers.common.layout import must_select, single
 from fhash_formats.readers.common.select import Selection
 from fhash_formats.readers.common.stored_parts import labelled_parts
-from fhash_formats.readers.common.surroundings import warn_left_out
 from fhash_formats.readers.common.variables import (
     FIELD_DIMENSIONS,
     MAX_LISTED,
@@ -194,6 +193,7 @@ def _source(array: Any, beside: Any, name: str) -> Source:
         read=lambda places: np.asarray(own[places].values),
         chunks=own.chunks or own.encoding.get("chunksizes"),
         behind=lambda: _behind(own),
+        handle=own.encoding,
     )
     naming = {
         other
@@ -201,10 +201,8 @@ def _source(array: Any, beside: Any, name: str) -> Source:
         for key, other in references(each.attributes)
         if key != COORDINATES
     }
-    label = f"array '{name}'"
-    warn_left_out(f"{label}: not everything beside it is kept", failed)
     return Source(
-        name=label,
+        name=f"array '{name}'",
         path=origin,
         variables=list(stored.values()),
         groups={"": {key: value for key, value in beside.attrs.items() if key != COORDINATES}},
@@ -213,6 +211,7 @@ def _source(array: Any, beside: Any, name: str) -> Source:
         # a coordinate is what the dataset calls so, unless it is named in another way
         coordinates=[key for key in map(str, array.coords) if key not in naming],
         computed=origin is None,
+        left_out=failed,
         default_fill=default_fill if _is_netcdf(origin) else lambda dtype: None,
     )
 
@@ -246,7 +245,7 @@ def _stored(name: str, array: Any, *, auxiliary: bool) -> Variable:
 
 
 def _behind(own: Any) -> Behind:
-    """What is stored of the array behind a variable, as far as xarray shows it."""
+    """Stored parts of the array behind a variable, as far as xarray shows them."""
     parts, key = labelled_parts("array", own)
     if parts is None:
         return Behind()

@@ -394,12 +394,12 @@ def is_vtkhdf(head: bytes, path: Path) -> bool:
         return False
     if path.suffix.lower() in VTKHDF_SUFFIXES:
         return True
-    import h5py
-
     try:
+        import h5py
+
         with h5py.File(path, "r") as file:
             return "VTKHDF" in file
-    except (OSError, RuntimeError, KeyError):
+    except (ImportError, OSError, RuntimeError, KeyError):
         return False  # the reader of HDF5 says what is wrong
 
 

@@ -211,7 +211,7 @@ def _variables(
 
 
 def _behind(folder: Path | None, array: zarr.Array[Any]) -> Behind:
-    """What is stored of an array, and the state of its folder.
+    """Stored parts of an array, and the state of its folder.
 
     In a folder the array's metadata shows a change of shape at once; a changed chunk shows when all
     files are checked at the end.

@@ -125,7 +125,7 @@ def test_the_variable_must_be_clear() -> None:
     assert labelled_series(two, "v").name == "v"
     with pytest.raises(InputError, match="no variable 'w'; it has u, crs, v"):
         labelled_series(two, "w")
-    with pytest.raises(InputError, match="no variable of 3"):
+    with pytest.raises(InputError, match="no variable of 2"):
         labelled_series(source[["crs"]])
 
 

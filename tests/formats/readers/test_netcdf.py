@@ -246,8 +246,8 @@ def test_a_broken_install_ends_in_one_line_that_names_the_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
-    monkeypatch.setitem(sys.modules, "h5netcdf", None)
-    with pytest.raises(InputError, match=r"cannot be read as NetCDF.*h5netcdf") as caught:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(InputError, match=r"cannot be read as NetCDF.*h5py") as caught:
         open_series(path)
     assert "\n" not in str(caught.value)
 

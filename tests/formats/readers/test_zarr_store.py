@@ -117,7 +117,8 @@ def test_groups_and_choices(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     create_zarr(path, VALUES, name="gas/density")
     create_zarr(path, VALUES * 2, name="pressure")
-    create_zarr(path, np.zeros((3, 4)), name="flat")
+    create_zarr(path, np.ones((3, 4)), name="flat")
+    create_zarr(path, np.ones(3), name="line")
     with pytest.raises(
         InputError, match=r"holds 2 variables: gas/density \(4, 3, 5, 6\), pressure .*--var"
     ):
@@ -127,8 +128,9 @@ def test_groups_and_choices(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(path / "pressure"), VALUES * 2)
     with pytest.raises(InputError, match="no variable 'pressures'; it holds pressure"):
         open_series(path, var="pressures")
-    with pytest.raises(InputError, match="variable flat has 2 dimensions"):
-        open_series(path, var="flat")
+    assert frames(path, var="flat").shape == (1, 1, 3, 4)
+    with pytest.raises(InputError, match="variable line has 1 dimensions"):
+        open_series(path, var="line")
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])

@@ -563,7 +563,8 @@ def _steps_of_chunks(
 
 def _slabs(chunks: Sequence[int], most: int) -> list[int]:
     """First steps of slabs of at most so many steps, none of two chunks, and the end of all."""
-    starts, first = [], 0
+    starts: list[int] = []
+    first = 0
     for length in chunks:
         starts += range(first, first + length, most)
         first += length

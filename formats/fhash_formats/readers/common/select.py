@@ -44,6 +44,7 @@ from fhash_formats.readers.common.file_series import (
 from fhash_formats.readers.common.layout import (
     Dimension,
     Layout,
+    Read,
     arrange,
     shared_roles,
     with_roles,
@@ -61,7 +62,6 @@ from fhash_formats.readers.common.surroundings import (
 from fhash_formats.readers.common.variables import (
     FIELD_DIMENSIONS,
     Behind,
-    Read,
     Source,
     Variable,
     choose,
@@ -176,7 +176,8 @@ class Selection:
         """The packing that the attributes say; None for types that cannot be packed."""
         if variable.field or variable.dtype.kind not in "iuf":
             return None
-        return packing(self.source, variable.dtype, variable.attributes)
+        told = variable.attributes if variable.values is None else variable.handle
+        return packing(self.source, variable.dtype, told)
 
     def _unpacking(self, variable: Variable) -> Read:
         """The function that reads values in physical units."""
@@ -346,8 +347,9 @@ class Selection:
                 return variable.texts()
             packed = self.declared(variable)
             stored = variable.whole()
-            unpacked = packed is None or variable.values is not None
-            return stored if unpacked else packed.unpack(np.array(stored))
+            if packed is None or variable.values is not None:
+                return stored
+            return packed.unpack(np.array(stored))
 
         return Column(
             name=variable.name,
@@ -560,6 +562,7 @@ class Selection:
         have the names of the axes, and in what is beside it names of their own.
         """
         layout, coords, opened = arranged.layout, arranged.coords, self.opened
+        warn_left_out(f"{self.source}: not everything beside it is kept", opened.left_out)
         beside_it = self._beside(variable)
         taken = {plain_name(each.name) for each in coords.values()}
         axes = named_dimensions(layout, coords)
@@ -608,7 +611,7 @@ class Selection:
         return path.removeprefix(f"{parent(variable.name)}/").replace("/", "_")
 
     def _beside(self, variable: Variable) -> dict[str, Variable]:
-        """What lies beside a variable, by names without groups; of two names the nearest."""
+        """Variables beside one, by names without groups; of two names the nearest."""
         near = {each.name: each for _, each in self._near(variable)}
         if self.opened.spread:
             near |= {each.name: each for each in self.opened.variables if each.name not in near}
@@ -619,7 +622,7 @@ class Selection:
         return found
 
     def listed(self) -> list[Listed]:
-        """What is said of each variable; see `listing`."""
+        """Description of each variable; see `listing`."""
         return listing(self.source, self.variables, self.dimensions, self.request, self.declared)
 
 

@@ -93,7 +93,8 @@ class StoredParts:
 
         key: a number, a slice or an array of indices by dimension.
         """
-        edges, share = [], self.share
+        edges: list[npt.NDArray[np.int64]] = []
+        share: Any = self.share
         for place in reversed(range(share.ndim)):
             borders = self.edges[place]
             chosen = np.arange(borders[-1])[key.get(place, slice(None))]

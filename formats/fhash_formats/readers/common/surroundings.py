@@ -131,7 +131,7 @@ def surroundings(
         found.add(name, is_coordinate)
     limit = max(_size(own.shape, own.dtype), SMALL * SMALL_BYTES)
     for name, other in variables.items():
-        if name in names or set(own.dimensions) <= set(other.dimensions):
+        if name in names or set(own.names) <= set(other.names):
             continue  # another field can be encoded itself
         if SMALL * _size(other.shape, other.dtype) < limit:
             found.add(name, False)
@@ -191,7 +191,7 @@ def metadata_of(
     """
     name, layout, packed = wanted.name, arranged.layout, arranged.packed
     own, request = variables[name], arranged.request
-    kept, picked = kept_dimensions(wanted.source, name, layout, own.dimensions, request.select)
+    kept, picked = kept_dimensions(wanted.source, name, layout, own.names, request.select)
     wanted = replace(
         wanted,
         dimensions=kept,
@@ -219,12 +219,12 @@ def _named(
     attributes: Mapping[str, Any],
 ) -> dict[str, bool]:
     """Names of all that belongs to a variable, in order, and whether each is a coordinate."""
-    names = {name: True for name in own.dimensions}
+    names = {name: True for name in own.names}
     names |= dict.fromkeys([*_texts(own.attributes, COORDINATES), *wanted.coordinates], True)
     # a coordinate that belongs to no variable alone, or to another one on the same vertices
     everywhere = [each.attributes for each in variables.values()]
     for name in (text for each in (attributes, *everywhere) for text in _texts(each, COORDINATES)):
-        if name in variables and set(variables[name].dimensions) <= set(own.dimensions):
+        if name in variables and set(variables[name].names) <= set(own.names):
             names[name] = True
     for name in [*_references(own), *wanted.used]:
         names.setdefault(name, False)
@@ -260,7 +260,7 @@ class _Collected:
         self._wanted, self._stored, self._left_out = wanted, variables, left_out
         self._bytes = 0
         own = variables[wanted.name]
-        self._lengths = dict(zip(own.dimensions, own.shape, strict=True))
+        self._lengths = dict(zip(own.names, own.shape, strict=True))
 
     def add(self, name: str, is_coordinate: bool) -> None:
         """Read a variable, or note why it is left out."""
@@ -271,7 +271,7 @@ class _Collected:
         stored, picked = self._stored[name], self._wanted.picked
         try:
             values = np.asarray(
-                stored.read(tuple(picked.get(each, slice(None)) for each in stored.dimensions))
+                stored.read(tuple(picked.get(each, slice(None)) for each in stored.names))
             )
         except Exception as error:  # filters and files raise all kinds
             self._left_out[name] = f"cannot be read: {condense(error)}"
@@ -279,7 +279,7 @@ class _Collected:
         if stored_type(values) is None:
             self._left_out[name] = f"values of type {values.dtype}"
             return
-        dimensions = tuple(each for each in stored.dimensions if each not in picked)
+        dimensions = tuple(each for each in stored.names if each not in picked)
         self._bytes += _size(values.shape, values.dtype)
         self._lengths |= dict(zip(dimensions, values.shape, strict=True))
         self.variables.append(
@@ -296,7 +296,7 @@ class _Collected:
         """Why a variable is left out, as far as is known before it is read; "" if it is not."""
         kept = [
             (each, length)
-            for each, length in zip(stored.dimensions, stored.shape, strict=True)
+            for each, length in zip(stored.names, stored.shape, strict=True)
             if each not in self._wanted.picked
         ]
         names = [each for each, _ in kept]

@@ -68,7 +68,7 @@ def _unread(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Behind:
-    """What is behind a variable: the parts of it that somebody wrote, and the files that hold them.
+    """Parts of a variable that somebody wrote, and the files that hold them.
 
     Attributes:
         parts: None where all are stored.
@@ -103,7 +103,7 @@ class Variable:
         behind: looks at what was stored; None where all was.
         require: raises what is missing where the values cannot be read here.
         computed: whether its values follow from a header, so that they are not kept beside others.
-        handle: whatever else the reader needs.
+        handle: whatever else the reader needs; where `values` is given, what packs them.
         field: path of names in a compound type, () where the array is no such.
         members: arrays of the same kind, one a step; () for an array that the file holds as one
             (`join`).
@@ -127,6 +127,11 @@ class Variable:
     handle: Any = None
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each dimension, "" for one without."""
+        return tuple(self.dimension(place) or "" for place in range(len(self.shape)))
 
     @property
     def units(self) -> str:
@@ -545,6 +550,7 @@ class Source:
         only: the variable that the path means; "" for any.
         coordinates: names of coordinates that no attribute tells.
         computed: whether values were computed, so that what packs them in a file tells nothing.
+        left_out: variables that no file holds, with the reason.
         default_fill: gives the number that the format's library puts where nobody wrote, as stored.
     """
 
@@ -562,6 +568,7 @@ class Source:
     only: str = ""
     coordinates: Sequence[str] = ()
     computed: bool = False
+    left_out: Mapping[str, str] = field(default_factory=dict)
     default_fill: Callable[[np.dtype[Any]], Any] = lambda dtype: None
 
 

@@ -434,7 +434,7 @@ def test_sizes_are_bounded(monkeypatch) -> None:
         stored(("many",), np.array(["a"] * 20000)),
     ],
 )
-def test_what_no_container_holds_is_named(bad: Stored) -> None:
+def test_what_no_container_holds_is_named(bad: Variable) -> None:
     with pytest.warns(FhashWarning, match="bad"):
         metadata = found({**some(coordinates="bad lat2d"), "bad": bad})
     assert metadata.named("bad") is None
