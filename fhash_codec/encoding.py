@@ -32,7 +32,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.header import RESIDUAL, TRANSFORM_FEATURE
 from fhash_formats.errors import FhashWarning, InputError, QualityError
-from fhash_formats.readers.common.listing import Listed
+from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.series import AXES, ArraySeries, Series, index_coordinate, shown_name
 from fhash_formats.support.files import check_output

@@ -24,7 +24,7 @@ from fhash_codec.header import figure_attributes, history_line, source_attribute
 from fhash_codec.volume import OUTSIDE, Volume, holds
 from fhash_formats.container import is_container
 from fhash_formats.errors import InputError, UnsupportedFileError
-from fhash_formats.readers.common.cf import SCALING
+from fhash_formats.readers.cf import SCALING
 from fhash_formats.readers.labelled import labelled_series
 from fhash_formats.series import (
     AXES,

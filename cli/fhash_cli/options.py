@@ -500,7 +500,7 @@ class SourceOptions:
             raise InputError(f"--{given[0].replace('_', '-')} is for DATA that are read; name them")
 
     def _wishes(self) -> dict[str, Any]:
-        from fhash_formats.readers.common.file_series import RawLayout, parse_shape
+        from fhash_formats.readers.file_series import RawLayout, parse_shape
 
         names = [name for name, _ in self.select]
         twice = next((name for name in names if names.count(name) > 1), None)

@@ -12,7 +12,7 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
-    from fhash_formats.readers.common.listing import Listed
+    from fhash_formats.readers.listing import Listed
 
 ALL = "all"
 """Value of `--var` that stands for every variable that can be encoded as it is."""

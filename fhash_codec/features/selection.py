@@ -27,7 +27,7 @@ from fhash_codec.features.scan import Scan, scan
 from fhash_codec.measure.value_range import Ranks
 from fhash_codec.progress import Progress, stage
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.cf import settled
+from fhash_formats.readers.cf import settled
 from fhash_formats.readers.labelled import array_series
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import Series

@@ -33,7 +33,7 @@ from fhash_formats.container.array import (
 )
 from fhash_formats.container.header import TABLE
 from fhash_formats.errors import DamagedFileError, FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.common.file_series import FileSeries, Request, selection
+from fhash_formats.readers.file_series import FileSeries, Request, selection
 from fhash_formats.readers.registry import list_variables
 from fhash_formats.readers.zarr_coded import CodedArray, coded_names, open_coded
 from fhash_formats.support.files import check_output

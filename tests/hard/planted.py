@@ -97,9 +97,9 @@ pixel-middle fhash_codec/rendering/cameras.py
 (np.arange(height) + 0.5) / height => (np.arange(height) + 1) / height
 part-in-view fhash_codec/rendering/view.py
 int(np.ceil(high)) + 1 + margin => int(np.ceil(high)) + margin
-unpacked-sign formats/fhash_formats/readers/common/cf.py
+unpacked-sign formats/fhash_formats/readers/cf.py
 values += self.offset => values -= self.offset
-picked-index formats/fhash_formats/readers/common/layout.py
+picked-index formats/fhash_formats/readers/layout.py
 slice(self.picked[place], self.picked[place] + 1) => slice(0, 1)
 spacing-count formats/fhash_formats/writers/common.py
 extent / (len(values) - 1) => extent / len(values)

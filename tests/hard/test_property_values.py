@@ -18,7 +18,7 @@ from properties import INTEGERS, NUMBERS, Draw, arrays, chunks, looking, same
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.file_series import RawLayout
+from fhash_formats.readers.file_series import RawLayout
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.writers.common import Region

@@ -110,7 +110,7 @@ def _open(
 ) -> Any:
     """The series of the data: of several variables, the one that the container has the name of."""
     from fhash_codec.volume import open as open_volume
-    from fhash_formats.readers.common.variables import SeveralVariablesError
+    from fhash_formats.readers.variables import SeveralVariablesError
     from fhash_formats.series import meant
 
     try:

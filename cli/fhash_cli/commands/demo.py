@@ -53,7 +53,7 @@ OVERHEAD_BYTES = 2**20
 
 
 def _shape(text: str) -> dict[str, int]:
-    from fhash_formats.readers.common.file_series import parse_shape
+    from fhash_formats.readers.file_series import parse_shape
 
     words = [word.strip() for word in text.split(",")]
     if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):

@@ -73,7 +73,7 @@ def pack_command(
     tell, such as the PSNR, is not in the file.
     """
     import fhash_codec
-    from fhash_formats.readers.common.file_series import parse_axes
+    from fhash_formats.readers.file_series import parse_axes
 
     var, axes = chosen.var, chosen.axes
     names = None if var is None or var == ALL else [name.strip() for name in var.split(",")]

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.file_series import Request, Stamp, refusing
-from fhash_formats.readers.common.layout import Read
-from fhash_formats.readers.common.stored_parts import Hdf5Sources
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.file_series import Request, Stamp, refusing
+from fhash_formats.readers.layout import Read
+from fhash_formats.readers.stored_parts import Hdf5Sources
+from fhash_formats.readers.variables import (
     Behind,
     Source,
     Variable,

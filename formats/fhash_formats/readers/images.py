@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import role_of_name
-from fhash_formats.readers.common.file_series import Request, Stamp, naming
-from fhash_formats.readers.common.stored_bytes import (
+from fhash_formats.readers.cf import role_of_name
+from fhash_formats.readers.file_series import Request, Stamp, naming
+from fhash_formats.readers.stored_bytes import (
     MAX_FILES,
     CompressedFile,
     NumbersInText,
@@ -27,7 +27,7 @@ from fhash_formats.readers.common.stored_bytes import (
     lattice,
     numbered_files,
 )
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.variables import (
     Source,
     Variable,
     components,

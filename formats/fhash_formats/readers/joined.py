@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.common.cf import is_numbered, join_times
-from fhash_formats.readers.common.file_series import FileSeries, FolderStamp, Stamp
-from fhash_formats.readers.common.surroundings import warn_left_out
+from fhash_formats.readers.cf import is_numbered, join_times
+from fhash_formats.readers.file_series import FileSeries, FolderStamp, Stamp
+from fhash_formats.readers.surroundings import warn_left_out
 from fhash_formats.series import (
     Coordinate,
     NotStored,

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.file_series import FileSeries, Request, condense
-from fhash_formats.readers.common.layout import must_select, single
-from fhash_formats.readers.common.select import Selection
-from fhash_formats.readers.common.stored_parts import labelled_parts
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.file_series import FileSeries, Request, condense
+from fhash_formats.readers.hdf5 import default_fill, is_hdf5
+from fhash_formats.readers.layout import must_select, single
+from fhash_formats.readers.netcdf3 import MAGIC
+from fhash_formats.readers.select import Selection
+from fhash_formats.readers.stored_parts import labelled_parts
+from fhash_formats.readers.variables import (
     FIELD_DIMENSIONS,
     MAX_LISTED,
     MIN_DIMENSIONS,
@@ -23,8 +25,6 @@ from fhash_formats.readers.common.variables import (
     Source,
     Variable,
 )
-from fhash_formats.readers.hdf5 import default_fill, is_hdf5
-from fhash_formats.readers.netcdf3 import MAGIC
 from fhash_formats.series import (
     AXES,
     COORDINATES,

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.readers.common.file_series import Request, Stamp, refusing
-from fhash_formats.readers.common.variables import Source, Variable, file_source
+from fhash_formats.readers.file_series import Request, Stamp, refusing
 from fhash_formats.readers.hdf5 import default_fill
+from fhash_formats.readers.variables import Source, Variable, file_source
 from fhash_formats.support.values import decoded_text
 
 MAGIC = (b"CDF\x01", b"CDF\x02", b"CDF\x05")

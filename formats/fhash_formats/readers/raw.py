@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.file_series import (
+from fhash_formats.readers.file_series import (
     ENDIANS,
     RawLayout,
     Request,
@@ -17,8 +17,8 @@ from fhash_formats.readers.common.file_series import (
     parse_dtype,
     refusing,
 )
-from fhash_formats.readers.common.stored_bytes import FlatArray
-from fhash_formats.readers.common.variables import Source, Variable, file_source
+from fhash_formats.readers.stored_bytes import FlatArray
+from fhash_formats.readers.variables import Source, Variable, file_source
 from fhash_formats.series import AXES
 
 NAME = re.compile(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
 from fhash_formats.readers import hdf5, images, netcdf3, raw, tiff, vtk, zarr_store
-from fhash_formats.readers.common.file_series import (
+from fhash_formats.readers.file_series import (
     FileSeries,
     RawLayout,
     Request,
@@ -22,11 +22,11 @@ from fhash_formats.readers.common.file_series import (
     refusing,
     selection,
 )
-from fhash_formats.readers.common.listing import Listed, listed_series
-from fhash_formats.readers.common.select import list_selected, open_selected
-from fhash_formats.readers.common.stored_parts import require_inside
-from fhash_formats.readers.common.variables import Source
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern, warn_of_gaps
+from fhash_formats.readers.listing import Listed, listed_series
+from fhash_formats.readers.select import list_selected, open_selected
+from fhash_formats.readers.stored_parts import require_inside
+from fhash_formats.readers.variables import Source
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
 
 HEAD_BYTES = 4096

@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.file_series import Request, Stamp, condense, naming
-from fhash_formats.readers.common.stored_bytes import PlainFile, lattice
-from fhash_formats.readers.common.stored_parts import StoredParts
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.file_series import Request, Stamp, condense, naming
+from fhash_formats.readers.stored_bytes import PlainFile, lattice
+from fhash_formats.readers.stored_parts import StoredParts
+from fhash_formats.readers.variables import (
     Behind,
     Source,
     Variable,

@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.file_series import FileSeries, Request, Stamp, naming
-from fhash_formats.readers.common.select import open_selected
-from fhash_formats.readers.common.stored_bytes import axis_steps, lattice
-from fhash_formats.readers.common.stored_parts import Hdf5Sources
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming
+from fhash_formats.readers.hdf5 import Attributes, is_hdf5, require_filters
+from fhash_formats.readers.joined import JoinedSeries
+from fhash_formats.readers.select import open_selected
+from fhash_formats.readers.stored_bytes import axis_steps, lattice
+from fhash_formats.readers.stored_parts import Hdf5Sources
+from fhash_formats.readers.variables import (
     HEADER,
     Behind,
     Source,
@@ -27,8 +29,6 @@ from fhash_formats.readers.common.variables import (
     placed,
     positions,
 )
-from fhash_formats.readers.hdf5 import Attributes, is_hdf5, require_filters
-from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.arrays import Values

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.stored_bytes import DEFLATE_RATIO, numbers_of_words
+from fhash_formats.readers.stored_bytes import DEFLATE_RATIO, numbers_of_words
 
 CHUNK_BYTES = 2**18
 """Bytes that the parser takes at once."""

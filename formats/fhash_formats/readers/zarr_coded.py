@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
-from fhash_formats.readers.common.cf import Packing
-from fhash_formats.readers.common.file_series import FileSeries, Request, condense, refusing
-from fhash_formats.readers.common.layout import Layout, label
-from fhash_formats.readers.common.select import Selection
-from fhash_formats.readers.common.stored_parts import ABSENT
-from fhash_formats.readers.common.variables import Variable
+from fhash_formats.readers.cf import Packing
+from fhash_formats.readers.file_series import FileSeries, Request, condense, refusing
+from fhash_formats.readers.layout import Layout, label
+from fhash_formats.readers.select import Selection
+from fhash_formats.readers.stored_parts import ABSENT
+from fhash_formats.readers.variables import Variable
 from fhash_formats.readers.zarr_store import open_zarr
 from fhash_formats.series import AXES
 from fhash_formats.transform.stream import MAX_TILE_VERTICES, NO_AXIS, TILE_AXES, ArrayAxes

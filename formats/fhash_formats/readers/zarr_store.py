@@ -14,15 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import number_of_text
-from fhash_formats.readers.common.file_series import (
+from fhash_formats.readers.cf import number_of_text
+from fhash_formats.readers.file_series import (
     Request,
     Stamp,
     condense,
     refusing,
 )
-from fhash_formats.readers.common.stored_parts import zarr_parts
-from fhash_formats.readers.common.variables import Behind, Source, Variable, file_source
+from fhash_formats.readers.stored_parts import zarr_parts
+from fhash_formats.readers.variables import Behind, Source, Variable, file_source
 from fhash_formats.support.values import PLUMBING
 
 if TYPE_CHECKING:

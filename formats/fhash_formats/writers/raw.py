@@ -52,7 +52,7 @@ NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are calle
 
 
 def _outputs(path: Path, region: Region) -> list[Path]:
-    from fhash_formats.readers.common.file_series import parse_dtype
+    from fhash_formats.readers.file_series import parse_dtype
     from fhash_formats.readers.raw import layout_of_name
 
     _, layout = layout_of_name(path.stem)
@@ -80,7 +80,7 @@ def _outputs(path: Path, region: Region) -> list[Path]:
 def _open_raw(
     region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
 ) -> Iterator[Put]:
-    from fhash_formats.readers.common.file_series import ENDIANS
+    from fhash_formats.readers.file_series import ENDIANS
     from fhash_formats.readers.raw import layout_of_name
 
     _, layout = layout_of_name(outputs[0].stem)

@@ -41,7 +41,7 @@ from fhash_codec.features.selection import (
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import silent
 from fhash_formats.errors import FhashWarning
-from fhash_formats.readers.common import file_series
+from fhash_formats.readers import file_series
 from fhash_formats.readers.labelled import array_series, labelled_series
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import ArraySeries, Coordinate

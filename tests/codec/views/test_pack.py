@@ -24,7 +24,7 @@ from fhash_codec.header import full_header
 from fhash_codec.views import pack as module
 from fhash_codec.views.pack import Tiles
 from fhash_codec.views.unpack import ChunkTable
-from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.file_series import Request
 from fhash_formats.readers.zarr_coded import open_coded
 from fhash_formats.series import ArraySeries
 from fhash_formats.transform.chunk import decode_chunk

@@ -18,7 +18,7 @@ from stored_series import VALUES as VALUES_RAW
 from stored_series import assert_frames, frames, write_hdf5
 
 from fhash_formats.errors import FhashError, InputError
-from fhash_formats.readers.common.file_series import DTYPES, RawLayout
+from fhash_formats.readers.file_series import DTYPES, RawLayout
 from fhash_formats.readers.registry import list_variables, open_series
 
 

@@ -24,7 +24,7 @@ from fhash_formats.errors import (
     MissingInputError,
     RegionError,
 )
-from fhash_formats.readers.common.file_series import FileSeries, RawLayout
+from fhash_formats.readers.file_series import FileSeries, RawLayout
 from fhash_formats.readers.joined import JoinedSeries, natural_order
 from fhash_formats.readers.registry import REGISTRY, list_variables, open_mask, open_series
 from fhash_formats.series import Coordinate

@@ -19,8 +19,8 @@ from stored_series import frames
 
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers import vtk_document
-from fhash_formats.readers.common.variables import SeveralVariablesError
 from fhash_formats.readers.registry import open_series
+from fhash_formats.readers.variables import SeveralVariablesError
 from fhash_formats.readers.vtk_document import Document, VtkArrays, parse
 from fhash_formats.series import Coordinate
 from fhash_formats.writers.common import Region

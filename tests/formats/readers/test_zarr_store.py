@@ -19,7 +19,7 @@ from stored_series import VALUES, assert_frames, create_zarr, frames, zipped
 from zarr.codecs import Crc32cCodec, GzipCodec, TransposeCodec
 
 from fhash_formats.errors import DamagedFileError, FhashWarning, InputError
-from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.file_series import Request
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.readers.zarr_coded import coded_names, open_coded
 from fhash_formats.transform.chunk import decode_chunk

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.file_series import Stamp
-from fhash_formats.readers.common.layout import Read
-from fhash_formats.readers.common.stored_parts import StoredParts
+from fhash_formats.readers.file_series import Stamp
+from fhash_formats.readers.layout import Read
+from fhash_formats.readers.stored_parts import StoredParts
 from fhash_formats.series import AXIS_NAMES, Coordinate, meant
 from fhash_formats.support.values import json_attributes, text_of
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, InputError, MissingDependencyError
-from fhash_formats.readers.common.cf import Packing, missing_values, note_packing, settled
+from fhash_formats.readers.cf import Packing, missing_values, note_packing, settled
 from fhash_formats.series import (
     AXES,
     Coordinate,

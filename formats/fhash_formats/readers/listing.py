@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import Packing
-from fhash_formats.readers.common.file_series import Request
-from fhash_formats.readers.common.layout import (
+from fhash_formats.readers.cf import Packing
+from fhash_formats.readers.file_series import Request
+from fhash_formats.readers.layout import (
     Dimension,
     arrange,
     is_asked,
@@ -23,7 +23,7 @@ from fhash_formats.readers.common.layout import (
     readings,
     single,
 )
-from fhash_formats.readers.common.variables import Variable, kind_of, named, plain_name
+from fhash_formats.readers.variables import Variable, kind_of, named, plain_name
 from fhash_formats.series import AXES, Series, empty_selection
 from fhash_formats.support.values import plain_text
 

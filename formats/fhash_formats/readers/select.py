@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import (
+from fhash_formats.readers.cf import (
     SCALING,
     Column,
     Packing,
@@ -33,7 +33,7 @@ from fhash_formats.readers.common.cf import (
     usable,
     written_times,
 )
-from fhash_formats.readers.common.file_series import (
+from fhash_formats.readers.file_series import (
     FileSeries,
     FolderStamp,
     Request,
@@ -41,7 +41,7 @@ from fhash_formats.readers.common.file_series import (
     StoredValues,
     refusing,
 )
-from fhash_formats.readers.common.layout import (
+from fhash_formats.readers.layout import (
     Dimension,
     Layout,
     Read,
@@ -49,9 +49,9 @@ from fhash_formats.readers.common.layout import (
     shared_roles,
     with_roles,
 )
-from fhash_formats.readers.common.listing import Listed, listing
-from fhash_formats.readers.common.stored_parts import not_stored, warn_of_column
-from fhash_formats.readers.common.surroundings import (
+from fhash_formats.readers.listing import Listed, listing
+from fhash_formats.readers.stored_parts import not_stored, warn_of_column
+from fhash_formats.readers.surroundings import (
     MAX_ARRAYS,
     Arranged,
     Wanted,
@@ -59,7 +59,7 @@ from fhash_formats.readers.common.surroundings import (
     named_dimensions,
     warn_left_out,
 )
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.variables import (
     FIELD_DIMENSIONS,
     Behind,
     Source,

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common.file_series import condense, inside_folder
-from fhash_formats.readers.common.layout import Layout
+from fhash_formats.readers.file_series import condense, inside_folder
+from fhash_formats.readers.layout import Layout
 from fhash_formats.series import NotStored
 from fhash_formats.support.values import text_of
 

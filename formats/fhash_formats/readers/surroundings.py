@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import FhashWarning
-from fhash_formats.readers.common.cf import Packing, with_times
-from fhash_formats.readers.common.file_series import Request, condense
-from fhash_formats.readers.common.layout import Layout, picks
-from fhash_formats.readers.common.variables import FIELD_DIMENSIONS, Variable
+from fhash_formats.readers.cf import Packing, with_times
+from fhash_formats.readers.file_series import Request, condense
+from fhash_formats.readers.layout import Layout, picks
+from fhash_formats.readers.variables import FIELD_DIMENSIONS, Variable
 from fhash_formats.series import (
     COORDINATES,
     NO_AXIS,

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf import Column, assign_axes, coordinate
-from fhash_formats.readers.common.file_series import Request
+from fhash_formats.readers.cf import Column, assign_axes, coordinate
+from fhash_formats.readers.file_series import Request
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.support.values import text_of
 

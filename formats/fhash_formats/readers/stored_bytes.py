@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.variables import Variable, positions
+from fhash_formats.readers.variables import Variable, positions
 from fhash_formats.series import AXIS_NAMES
 
 BLOCK_BYTES = 8 * 2**20

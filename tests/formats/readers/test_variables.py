@@ -13,25 +13,25 @@ import pytest
 from stored_series import VALUES, assert_frames, write_hdf5
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common import surroundings as module
-from fhash_formats.readers.common.cf import packing
-from fhash_formats.readers.common.file_series import RawLayout, Request
-from fhash_formats.readers.common.layout import Dimension, Layout
-from fhash_formats.readers.common.listing import Listed, listing
-from fhash_formats.readers.common.surroundings import (
+from fhash_formats.readers import surroundings as module
+from fhash_formats.readers.cf import packing
+from fhash_formats.readers.file_series import RawLayout, Request
+from fhash_formats.readers.layout import Dimension, Layout
+from fhash_formats.readers.listing import Listed, listing
+from fhash_formats.readers.registry import open_series
+from fhash_formats.readers.surroundings import (
     Wanted,
     digest_of,
     kept_dimensions,
     surroundings,
 )
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.variables import (
     Variable,
     expand,
     group_time,
     join,
     times,
 )
-from fhash_formats.readers.registry import open_series
 from fhash_formats.series import SourceMetadata
 
 NESTED = np.dtype(

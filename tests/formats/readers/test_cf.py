@@ -17,8 +17,8 @@ import zarr
 from stored_series import VALUES, create_zarr, frames, save_netcdf, write_hdf5
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.common.cf import Column, counts_steps, join_times, packing, real_time
-from fhash_formats.readers.common.file_series import (
+from fhash_formats.readers.cf import Column, counts_steps, join_times, packing, real_time
+from fhash_formats.readers.file_series import (
     DTYPES,
     LONGEST_MESSAGE,
     FileSeries,
@@ -32,7 +32,7 @@ from fhash_formats.readers.common.file_series import (
     parse_shape,
     refusing,
 )
-from fhash_formats.readers.common.layout import Dimension, arrange, shared_roles
+from fhash_formats.readers.layout import Dimension, arrange, shared_roles
 from fhash_formats.readers.registry import open_series
 from fhash_formats.series import Coordinate
 
@@ -499,7 +499,7 @@ def test_a_chunk_of_many_steps_is_kept_as_far_as_it_fits(
     held: int | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fhash_formats.readers.common.file_series.SLAB_BYTES", limit)
+    monkeypatch.setattr("fhash_formats.readers.file_series.SLAB_BYTES", limit)
     values = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
     save(tmp_path / f"a{suffix}", values, (3, 3, 5, 6))
     with open_series(tmp_path / f"a{suffix}") as series:

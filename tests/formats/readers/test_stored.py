@@ -24,8 +24,9 @@ from stored_series import VALUES as PLAIN
 from stored_series import save_netcdf, write_hdf5
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.common import stored_bytes
-from fhash_formats.readers.common.stored_bytes import (
+from fhash_formats.readers import stored_bytes
+from fhash_formats.readers.registry import open_series
+from fhash_formats.readers.stored_bytes import (
     CompressedFile,
     FlatArray,
     NumbersInText,
@@ -35,12 +36,11 @@ from fhash_formats.readers.common.stored_bytes import (
     lattice,
     numbers_of_words,
 )
-from fhash_formats.readers.common.variables import (
+from fhash_formats.readers.variables import (
     Variable,
     component_by_number,
     components,
 )
-from fhash_formats.readers.registry import open_series
 from fhash_formats.series import NotStored, Series, spans_text
 
 
@@ -122,7 +122,7 @@ def test_a_file_cut_during_a_read_is_refused(tmp_path: Path) -> None:
 def test_one_frame_is_read_at_a_time(
     tmp_path: Path, order: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fhash_formats.readers.common.file_series.SLAB_BYTES", 1)
+    monkeypatch.setattr("fhash_formats.readers.file_series.SLAB_BYTES", 1)
     values = np.zeros((40, 40, 64, 64), np.float32)
     np.save(tmp_path / "a.npy", values)
     count = 0
