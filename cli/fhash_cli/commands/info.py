@@ -138,7 +138,7 @@ def _widths(layers: list[dict[str, Any]]) -> list[int]:
     return [layers[0]["shape"][1], *(layer["shape"][0] for layer in layers)]
 
 
-MIN_DIMENSIONS = 3
+MIN_DIMENSIONS = 2
 """Dimensions of an array that may be a variable; others are named in one line."""
 
 UNOPENED = "what cannot be opened"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
-from fhash_formats.readers import hdf5, images, netcdf3, raw, tiff, vtk, zarr_store
+from fhash_formats.readers import grids, hdf5, images, netcdf3, tiff, vtk, zarr_store
 from fhash_formats.readers.file_series import (
     FileSeries,
     RawLayout,
@@ -52,10 +52,12 @@ class Reader:
     open: Callable[[Path, Request], Source | JoinedSeries]
 
     def __str__(self) -> str:
-        return f"{self.name} ({' '.join(self.suffixes)})"
+        return f"{self.name} ({' '.join(self.suffixes)})" if self.suffixes else self.name
 
 
-RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.is_raw, open=raw.open_raw)
+RAW = Reader(
+    name="raw", suffixes=(".raw", ".bin", ".dat"), matches=images.is_raw, open=images.open_raw
+)
 ZARR = Reader(
     name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
 )
@@ -75,7 +77,7 @@ REGISTRY = (
         open=hdf5.open_netcdf,
     ),
     Reader(name="HDF5", suffixes=hdf5.SUFFIXES, matches=hdf5.matches, open=hdf5.open_hdf5),
-    Reader(name="NumPy", suffixes=(".npy",), matches=raw.is_npy, open=raw.open_npy),
+    Reader(name="NumPy", suffixes=(".npy",), matches=images.is_npy, open=images.open_npy),
     ZARR,
     Reader(name="VTK", suffixes=vtk.XML_SUFFIXES, matches=vtk.is_vtk_xml, open=vtk.open_vtk),
     Reader(
@@ -92,6 +94,20 @@ REGISTRY = (
         suffixes=images.METAIMAGE_SUFFIXES,
         matches=images.is_metaimage,
         open=images.open_metaimage,
+    ),
+    Reader(
+        name="NIfTI",
+        suffixes=grids.NIFTI_SUFFIXES,
+        matches=grids.is_nifti,
+        open=grids.open_nifti,
+    ),
+    Reader(name="MRC", suffixes=grids.MRC_SUFFIXES, matches=grids.is_mrc, open=grids.open_mrc),
+    Reader(name="OpenDX", suffixes=grids.DX_SUFFIXES, matches=grids.is_dx, open=grids.open_dx),
+    Reader(
+        name="legacy VTK",
+        suffixes=grids.LEGACY_SUFFIXES,
+        matches=grids.is_legacy_vtk,
+        open=grids.open_legacy_vtk,
     ),
     Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
 )
@@ -293,9 +309,37 @@ def find_reader(path: Path, request: Request) -> Reader:
     for reader in REGISTRY:
         if suffix in reader.suffixes:
             return reader
-    raise InputError(
-        f"{path} is of no format that can be read: {', '.join(str(reader) for reader in REGISTRY)}"
-    )
+    raise InputError(f"{path} is of no format that can be read{_advice(path)}")
+
+
+ELSEWHERE = {
+    "xarray (engine='cfgrib')": ".grib .grib2 .grb .grb2 .grb1",
+    "segyio or xarray (engine='segy')": ".sgy .segy",
+    "ParaView, with the filter ResampleToImage": ".vtu .vts .pvtu .pvts .vtp .vtm .foam .case"
+    " .e .exo .cgns .xmf .xdmf .plt .silo .msh .stl .ply .obj",
+    "pydicom or SimpleITK": ".dcm .dicom",
+    "rioxarray": ".hgt .asc .adf .vrt .ecw .jp2",
+    "astropy.io.fits": ".fits .fit .fts",
+    "adios2": ".bp .bp4 .bp5",
+    "pyopenvdb": ".vdb",
+    "yt": ".plt0000 .athdf .enzo",
+    "scipy.io.loadmat": ".mat",
+    "pyarrow": ".parquet .feather",
+    "pyhdf": ".hdf4 .h4",
+    "aicsimageio": ".czi .lif .nd2 .oib .ims",
+}
+"""Ways to read other formats, each with the suffixes of files for which it is the usual one."""
+
+
+def _advice(path: Path) -> str:
+    """The way to read a file of a format that is not read here, else the formats that are."""
+    suffix = path.suffix.lower()
+    for way, suffixes in ELSEWHERE.items():
+        if suffix in suffixes.split():
+            return (
+                f"; read it by {way}, and give the array or the xarray object to fhash_codec.encode"
+            )
+    return f": {', '.join(str(reader) for reader in REGISTRY)}"
 
 
 def _head(path: Path) -> bytes:

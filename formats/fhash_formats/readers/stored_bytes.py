@@ -184,10 +184,16 @@ class PlainFile:
 
 
 class NumbersInText:
-    """Values of a type that a file holds as text, from byte `start` on."""
+    """Values of a type that a file holds as text, from byte `start` on.
 
-    def __init__(self, path: Path, dtype: np.dtype[Any], *, start: int, size: int) -> None:
+    more: whether other text may follow.
+    """
+
+    def __init__(
+        self, path: Path, dtype: np.dtype[Any], *, start: int, size: int, more: bool = False
+    ) -> None:
         self.path, self.dtype, self.start, self.size = path, dtype, start, size
+        self._more = more
         count = size // dtype.itemsize
         if path.stat().st_size - start < 2 * count - 1:
             raise InputError(f"{path} is too short for {count} numbers; it is cut")
@@ -208,6 +214,7 @@ class NumbersInText:
             file.seek(self.start)
             words = file.read().replace(b",", b" ").split()
         count = self.size // self.dtype.itemsize
+        words = words[:count] if self._more else words
         if len(words) != count:
             raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
         try:

@@ -53,7 +53,7 @@ NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are calle
 
 def _outputs(path: Path, region: Region) -> list[Path]:
     from fhash_formats.readers.file_series import parse_dtype
-    from fhash_formats.readers.raw import layout_of_name
+    from fhash_formats.readers.images import layout_of_name
 
     _, layout = layout_of_name(path.stem)
     if layout.shape is None or layout.dtype is None:
@@ -81,7 +81,7 @@ def _open_raw(
     region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]
 ) -> Iterator[Put]:
     from fhash_formats.readers.file_series import ENDIANS
-    from fhash_formats.readers.raw import layout_of_name
+    from fhash_formats.readers.images import layout_of_name
 
     _, layout = layout_of_name(outputs[0].stem)
     dtype = (

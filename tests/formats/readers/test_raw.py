@@ -60,7 +60,7 @@ def test_npy_recognised_by_its_magic(tmp_path: Path) -> None:
         (np.full((2, 2, 2), "word"), "text"),
         (np.zeros((2, 2, 2), "M8[s]"), "dates"),
         (np.zeros(()), "0 dimensions"),
-        (np.zeros((2, 2)), "2 dimensions"),
+        (np.zeros(2), "1 dimensions"),
         (np.zeros((1, 1, 1, 1, 1)), "5 dimensions"),
         (np.zeros((0, 2, 2)), "length 0"),
         (np.zeros((2, 2, 2), np.longdouble), "float128|longdouble"),
