@@ -294,7 +294,6 @@ def test_several_datasets_need_a_choice(tmp_path: Path) -> None:
     ("array", "words"),
     [
         (np.zeros(3), "1 dimensions"),
-        (np.zeros(3), "1 dimensions"),
         (np.float64(1), "0 dimensions"),
         (np.zeros((2, 2, 2), complex), "complex128"),
         (np.full((2, 2, 2), b"word"), "text"),
