@@ -492,9 +492,9 @@ def texts_along(
     arrays: Variables.
     """
     for array in arrays:
-        along, name = array.dimension(0), array.name.rpartition("/")[2].lower()
         if array.shape[:1] != (length,) or array.error:
             continue
+        along, name = array.dimensions[0], array.name.rpartition("/")[2].lower()
         texts = len(array.shape) == 1 and array.dtype.kind in "SUTO"
         fits = along == dimension if along is not None else name in NAMES["t"].split()
         if (array.is_letters or texts) and fits:

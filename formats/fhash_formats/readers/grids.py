@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from fhash_formats.readers.stored_bytes import (
     StoredBytes,
     axis_steps,
     lattice,
+    numbers_of,
 )
 from fhash_formats.readers.variables import (
     Source,
@@ -34,13 +35,12 @@ from fhash_formats.readers.variables import (
     placed,
     positions,
 )
-from fhash_formats.series import AXIS_NAMES
+from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import decoded_text
 
 PACKED_SUFFIX = ".gz"
 HEAD_BYTES = 1 << 13
 """Stored bytes in which a compressed header is."""
-SPACE = ("z", "y", "x")
 
 
 def _head(path: Path, count: int) -> tuple[bytes, bool]:
@@ -58,26 +58,17 @@ def _inflated(head: bytes) -> bytes:
         return b""
 
 
-def _values(path: Path, packed: bool, start: int, size: int) -> StoredBytes:
-    """The bytes of values from a place in a file on, or in its true bytes."""
-    if not packed:
-        return PlainFile(path, start=start, size=size)
-    return _Behind(CompressedFile(path, "deflate", start=0, size=start + size), start, size)
-
-
-class _Behind:
-    """Bytes behind a header that is compressed with them."""
-
-    def __init__(self, whole: StoredBytes, start: int, size: int) -> None:
-        self._whole, self._start, self.size = whole, start, size
-
-    def readinto(self, place: int, view: memoryview) -> None:
-        """Fill a view with the bytes from `place` on."""
-        self._whole.readinto(self._start + place, view)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._whole.close()
+def _array(
+    path: Path, packed: bool, shape: tuple[int, ...], dtype: np.dtype[Any], start: int
+) -> StoredArray:
+    """The array that begins at a byte of a file, or of its true bytes."""
+    end = start + prod(shape) * dtype.itemsize
+    stored: StoredBytes = (
+        CompressedFile(path, "deflate", start=0, size=end)
+        if packed
+        else PlainFile(path, start=0, size=end)
+    )
+    return StoredArray(path, shape, dtype, stored, offset=start)
 
 
 NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr")
@@ -166,8 +157,8 @@ def open_nifti(path: Path, request: Request) -> Source:
         if not file.is_file():
             raise MissingInputError(f"its values are in {file}, which is not there")
         offset = max(int(header["vox_offset"]), 0 if pair else size)
-        stored = _values(file, packed, offset, prod(sizes) * dtype.itemsize)
         shape = tuple(reversed(sizes))
+        array = _array(file, packed, shape, dtype, offset)
         names = ["x", "y", "z", AXIS_NAMES["t"]][: len(sizes)]
         extra = [f"dim{n}" for n in range(5, len(sizes) + 1)]
         whole = Variable(
@@ -176,7 +167,7 @@ def open_nifti(path: Path, request: Request) -> Source:
             dtype=dtype,
             dimensions=tuple(reversed([*names, *extra])),
             attributes=_nifti_attributes(header),
-            read=StoredArray(file, shape, dtype, stored).read,
+            read=array.read,
         )
         vector = len(sizes) == 5
         arrays = components(whole, 0, interleaved=False) if vector else [whole]
@@ -184,7 +175,7 @@ def open_nifti(path: Path, request: Request) -> Source:
             arrays = [each for one in arrays for each in components(one, 0, interleaved=False)]
         found = placed(arrays, _nifti_positions(source, header, sizes))
     files = [file] if pair else []
-    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
+    return file_source(path, found, stamp=stamp, files=files, close=array.stored.close)
 
 
 def _stem(path: Path) -> str:
@@ -282,14 +273,13 @@ def open_mrc(path: Path, request: Request) -> Source:
             letters = ["x", "y", "z"]  # of programs that leave them out
         dtype = np.dtype(order + kind)
         shape = tuple(reversed(sizes))
-        start = 1024 + int(words[23])
-        stored = _values(path, packed, start, prod(shape) * dtype.itemsize)
+        array = _array(path, packed, shape, dtype, 1024 + int(words[23]))
         whole = Variable(
             name=_stem(path),
             shape=shape,
             dtype=dtype,
             dimensions=tuple(reversed(letters)),
-            read=StoredArray(path, shape, dtype, stored).read,
+            read=array.read,
         )
         coords = {}
         for n, axis in enumerate("xyz"):
@@ -300,7 +290,7 @@ def open_mrc(path: Path, request: Request) -> Source:
             origin = floats[49 + n] if np.isfinite(floats[49 + n]) else 0.0
             first = int(words[4 + column]) if origin == 0 else 0
             coords[axis] = lattice(axis, origin, step, sizes[column], first=first, units=unit)
-    return file_source(path, placed([whole], coords), stamp=stamp, close=stored.close)
+    return file_source(path, placed([whole], coords), stamp=stamp, close=array.stored.close)
 
 
 DX_SUFFIXES = (".dx",)
@@ -350,7 +340,10 @@ def open_dx(path: Path, request: Request) -> Source:
         if re.search("binary|ieee", array[0]):
             stored = PlainFile(path, start=start, size=size)
         else:
-            stored = NumbersInText(path, dtype, start=start, size=size, more=True)
+            with path.open("rb") as file:
+                file.seek(start)
+                stop = _end_of_numbers(file)
+            stored = NumbersInText(path, dtype, start=start, size=size, stop=stop)
         whole = Variable(
             name=path.stem,
             shape=tuple(sizes),
@@ -366,11 +359,20 @@ def open_dx(path: Path, request: Request) -> Source:
 
 def _dx_numbers(text: str, key: str) -> list[list[float]]:
     """The three numbers of each line of a key."""
-    found = re.findall(rf"\b{key}\s+({DX_NUMBER})\s+({DX_NUMBER})\s+({DX_NUMBER})", text)
-    try:
-        return [[float(word) for word in each] for each in found]
-    except ValueError as error:
-        raise InputError(f"its {key} is no three numbers") from error
+    found = re.findall(rf"\b{key}\s+({DX_NUMBER}\s+{DX_NUMBER}\s+{DX_NUMBER})", text)
+    return [numbers_of(each, 3).tolist() for each in found]
+
+
+def _end_of_numbers(file: BinaryIO) -> int:
+    """The place of the next line that begins with a word, or of the end; the file is there then."""
+    place = file.tell()
+    while line := file.readline():
+        first = line.split(maxsplit=1)[:1]
+        if first and first[0][:1].isalpha() and first[0].lower() not in (b"nan", b"inf"):
+            break
+        place = file.tell()
+    file.seek(place)
+    return place
 
 
 LEGACY_SUFFIXES = (".vtk",)
@@ -434,7 +436,7 @@ def open_legacy_vtk(path: Path, request: Request) -> Source:
             }
             if reader.time is not None:
                 coords["t"] = positions(AXIS_NAMES["t"], [reader.time])
-            parts = [each for one in whole for each in components(one, len(SPACE))]
+            parts = [each for one in whole for each in components(one, len(AXES[1:]))]
             found += placed(parts, coords, f"header/{section}")
     return file_source(path, found, stamp=stamp)
 
@@ -454,7 +456,7 @@ def _legacy_variable(
         name=f"{array.section}/{array.name}" if shared else array.name,
         shape=shape,
         dtype=array.dtype,
-        dimensions=(*SPACE, None),
+        dimensions=AXES[1:],
         read=StoredArray(path, shape, array.dtype, array.stored).read,
     )
 
@@ -494,7 +496,7 @@ class _LegacyReader:
                 self._take(words)
         match = re.search(r"time\s*[=:]\s*([-+0-9.eE]+)", title)
         if self.time is None and match is not None:
-            self.time = _float(match[1])
+            self.time = float(numbers_of(match[1], 1)[0])
         if min(self.sizes) < 1:
             raise InputError(f"its dimensions are {self.sizes}")
 
@@ -579,8 +581,8 @@ class _LegacyReader:
         size = count * parts * dtype.itemsize
         stored: StoredBytes
         if self._text:
-            stored = NumbersInText(self.path, dtype, start=start, size=size, more=True)
-            self._pass_text()
+            stop = _end_of_numbers(self._file)
+            stored = NumbersInText(self.path, dtype, start=start, size=size, stop=stop)
         else:
             stored = PlainFile(self.path, start=start, size=size)
             self._file.seek(start + size)
@@ -593,16 +595,6 @@ class _LegacyReader:
             stored=stored,
         )
 
-    def _pass_text(self) -> None:
-        """Go to the next line that begins with a word."""
-        place = self._file.tell()
-        while line := self._file.readline():
-            first = line.split(maxsplit=1)[:1]
-            if first and first[0][:1].isalpha() and first[0].lower() not in (b"nan", b"inf"):
-                self._file.seek(place)
-                return
-            place = self._file.tell()
-
 
 def _whole(array: _LegacyArray) -> npt.NDArray[np.float64]:
     """All values of an array, which is small."""
@@ -612,14 +604,6 @@ def _whole(array: _LegacyArray) -> npt.NDArray[np.float64]:
 
 
 def _numbers(words: Sequence[str], count: int) -> list[float]:
-    numbers = [_float(word) for word in words[1 : count + 1]]
-    if len(numbers) != count:
-        raise InputError(f"{' '.join(words)[:60]!r} stands where {count} numbers are needed")
+    """The numbers behind the first word of a line."""
+    numbers: list[float] = numbers_of(" ".join(words[1 : count + 1]), count).tolist()
     return numbers
-
-
-def _float(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise InputError(f"{word[:40]!r} stands where a number is needed") from error

@@ -124,7 +124,7 @@ class Attributes(Mapping[str, Any]):
         found = {}
         attributes = self._described.attrs
         for name in attributes:
-            if name in PLUMBING and name != "NAME":
+            if name in PLUMBING:
                 continue
             try:
                 value = attributes[name]
@@ -135,7 +135,6 @@ class Attributes(Mapping[str, Any]):
                     continue
                 value = ""
             found[name] = _plain(name, value)
-        found.pop("NAME", None)
         return found
 
     def __getitem__(self, name: str) -> Any:
@@ -169,11 +168,13 @@ class Tree:
         datasets: each once, in the order of names.
         groups: each once.
         broken: links that lead nowhere, and where they point.
+        files: each file that links lead to, the own one too, by its number.
     """
 
     datasets: dict[str, Any] = field(default_factory=dict)
     groups: dict[str, Any] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)
+    files: dict[int, Any] = field(default_factory=dict)
 
 
 class Scalar:
@@ -183,7 +184,7 @@ class Scalar:
     """
 
     shape: tuple[int, ...] = ()
-    is_scale, is_virtual, dims, chunks = False, False, (), None
+    is_scale, chunks = False, None
 
     def __init__(self, group: Any, name: bytes, dtype: np.dtype[Any]) -> None:
         self._group, self._name, self.dtype = group, name, dtype
@@ -224,6 +225,8 @@ def walk(root: Any) -> Tree:
         if (info.fileno, info.addr) in seen:
             continue
         seen.add((info.fileno, info.addr))
+        if info.fileno not in tree.files:
+            tree.files[info.fileno] = h5py.File(h5py.h5i.get_file_id(opened))
         if isinstance(opened, h5py.h5d.DatasetID):
             if opened.get_space().get_simple_extent_type() == h5py.h5s.SCALAR:
                 tree.datasets[path] = Scalar(group, name, opened.dtype)
@@ -264,7 +267,7 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
         file = h5py.File(path, "r")
         try:
             tree = walk(file)
-            variables = _Variables(source, path, file, tree, netcdf=netcdf).listed()
+            variables = _Variables(path, tree, netcdf=netcdf).listed()
             var = request.var and _own_name(file, tree.datasets, request.var)
         except BaseException:
             file.close()
@@ -273,7 +276,7 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
         path,
         variables,
         groups={name: Attributes(group) for name, group in tree.groups.items()},
-        close=partial(_close, file, tree),
+        close=partial(_close, tree),
         stamp=stamp,
         naming=netcdf,
         spread=not netcdf,
@@ -287,15 +290,10 @@ def open_netcdf(path: Path, request: Request) -> Source:
     return open_hdf5(path, request, netcdf=True)
 
 
-def _close(file: Any, tree: Tree) -> None:
+def _close(tree: Tree) -> None:
     """Close a file, and those that its links lead to, which stay open with their datasets."""
-    others = {}
-    for each in tree.datasets.values():
-        if not isinstance(each, Scalar) and each:
-            others[each.file.filename] = each.file
-    for other in others.values():
-        other.close()
-    file.close()
+    for file in tree.files.values():
+        file.close()
 
 
 def _own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
@@ -317,13 +315,19 @@ def _own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
 class _Variables:
     """Makes the variables of a file."""
 
-    def __init__(self, source: str, path: Path, file: Any, tree: Tree, *, netcdf: bool) -> None:
-        self.source, self.path, self.tree, self.netcdf = source, path, tree, netcdf
-        self.home = file.filename
+    def __init__(self, path: Path, tree: Tree, *, netcdf: bool) -> None:
+        self.source, self.path, self.tree, self.netcdf = str(path), path, tree, netcdf
         self._records: dict[str, int] = {}  # lengths of unlimited dimensions, by their scales
-        self._names = {
-            each.name: path for path, each in tree.datasets.items() if not isinstance(each, Scalar)
+        # scales of dimensions without values
+        self._empty = {
+            name for name, each in tree.datasets.items() if each.is_scale and _is_empty(each)
         }
+
+    @cached_property
+    def _names(self) -> dict[str, str]:
+        """Paths by the names that HDF5 gives datasets."""
+        datasets = self.tree.datasets.items()
+        return {each.name: path for path, each in datasets if not isinstance(each, Scalar)}
 
     def listed(self) -> list[Variable]:
         """Datasets that hold values, and links to nowhere."""
@@ -336,7 +340,7 @@ class _Variables:
                     self._records[scale] = max(known, dataset.shape[place])
         found: list[Variable] = []
         for name, dataset in self.tree.datasets.items():
-            if dataset.shape is not None and not (dataset.is_scale and _is_empty(dataset)):
+            if dataset.shape is not None and name not in self._empty:
                 found += self._variables(name, dataset, *dims[name])
         return found + [
             Variable(
@@ -393,16 +397,13 @@ class _Variables:
         if self.netcdf and dtype == np.int8 and attributes.get("dtype") == "bool":
             dtype = np.dtype(bool)  # as xarray writes booleans
             attributes = {key: each for key, each in attributes.items() if key != "dtype"}
-        shape = (
-            tuple(
-                max(length, self._records.get(scale, 0))
-                if dataset.maxshape[place] is None
-                else length
-                for place, (length, scale) in enumerate(zip(dataset.shape, scales, strict=True))
+        shape = tuple(dataset.shape)
+        if self._records:
+            grown = zip(shape, scales, dataset.maxshape, strict=True)
+            shape = tuple(
+                max(length, self._records.get(scale, 0)) if limit is None else length
+                for length, scale, limit in grown
             )
-            if self._records
-            else tuple(dataset.shape)
-        )
         variable = Variable(
             name=path.replace(HIDDEN, ""),
             shape=shape,
@@ -415,7 +416,7 @@ class _Variables:
             scales={
                 name: scale
                 for name, scale in zip(names, scales, strict=True)
-                if name and scale and scale != path and not _is_empty(self.tree.datasets[scale])
+                if name and scale not in ("", path) and scale not in self._empty
             },
             behind=partial(self._behind, path, dataset),
             require=partial(require_filters, self.source, path, dataset),

@@ -12,9 +12,10 @@ import numpy as np
 
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.file_series import FileSeries, Request, condense
-from fhash_formats.readers.hdf5 import default_fill, is_hdf5
+from fhash_formats.readers.hdf5 import default_fill, says_netcdf
 from fhash_formats.readers.layout import must_select, single
-from fhash_formats.readers.netcdf3 import MAGIC
+from fhash_formats.readers.netcdf3 import matches as is_classic
+from fhash_formats.readers.registry import HEAD_BYTES
 from fhash_formats.readers.select import Selection
 from fhash_formats.readers.stored_parts import labelled_parts
 from fhash_formats.readers.variables import (
@@ -114,7 +115,7 @@ def labelled_series(source: xr.DataArray | xr.Dataset, variable: Hashable = None
         array = beside[variable]
     opened = _source(array, beside, str(array.name or "values"))
     found = Selection(opened, Request(asked=False, var=opened.only))
-    own = found.choose(opened.only)
+    own = found.choose()
     dimensions = found.dimensions(own)
     open_dims = [
         dimensions[place].name for place in must_select(dimensions, single(dimensions, {}))
@@ -126,7 +127,7 @@ def labelled_series(source: xr.DataArray | xr.Dataset, variable: Hashable = None
             f" only t, z, y and x; select one index of the others, such as array.isel({choice})"
         )
     layout = found.arrange(own)
-    series = found.series()
+    series = found.series_of(own, layout)
     if is_lazy(array):
         kept = array.isel({array.dims[n]: at for n, at in layout.picked.items()})
         known = dict(zip(layout.axes, kept.dims, strict=True))
@@ -185,6 +186,7 @@ def _source(array: Any, beside: Any, name: str) -> Source:
     packed = own.dtype.kind in "iuf" and dtype.kind in "iuf"
     stored[name] = Variable(
         name=name,
+        flat=True,
         shape=own.shape,
         dtype=dtype if packed else own.dtype,
         values=own.dtype.newbyteorder("="),
@@ -221,8 +223,8 @@ def _is_netcdf(path: Path | None) -> bool:
     if path is None or not path.is_file():
         return False
     with path.open("rb") as file:
-        head = file.read(8)
-    return head[:4] in MAGIC or is_hdf5(head)
+        head = file.read(HEAD_BYTES)
+    return is_classic(head, path) or says_netcdf(head, path)
 
 
 def _stored(name: str, array: Any, *, auxiliary: bool) -> Variable:
@@ -231,6 +233,7 @@ def _stored(name: str, array: Any, *, auxiliary: bool) -> Variable:
     made = array if numbers else _encoded(name, array)
     return Variable(
         name=name,
+        flat=True,
         shape=made.shape,
         dtype=np.dtype(made.encoding.get("dtype", made.dtype)) if numbers else made.dtype,
         dimensions=tuple(map(str, made.dims)),

@@ -240,7 +240,7 @@ def open_whole(path: str | Path, request: Request) -> Series:
         pages = tiff.open_pages(text, files, request)
         if pages is not None:
             warn_of_gaps(text, files)
-            return open_selected(pages, request).as_asked(request)
+            return open_selected(pages, request)
     return JoinedSeries(text, files, lambda file: _open_of_pattern(file, request))
 
 
@@ -257,7 +257,7 @@ def _open_one(path: Path, request: Request) -> FileSeries | JoinedSeries:
     try:
         opened = find_reader(path, request).open(path, request)
         if isinstance(opened, Source):
-            return open_selected(opened, request).as_asked(request)
+            return open_selected(opened, request)
         return opened
     except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
         if isinstance(error, FhashError):

@@ -61,14 +61,12 @@ from fhash_formats.readers.surroundings import (
 )
 from fhash_formats.readers.variables import (
     FIELD_DIMENSIONS,
-    Behind,
     Source,
     Variable,
     choose,
     component_by_number,
     expand,
     join,
-    parent,
     plain_name,
     series_like,
     stacked,
@@ -94,7 +92,7 @@ class Selection:
         self.opened, self.request, self.source = opened, request, opened.name
         self._groups: dict[str, dict[str, Variable]] = {}
         for each in opened.variables:
-            self._groups.setdefault(parent(each.name), {})[plain_name(each.name)] = each
+            self._groups.setdefault(each.group, {})[each.label] = each
         self._by_name = {each.name: each for each in opened.variables}
         self._lists: dict[tuple[str, str, str | None], list[Variable]] = {}
         self._columns: dict[str, Column] = {}
@@ -140,8 +138,9 @@ class Selection:
 
         fields: whether there are arrays of three and more; other arrays are then their tables.
         """
-        names = [variable.dimension(place) for place in range(2)]
-        roles = [None if name is None else self._role(name, variable) for name in names]
+        roles = [
+            None if each is None else self._role(each, variable) for each in variable.dimensions
+        ]
         if set(roles) == {"y", "x"}:
             return ""
         if fields or not {*roles} <= {"y", "x", None}:
@@ -157,13 +156,14 @@ class Selection:
             known = self._by_name[path].attributes if path in self._by_name else {}
         return known
 
-    def choose(self, var: str | None) -> Variable:
+    def choose(self) -> Variable:
         """The variable that is wanted; see `variables.choose`."""
         request = self.request
+        var = self.opened.aliases.get(request.var, request.var) if request.var else None
         return choose(
             self.source,
             self.variables,
-            component_by_number(self.opened.aliases.get(str(var), var), self.variables),
+            component_by_number(var, self.variables),
             booleans=request.booleans,
             selected=len(request.select),
         )
@@ -222,17 +222,22 @@ class Selection:
         """Raise InputError for a variable on the cells, edges or nodes of a mesh.
 
         Conventions: UGRID 1.0 (mesh, location), CDI_grid_type of CDO and ICON, dimensions of MPAS;
-        else two positions of horizontal axes along one dimension.
+        else positions of both horizontal axes along a dimension that has no own.
         """
         told = {key.lower(): str(each) for key, each in variable.attributes.items()}
         ugrid = "mesh" in told and "location" in told
         if ugrid or told.get("cdi_grid_type", "") == "unstructured":
             raise InputError(_mesh(variable, dimensions[-1]))
         for each in dimensions:
-            if each.name is None or each.role is not None:
-                continue
+            own = each.name and (
+                role_of_name(each.name)
+                or self._named(each.name, variable)
+                or each.name in self.opened.left_out
+            )
+            if each.name is None or own:
+                continue  # also time, along which a moving grid has positions
             along = self._along(each.name, variable)
-            roles = {role_of_coordinate(plain_name(n.name), n.attributes) for n in along}
+            roles = {role_of_coordinate(n.label, n.attributes) for n in along}
             if each.name in MESH_DIMENSIONS or {"y", "x"} <= roles:
                 raise InputError(_mesh(variable, each))
 
@@ -251,14 +256,12 @@ class Selection:
                 role=None if name is None else self._role(name, variable),
                 column=None if name is None else self._labels(name, length, variable),
             )
-            for name, length in (
-                (variable.dimension(place), length) for place, length in enumerate(variable.shape)
-            )
+            for name, length in zip(variable.dimensions, variable.shape, strict=True)
         ]
 
     def _scope(self, variable: Variable) -> list[str]:
         """The group of a variable and those around it, the nearest first."""
-        parts = parent((variable.members or (variable,))[0].name).split("/")
+        parts = variable.first.group.split("/")
         around = ("/".join(parts[:count]) for count in range(len(parts), -1, -1))
         return list(dict.fromkeys(around))
 
@@ -276,15 +279,15 @@ class Selection:
 
     def _along(self, dimension: str, variable: Variable) -> list[Variable]:
         """Number variables along one dimension: its namesake, then coordinates, then the rest."""
-        owner = (variable.members or (variable,))[0]
-        key = (dimension, parent(owner.name), owner.scales.get(dimension))
+        owner = variable.first
+        key = (dimension, owner.group, owner.scales.get(dimension))
         if key not in self._lists:
             ranked: tuple[list[Variable], ...] = ([], [], [])
             tied = self._by_name.get(owner.scales.get(dimension, ""))
             if tied is not None and usable(tied.dtype) and len(tied.shape) == 1:
                 ranked[0].append(tied)
             for name, each in self._near(owner):
-                alone = name == dimension and each.dimensions in ((), (None,))
+                alone = name == dimension and each.dimensions == (None,)
                 if not usable(each.dtype) or len(each.shape) != 1 or each is tied:
                     continue
                 if each.dimensions == (dimension,) or alone:
@@ -295,15 +298,15 @@ class Selection:
 
     def _named(self, dimension: str, variable: Variable) -> Variable | None:
         """The variable that a dimension is named after, or tied to; it may hold texts."""
-        owner = (variable.members or (variable,))[0]
-        if dimension in owner.scales:
-            return self._by_name.get(owner.scales[dimension])
-        near = self._near(owner)
+        scales = variable.first.scales
+        if dimension in scales:
+            return self._by_name.get(scales[dimension])
+        near = self._near(variable)
         return next((each for name, each in near if name == dimension), None)
 
     def _role(self, dimension: str, variable: Variable) -> str | None:
         for each in self._along(dimension, variable):
-            role = role_of_coordinate(plain_name(each.name), each.attributes)
+            role = role_of_coordinate(each.label, each.attributes)
             if role is not None:
                 return role
         return role_of_name(dimension)
@@ -339,14 +342,11 @@ class Selection:
     def _made_column(self, variable: Variable) -> Column:
         @cache
         def read() -> npt.NDArray[Any]:
-            behind = Behind() if variable.behind is None else variable.behind()
-            parts = behind.parts
+            parts = variable.behind().parts
             if parts is not None and parts.fill == parts.fill:
                 warn_of_column(variable.name, parts)
-            if variable.is_letters:
-                return variable.texts()
             packed = self.declared(variable)
-            stored = variable.whole()
+            stored = variable.texts()
             if packed is None or variable.values is not None:
                 return stored
             return packed.unpack(np.array(stored))
@@ -369,7 +369,7 @@ class Selection:
             return coords
         coords["t"] = times(variable.members, self.attributes, self._scalar)
         for member in variable.members[1:]:
-            place = self._candidates(parent(member.name), owned=True)
+            place = self._candidates(member.group, owned=True)
             own = beside(self.source, layout.axes, layout.shape, [place], certain=True, tied="t")
             for axis, one in own.items():
                 if axis in coords and not np.array_equal(one.values, coords[axis].values):
@@ -429,8 +429,9 @@ class Selection:
             )
             coords = found | coords
         coords |= self._scalars(variable, layout, coords)
-        if "t" in layout.axes:
-            coords |= self._written(variable, named["t"], coords)
+        if "t" in unnamed and ("t" not in coords or not coords["t"].attributes):
+            written = self._texts(variable, named["t"])
+            coords |= {} if written is None else {"t": written}
         return coords
 
     def _along_axis(
@@ -441,24 +442,22 @@ class Selection:
         role_differs = dimension.role is not None and dimension.role != axis
         if not self.opened.naming and self.request.axes is not None and role_differs:
             return {}  # positions of another axis than the user says that it is
-        along = [
-            self._column(each)
-            for each in self._along(name, variable)
-            if each.shape == (dimension.length,)
-        ]
+        along = [e for e in self._along(name, variable) if e.shape == (dimension.length,)]
         tied = self._named(name, variable)
-        first = next((each for each in along if tied is not None and each.name == tied.name), None)
-        others = [each for each in along if each is not first]
+        others = [self._column(each) for each in along if each is not tied]
+        first = self._column(tied) if tied is not None and tied in along else None
         roles = (
-            each
-            for each in others
-            if role_of_coordinate(plain_name(each.name), each.attributes) == axis
+            self._column(each)
+            for each in along
+            if each is not tied and role_of_coordinate(each.label, each.attributes) == axis
         )
         found = real_time(first, others) if axis == "t" else first
         found = found or next(roles, None)
-        if found is None or (
-            axis == "t" and only_counts(found) and self._texts(variable, dimension)
-        ):
+        if axis == "t" and (found is None or only_counts(found)):
+            written = self._texts(variable, dimension)
+            if written is not None:
+                return {axis: written}
+        if found is None:
             return {}
         return {axis: coordinate(self.source, found.name, found.read(), found.attributes)}
 
@@ -468,22 +467,14 @@ class Selection:
         texts = texts_along(dimension.name, dimension.length, near)
         return written_times(dimension.name or AXIS_NAMES["t"], texts)
 
-    def _written(
-        self, variable: Variable, dimension: Dimension, coords: Mapping[str, Coordinate]
-    ) -> dict[str, Coordinate]:
-        """Times that are texts, where no numbers are times."""
-        plain = dimension.name is None and "t" in coords and not coords["t"].attributes
-        found = self._texts(variable, dimension) if "t" not in coords or plain else None
-        return {} if found is None else {"t": found}
-
     def _scalars(
         self, variable: Variable, layout: Layout, coords: Mapping[str, Coordinate]
     ) -> dict[str, Coordinate]:
         """Positions of axes that a variable lacks: scalar coordinates of its group."""
         found: dict[str, Coordinate] = {}
-        owner = (variable.members or (variable,))[0]
+        scales = variable.first.scales
         for axis in (each for each in AXES if each not in (*layout.axes, *coords)):
-            tied = self._by_name.get(owner.scales.get(AXIS_NAMES[axis], ""))
+            tied = self._by_name.get(scales.get(AXIS_NAMES[axis], ""))
             if tied is not None and tied.shape == (1,):
                 found[axis] = coordinate(self.source, tied.name, tied.whole(), tied.attributes)
         for name, each in self._groups.get(self._scope(variable)[0], {}).items():
@@ -496,27 +487,29 @@ class Selection:
         return found
 
     def series(self) -> FileSeries:
-        """The series of the wanted variable, which closes the source with it."""
+        """The series of the wanted variable; see `series_of`."""
+        variable = self.choose()
+        return self.series_of(variable, self.arrange(variable))
+
+    def series_of(self, variable: Variable, layout: Layout) -> FileSeries:
+        """The series of a variable as it was arranged, which closes the source with it."""
         opened, request = self.opened, self.request
-        variable = self.choose(request.var)
         members = variable.members or (variable,)
         for member in members:
-            if member.require is not None:
-                member.require()
-        layout = self.arrange(variable)
-        declared, packed = self.declared(variable), self.packing(variable)
+            member.require()
+        packed = self.packing(variable)
         dtype = variable.values or (variable.dtype if packed is None else packed.dtype)
         # counts have not the unit of the values
         scaled = request.raw_values and SCALING & set(variable.attributes)
         without = STORED | ({"units"} if scaled else frozenset())
-        behind = [Behind() if one.behind is None else one.behind() for one in members]
+        behind = [one.behind() for one in members]
         parts = [each.parts for each in behind]
         folder = opened.folder if variable.members else behind[0].folder
         coords = self.coordinates(variable, layout)
         names = {
             word
             for axis, each in zip(layout.axes, layout.kept, strict=True)
-            for word in ((each.name,) if each.name else (axis, AXIS_NAMES[axis]))
+            for word in ((axis, AXIS_NAMES[axis]) if each.name is None else (each.name,))
         }
         if not opened.naming:
             names |= {each.name for each in coords.values()}
@@ -533,7 +526,7 @@ class Selection:
                 close=opened.close,
                 beside=[*opened.files, *dict.fromkeys(n for each in behind for n in each.files)],
             ),
-            name=plain_name(shown_name(variable.name, {name for name in names if name})),
+            name=plain_name(shown_name(variable.name, names)),
             values=StoredValues(
                 shape=layout.shape,
                 dtype=dtype,
@@ -549,7 +542,7 @@ class Selection:
         )
         if not variable.members and not variable.field:
             arranged = Arranged(layout=layout, request=request, packed=packed, coords=series.coords)
-            unfit = without if request.raw_values and declared is not None else ()
+            unfit = without if request.raw_values else ()
             series.metadata = partial(self._metadata, variable, arranged, unfit)
         return series
 
@@ -565,21 +558,18 @@ class Selection:
         warn_left_out(f"{self.source}: not everything beside it is kept", opened.left_out)
         beside_it = self._beside(variable)
         taken = {plain_name(each.name) for each in coords.values()}
-        axes = named_dimensions(layout, coords)
-        names = [variable.dimension(place) or name for place, name in enumerate(axes)]
-        named = opened.naming and all(each.name for each in layout.dimensions)
+        named = opened.naming and None not in variable.dimensions
         arrays, positions = {}, 0
         for name, each in beside_it.items():
-            free = None in (each.dimension(n) for n in range(len(each.shape)))
             is_position = name in taken and each.shape in ((), *((n,) for n in layout.shape))
             positions += is_position
             if len(each.shape) >= FIELD_DIMENSIONS and not named:
                 continue  # what has so many dimensions can be encoded itself
             own = [
-                each.dimension(n) or (name if is_position else f"{name}_dim_{n}")
-                for n in range(len(each.shape))
+                (name if is_position else f"{name}_dim_{n}") if given is None else given
+                for n, given in enumerate(each.dimensions)
             ]
-            arrays[name] = replace(each, dimensions=tuple(own)) if free else each
+            arrays[name] = replace(each, dimensions=tuple(own))
         if not named and len(arrays) == positions:
             return None
         if len(arrays) > MAX_ARRAYS and not named:
@@ -589,8 +579,8 @@ class Selection:
                 {f"{more} datasets": f"more than {MAX_ARRAYS}"},
             )
             arrays = dict(list(arrays.items())[:MAX_ARRAYS])
-        own_name = self._flat(variable, variable.name)
-        whole = replace(variable, name=own_name, dimensions=tuple(names))
+        own_name = self._flat(variable, variable)
+        whole = replace(variable, name=own_name, dimensions=tuple(named_dimensions(layout, coords)))
         wanted = Wanted(
             source=self.source,
             name=own_name,
@@ -604,11 +594,11 @@ class Selection:
         with refusing(f"{self.source} cannot be read"):
             return metadata_of(wanted, {own_name: whole, **arrays}, of_file, arranged)
 
-    def _flat(self, variable: Variable, path: str) -> str:
-        """A name without groups for what lies beside a variable."""
+    def _flat(self, variable: Variable, other: Variable) -> str:
+        """A name without groups for what lies beside a variable, or for itself."""
         if self.opened.naming:
-            return plain_name(path)
-        return path.removeprefix(f"{parent(variable.name)}/").replace("/", "_")
+            return other.label
+        return other.name.removeprefix(f"{variable.group}/").replace("/", "_")
 
     def _beside(self, variable: Variable) -> dict[str, Variable]:
         """Variables beside one, by names without groups; of two names the nearest."""
@@ -618,7 +608,7 @@ class Selection:
         found: dict[str, Variable] = {}
         for each in near.values():
             if each.name != variable.name and not each.error and not each.computed:
-                found.setdefault(self._flat(variable, each.name), each)
+                found.setdefault(self._flat(variable, each), each)
         return found
 
     def listed(self) -> list[Listed]:
@@ -640,13 +630,13 @@ def _mesh(variable: Variable, dimension: Dimension) -> str:
 
 
 def open_selected(opened: Source, request: Request) -> FileSeries:
-    """The series of the wanted variable of an open source, which is closed with it, or on errors.
+    """The series that is asked for of an open source, which is closed with it, or on errors.
 
     Raises InputError where it is not clear what is wanted.
     """
     try:
         with refusing(f"{opened.name} cannot be read"):
-            return Selection(opened, request).series()
+            return Selection(opened, request).series().as_asked(request)
     except BaseException:
         opened.close()
         raise

@@ -184,16 +184,13 @@ class PlainFile:
 
 
 class NumbersInText:
-    """Values of a type that a file holds as text, from byte `start` on.
-
-    more: whether other text may follow.
-    """
+    """Values of a type that a file holds as text, from byte `start` on, to `stop` or its end."""
 
     def __init__(
-        self, path: Path, dtype: np.dtype[Any], *, start: int, size: int, more: bool = False
+        self, path: Path, dtype: np.dtype[Any], *, start: int, size: int, stop: int | None = None
     ) -> None:
         self.path, self.dtype, self.start, self.size = path, dtype, start, size
-        self._more = more
+        self._count = -1 if stop is None else stop - start
         count = size // dtype.itemsize
         if path.stat().st_size - start < 2 * count - 1:
             raise InputError(f"{path} is too short for {count} numbers; it is cut")
@@ -212,9 +209,8 @@ class NumbersInText:
     def _parsed(self) -> npt.NDArray[np.uint8]:
         with self.path.open("rb") as file:
             file.seek(self.start)
-            words = file.read().replace(b",", b" ").split()
+            words = file.read(self._count).replace(b",", b" ").split()
         count = self.size // self.dtype.itemsize
-        words = words[:count] if self._more else words
         if len(words) != count:
             raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
         try:
@@ -298,16 +294,34 @@ def numbered_files(folder: Path, form: str, words: Sequence[str], most: int) -> 
 
 
 class StoredArray(FlatArray):
-    """An array of `shape` (slowest dimension first) and `dtype` in stored bytes."""
+    """An array of `shape` (slowest dimension first) and `dtype`, from a stored byte `offset` on."""
 
     def __init__(
-        self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], stored: StoredBytes
+        self,
+        path: Path,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        stored: StoredBytes,
+        *,
+        offset: int = 0,
     ) -> None:
-        super().__init__(path, shape, dtype)
+        super().__init__(path, shape, dtype, offset=offset)
         self.stored = stored
 
     def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
-        self.stored.readinto(start * self.dtype.itemsize, into.view(np.uint8).data)
+        place = self.offset + start * self.dtype.itemsize
+        self.stored.readinto(place, into.view(np.uint8).data)
+
+
+def numbers_of(text: str, count: int) -> npt.NDArray[np.float64]:
+    """So many numbers of a line, in any notation; raises InputError for another text."""
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape != (count,):
+        raise InputError(f"{text[:60]!r} stands where {count} numbers are needed")
+    return numbers
 
 
 def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArray[Any]:

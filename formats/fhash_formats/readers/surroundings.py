@@ -110,9 +110,13 @@ def kept_dimensions(
 def named_dimensions(layout: Layout, coords: Mapping[str, Coordinate]) -> list[str]:
     """A name for each dimension of an array; one without a name has that of its axis."""
     axes = iter(layout.axes)
+    others = [
+        f"dim_{place}" if place in layout.picked else coords[next(axes)].name
+        for place in range(len(layout.dimensions))
+    ]
     return [
-        each.name or f"dim_{place}" if place in layout.picked else coords[next(axes)].name
-        for place, each in enumerate(layout.dimensions)
+        other if each.name is None else each.name
+        for each, other in zip(layout.dimensions, others, strict=True)
     ]
 
 

@@ -91,7 +91,8 @@ class Variable:
         name: full name, "group/density".
         shape: lengths in the source's order.
         dtype: type of the stored values.
-        dimensions: name of each, None for one without; fewer than there are where none is named.
+        dimensions: name of each, None for one without, and for one that a library made up. Those
+            that are left out at the end have no name.
         attributes: as they are stored.
         read: gives stored values.
         chunks: lengths of a stored chunk, or of each chunk along a dimension; None without chunks.
@@ -100,8 +101,9 @@ class Variable:
         note: why nobody means it who does not name it, "" if somebody may.
         values: type of what `read` gives, where it is unpacked already; None for stored values.
         scales: full names of the variables that the source ties to dimensions, by name of these.
-        behind: looks at what was stored; None where all was.
+        behind: looks at what was stored.
         require: raises what is missing where the values cannot be read here.
+        flat: whether its name has no groups, whatever letters it has.
         computed: whether its values follow from a header, so that they are not kept beside others.
         handle: whatever else the reader needs; where `values` is given, what packs them.
         field: path of names in a compound type, () where the array is no such.
@@ -121,28 +123,44 @@ class Variable:
     note: str = ""
     values: np.dtype[Any] | None = None
     scales: Mapping[str, str] = field(default_factory=dict)
-    behind: Callable[[], Behind] | None = None
-    require: Callable[[], None] | None = None
+    behind: Callable[[], Behind] = Behind
+    require: Callable[[], None] = lambda: None
+    flat: bool = False
     computed: bool = False
     handle: Any = None
     field: tuple[str, ...] = ()
     members: tuple[Variable, ...] = ()
 
+    def __post_init__(self) -> None:
+        given = [None if each and each.startswith(MADE_UP) else each for each in self.dimensions]
+        open_places = len(self.shape) - len(given)
+        object.__setattr__(self, "dimensions", (*given, *[None] * open_places))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Name of each dimension, "" for one without."""
-        return tuple(self.dimension(place) or "" for place in range(len(self.shape)))
+        return tuple(each or "" for each in self.dimensions)
+
+    @property
+    def group(self) -> str:
+        """The group that holds it, "" at the top."""
+        return "" if self.flat else parent(self.name)
+
+    @property
+    def label(self) -> str:
+        """Its name without the groups around it."""
+        return self.name if self.flat else plain_name(self.name)
+
+    @property
+    def first(self) -> Variable:
+        """The array of the first step, which is itself where there is one for all steps."""
+        return self.members[0] if self.members else self
 
     @property
     def units(self) -> str:
         """Units of the values, "" where unknown."""
         units = self.attributes.get("units", "")
         return text_of(units) if isinstance(units, str | bytes) else ""
-
-    def dimension(self, place: int) -> str | None:
-        """Name of a dimension, None for one without, or with one that a library made up."""
-        name = self.dimensions[place] if place < len(self.dimensions) else None
-        return None if name is None or name.startswith(MADE_UP) else name
 
     @property
     def is_letters(self) -> bool:
@@ -444,7 +462,7 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
                 first,
                 name=template,
                 shape=shape,
-                dimensions=("step", *(first.dimension(n) for n in range(len(first.shape)))),
+                dimensions=("step", *first.dimensions),
                 chunks=first.chunks and (1, *first.chunks),
                 error=next((why for key, why in broken if template.startswith(key)), ""),
                 members=tuple(member for _, member in members),

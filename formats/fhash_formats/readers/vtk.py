@@ -17,7 +17,7 @@ from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming
 from fhash_formats.readers.hdf5 import Attributes, is_hdf5, require_filters
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
-from fhash_formats.readers.stored_bytes import axis_steps, lattice
+from fhash_formats.readers.stored_bytes import axis_steps, lattice, numbers_of
 from fhash_formats.readers.stored_parts import Hdf5Sources
 from fhash_formats.readers.variables import (
     HEADER,
@@ -215,7 +215,7 @@ def _arrays(source: str, grid: _Grid, place: str) -> list[Variable]:
             name=name if names.count(name) == 1 else f"{place}/{name}",
             shape=(*_shape(grid.extent, place), count),
             dtype=first.arrays.dtype(element),
-            dimensions=(*SPACE, None),
+            dimensions=SPACE,
             attributes=_units(element),
             auxiliary=name in GHOSTS,
             read=partial(_read, source, grid, array),
@@ -296,7 +296,7 @@ def _positions(grid: _Grid, place: str) -> dict[str, Variable]:
         # A parallel file may leave out what its pieces say, such as the direction.
         attributes = {**grid.holders[-2][0].attributes, **grid.element.attributes}
         origin, spacing, direction = (
-            _numbers(attributes.get(name, default), len(default.split()))
+            numbers_of(attributes.get(name, default), len(default.split()))
             for name, default in (
                 ("Origin", "0 0 0"),
                 ("Spacing", "1 1 1"),
@@ -373,16 +373,6 @@ def _units(element: Element) -> dict[str, Any]:
         if key.attributes.get("name") == "UNITS_LABEL" and key.note.strip():
             return {"units": key.note.strip()}
     return {}
-
-
-def _numbers(text: str, count: int) -> npt.NDArray[np.float64]:
-    try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.shape != (count,):
-        raise InputError(f"{text!r} stands where {count} numbers are needed")
-    return numbers
 
 
 VTKHDF_SUFFIXES = (".vtkhdf",)
@@ -477,11 +467,12 @@ def _hdf_arrays(
             continue
         entries = None if times is None else _entries(root, place, dataset, full, times)
         dims = (*([AXIS_NAMES["t"]] if leading else []), *SPACE)
+        vector = len(shape) > len(dims)
         whole = Variable(
             name=full,
             shape=((len(times), *shape[1:]) if times is not None else shape),
             dtype=dataset.dtype,
-            dimensions=(*dims, *([None] if len(shape) > len(dims) else [])),
+            dimensions=dims,
             attributes=Attributes(dataset),
             read=partial(_hdf_read, dataset, entries),
             chunks=dataset.chunks,
@@ -489,7 +480,6 @@ def _hdf_arrays(
             behind=partial(_hdf_behind, source, full, dataset, entries),
             require=partial(require_filters, source, full, dataset),
         )
-        vector = len(shape) > len(dims)
         found += components(whole, len(dims), interleaved=False) if vector else [whole]
     return found
 
@@ -574,7 +564,7 @@ class CollectionSeries(JoinedSeries):
 
     def __init__(self, path: Path, stamp: Stamp, entries: list[Entry], request: Request) -> None:
         def open_part(file: Path) -> FileSeries:
-            part = open_selected(open_vtk(file, request), request).as_asked(request)
+            part = open_selected(open_vtk(file, request), request)
             if part.shape[0] != 1:
                 raise InputError(f"{file} holds {part.shape[0]} steps; {path} lists one a file")
             if "t" in part.given:

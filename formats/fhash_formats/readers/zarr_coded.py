@@ -50,10 +50,10 @@ def open_coded(path: Path, request: Request) -> Iterator[tuple[FileSeries, Coded
     try:
         with refusing(f"{path} cannot be read as zarr"):
             found = Selection(opened, request)
-            variable = found.choose(found.request.var)
+            variable = found.choose()
             packed = _require_coded(found, variable)
             layout = found.arrange(variable)
-            series = found.series()
+            series = found.series_of(variable, layout)
         yield (
             series,
             CodedArray(found.source, variable, layout, () if packed is None else packed.fills),

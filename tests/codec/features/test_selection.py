@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -108,6 +109,48 @@ def test_packing_is_that_of_the_file(tmp_path: Path) -> None:
     assert metadata.stored == "int16"
     assert metadata.variable_attributes["scale_factor"] == 0.5
     assert not metadata.named("crs").is_coordinate  # as of the file
+
+
+def test_names_that_a_library_made_up_say_nothing(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["rho"], file["time"] = np.ones((3, 4, 5, 6)), np.array([1.0, 2, 4])
+    with (
+        open_series(tmp_path / "a.h5") as series,
+        xr.open_dataset(tmp_path / "a.h5", engine="h5netcdf", phony_dims="sort") as data,
+    ):
+        for found in (series, labelled_series(data)):
+            assert found.shape == (3, 4, 5, 6)
+            assert found.coords["t"].values.tolist() == [1, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("dims", "attributes", "message"),
+    [
+        (("time", "cell"), {"CDI_grid_type": "unstructured"}, "7 places of a mesh .cell"),
+        (("time", "face"), {"mesh": "m", "location": "face"}, "mesh .face"),
+        (("time", "nCells"), {}, "mesh .nCells"),
+        (("time", "lev", "site"), {}, "mesh .site"),
+    ],
+)
+def test_a_mesh_is_no_grid(
+    tmp_path: Path, dims: tuple[str, ...], attributes: dict[str, str], message: str
+) -> None:
+    shape = [{"time": 3, "lev": 2}.get(each, 7) for each in dims]
+    data = xr.Dataset(
+        {"u": (dims, np.ones(shape, "f4"), attributes)},
+        {
+            "lat": ("site", np.arange(7.0), {"units": "degrees_north"}),
+            "lon": ("site", np.arange(7.0), {"units": "degrees_east"}),
+        },
+    )
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=message):
+        open_series(tmp_path / "a.nc", var="u")
+    with pytest.raises(InputError, match=message):
+        labelled_series(data)
+    axes = "t,x" if len(dims) == 2 else "t,z,x"
+    with open_series(tmp_path / "a.nc", var="u", axes=axes) as series:
+        assert series.shape[3] == 7
 
 
 def test_indices_of_several_levels_are_named() -> None:

@@ -32,6 +32,14 @@ def scaled(path: Path, values: np.ndarray, **scales: Any) -> Path:
     return path
 
 
+def test_a_fill_value_without_meaning_does_not_bar_raw_values(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("v", data=VALUES).attrs["_FillValue"] = "none"
+    with pytest.raises(InputError, match="--raw-values reads"):
+        open_series(tmp_path / "a.h5")
+    assert_frames(tmp_path / "a.h5", VALUES, raw_values=True)
+
+
 def test_links_and_cycles(tmp_path: Path) -> None:
     write_hdf5(tmp_path / "other.h5", far=VALUES[::-1])
     with h5py.File(tmp_path / "a.h5", "w") as file:
