@@ -290,11 +290,11 @@ def _kind(error: Exception, code: int) -> str:
     return "input" if code == 2 else "failure"
 
 
-def table(rows: Sequence[Sequence[str]]) -> str:
+def table(rows: Sequence[Sequence[str]], *, left: bool = False) -> str:
     """Rows of equal length as aligned columns.
 
-    The first column is aligned to the left; where there are more than two, the others to the right.
-    Each cell is one line, whatever a file has for a name.
+    The first column is aligned to the left; where there are more than two, the others to the right
+    unless `left`. Each cell is one line, whatever a file has for a name.
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -304,7 +304,10 @@ def table(rows: Sequence[Sequence[str]]) -> str:
         others = (
             rest
             if len(row) == 2
-            else [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+            else [
+                cell.ljust(width) if left else cell.rjust(width)
+                for cell, width in zip(rest, widths[1:], strict=True)
+            ]
         )
         return "  ".join([first.ljust(widths[0]), *others]).rstrip()
 

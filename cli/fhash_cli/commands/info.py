@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +28,11 @@ from fhash_cli.output import (
     table,
 )
 from fhash_cli.variables import info_table
+from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec import Dataset, Volume
+    from fhash_formats.readers.listing import Listed
     from fhash_formats.series import Coordinate, Series
 
 
@@ -138,60 +142,80 @@ def _widths(layers: list[dict[str, Any]]) -> list[int]:
     return [layers[0]["shape"][1], *(layer["shape"][0] for layer in layers)]
 
 
-MIN_DIMENSIONS = 2
-"""Dimensions of an array that may be a variable; others are named in one line."""
+MAX_ROWS = 24
+"""Variables of a table that is for one screen; of more the names follow."""
 
-UNOPENED = "what cannot be opened"
-"""Beginning of the problem of an array of which nothing is known."""
-
-MAX_NAMES = 8
-"""Names of one line; of more `listed` leaves some out."""
+MAX_PROBLEMS = 6
+"""Lines of what cannot be encoded, and why."""
 
 MAX_TEXT = 300
 """Characters of an attribute that are shown."""
 
 
-def listing(
-    path: str, files: int, variables: Sequence[Mapping[str, Any]], *, named: bool = False
-) -> str:
-    """The variables of a data file, each with its commands; then what cannot be encoded.
+def listing(path: str, files: int, found: Sequence[Listed], *, named: bool = False) -> str:
+    """The variables of a data file as one table, a command, and what cannot be encoded.
 
     named: whether the user named the only variable that is listed.
     """
-    good = [variable for variable in variables if not variable["problem"]]
-    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
-    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
-    lines = [f"{path}{many} holds {count} to encode"] if not named else [f"{path}{many}"]
-    for variable in good:
-        units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
-        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
-        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
-        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
-        missing = f", missing where {marks}" if marks else ""
-        dtype = variable["dtype"] + stored
-        lines += ["", f"{variable['name']}: {dtype}, {shape}{units}{missing}"]
-        if len(variable["commands"]) > 1:
-            lines.append("  two readings are likely:")
-        lines += [f"  {text}" for text in variable["commands"]]
-    if len(good) > 1 and all(len(variable["commands"]) == 1 for variable in good):
-        words = ["fhash", "encode", path, "-o", f"{Path(path).stem}.fhz", "--var", "all"]
-        lines += ["", "all in one file:", f"  {shlex.join(words)}"]
-    rest = [variable for variable in variables if variable["problem"]]
-    others: list[Mapping[str, Any]] = []
-    small: list[Mapping[str, Any]] = []
-    for variable in rest:
-        known = len(variable["shape"]) < MIN_DIMENSIONS
-        (small if known and not variable["problem"].startswith(UNOPENED) else others).append(
-            variable
-        )
-    if others:
-        lines += ["", "not to be encoded:"]
-        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
-    if small:
-        names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
-        count = f"; {len(names)} in all" if len(names) > MAX_NAMES else ""
-        lines += ["", f"below {MIN_DIMENSIONS} dimensions: {listed(names)}{count}"]
+    good = [entry for entry in found if entry.options]
+    needs = [" or ".join(shlex.join(_needs(words)) for words in entry.options) for entry in good]
+    more = f" ({files} files; shapes are of the first)" if files > 1 else ""
+    count = f": {len(good) or 'no'} variable{'' if len(good) == 1 else 's'} to encode"
+    lines = [f"{path}{more}{'' if named else count}"]
+    if good:
+        rows = [_row(entry, need) for entry, need in zip(good[:MAX_ROWS], needs, strict=False)]
+        if len(set(needs)) == 1:
+            rows = [row[:-1] for row in rows]
+        titles = ["variable", "type", "dimensions", "units", "missing", "needs"][: len(rows[0])]
+        used = [place for place in range(len(titles)) if place < 3 or any(r[place] for r in rows)]
+        rows = [[row[place] for place in used] for row in [titles, *rows]]
+        lines += ["", *table(rows, left=True).splitlines()]
+        if len(good) > MAX_ROWS:
+            rest = [entry.name for entry in good[MAX_ROWS:]]
+            lines.append(f"and {len(rest)} more: {listed(rest)}; --json lists all")
+        lines += ["", *_commands(path, good)]
+    lines += ["" for problem in found[len(good) :][:1]]
+    lines += _refused([entry for entry in found if not entry.options])
     return "\n".join(map(one_line, lines))
+
+
+def _needs(words: Sequence[str]) -> list[str]:
+    """The options of a reading beside the name of the variable."""
+    return list(words[2:] if words[:1] == ("--var",) else words)
+
+
+def _row(entry: Listed, needs: str) -> list[str]:
+    stored = f" stored as {entry.stored}" if entry.stored else ""
+    pairs = zip(entry.dimensions, entry.shape, strict=False)
+    shape = ", ".join(_dimension(name, length, axis) for (name, axis), length in pairs)
+    marks = ", ".join(dict.fromkeys(f"{value:.6g}" for value in entry.missing))
+    units = "" if entry.units == "1" else entry.units
+    return [entry.name, entry.dtype + stored, shape, units, marks, needs]
+
+
+def _commands(path: str, good: Sequence[Listed]) -> list[str]:
+    """The command for all that is read in one way with the same options, else for the first."""
+    alike = [entry for entry in good if len(entry.options) == 1]
+    usual = Counter(tuple(_needs(entry.options[0])) for entry in alike)
+    words, count = min(usual.items(), key=lambda each: (len(each[0]), -each[1]), default=((), 0))
+    if count < 2:
+        return (alike or good)[0].commands(path)
+    output = f"{Path(path).stem.strip('*?.') or 'run'}.fhz"
+    return [shlex.join(["fhash", "encode", path, "-o", output, "--var", "all", *words])]
+
+
+def _refused(others: Sequence[Listed]) -> list[str]:
+    """Lines that say what cannot be encoded, together where the reason is the same."""
+    reasons: dict[str, list[str]] = {}
+    for entry in others:
+        small = entry.problem.startswith(f"{len(entry.shape)} dimension")
+        reason = "too few dimensions" if small and len(entry.shape) < 2 else entry.problem
+        reasons.setdefault(reason, []).append(
+            f"{entry.name} {entry.shape}" if small else entry.name
+        )
+    lines = [f"not to be encoded: {listed(names)}: {why}" for why, names in reasons.items()]
+    left = len(lines) - MAX_PROBLEMS
+    return lines[:MAX_PROBLEMS] + ([f"and {left} more reasons; --json has all"] if left > 0 else [])
 
 
 def _dimension(name: str, length: int, axis: str) -> str:
@@ -280,19 +304,20 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
     Of RUN.fhz: variable, domain, features, quality, and the card of its model: settings, tables,
     network and occupancy, each with its place in the file, coding and bytes.
 
-    Of DATA, any source that `fhash encode` reads: the variables with shape, type, units and axes,
-    and the command that encodes each. The options but -v are those of `fhash encode`; --var and
-    --t choose what is told in detail. Of several variables in RUN.fhz, --var chooses one.
+    Of DATA, any source that `fhash encode` reads: the variables with type, dimensions and units,
+    and the command that encodes them; the exit code is 2 where nothing can be encoded. The options
+    but -v are those of `fhash encode`; --var and --t choose what is told in detail. Of several
+    variables in RUN.fhz, --var chooses one.
     """
     if not _is_run(path):
         from fhash_codec.progress import silent
         from fhash_formats.readers.joined import files_of, is_pattern
 
         found = source.list(path)
-        variables = [variable.as_dict(path) for variable in found]
         files = len(files_of(path)) if is_pattern(path) else 1
+        variables = [variable.as_dict(path) for variable in found]
         result = {"path": path, "files": files, "variables": variables}
-        text = listing(path, files, variables, named=source.var is not None)
+        text = listing(path, files, found, named=source.var is not None)
         readings = [(entry.name, words) for entry in found for words in entry.options]
         if len(readings) == 1 and (source.var is not None or source.t is not None):
             ((name, words),) = readings
@@ -300,7 +325,8 @@ def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> N
             with one.open(path, silent) as series:
                 result["series"] = details(series)
                 text += f"\n\n{table(details_rows(series))}"
-        emit(result, text, as_json)
+        missed = None if readings else InputError(f"{path} holds nothing that can be encoded")
+        emit(result, text, as_json, missed)
         return
     import fhash_codec
 
@@ -337,13 +363,18 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
 
 def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
-    from fhash_formats.container import is_container
     from fhash_formats.support.files import is_url
 
-    if is_url(path):
-        return True
     place = Path(path)
-    return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
+    if is_url(path) or place.suffix.lower() == ".fhz":
+        return True
+    with suppress(OSError), place.open("rb") as file:
+        if file.read(2) == b"PK":
+            # the import takes as long as most listings
+            from fhash_formats.container import is_container
+
+            return is_container(place)
+    return False
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:

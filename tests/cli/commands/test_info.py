@@ -12,6 +12,7 @@ import pytest
 from command_line import Fhash, Refused
 
 from fhash_cli.commands.info import listing
+from fhash_formats.readers.listing import Listed
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 
@@ -58,27 +59,61 @@ def test_the_card_names_every_part_with_its_place(fhash: Fhash, name: str, said:
     assert "\n  level " not in short
 
 
-def test_several_variables_go_into_one_file_unless_one_can_be_read_in_two_ways() -> None:
-    dimensions = [{"name": name, "length": 2, "axis": name} for name in "tzyx"]
-    variables = [
-        {
-            "name": name,
-            "dtype": "float32",
-            "stored": "",
-            "units": "",
-            "shape": [2, 2, 2, 2],
-            "missing": [],
-            "problem": "",
-            "dimensions": dimensions,
-            "commands": [f"fhash encode 'a b.nc' --var {name}"],
-        }
-        for name in "uv"
+def entry(name: str, *readings: str, missing: tuple[float, ...] = ()) -> Listed:
+    """A variable whose readings need these options."""
+    options = tuple(("--var", name, *each.split()) for each in readings)
+    problem = "" if readings else "1 dimensions (2,); 2 to 4 can be read"
+    shape = (2, 2) if readings else (2,)
+    kinds = (("time", "t"), ("x", "x"))[: len(shape)]
+    return Listed(
+        name=name,
+        shape=shape,
+        dtype="float32",
+        dimensions=kinds,
+        options=options,
+        missing=missing,
+        problem=problem,
+        output=f"{name}.fhz",
+    )
+
+
+def test_one_table_and_one_command_for_all_that_is_read_alike() -> None:
+    lines = listing("a b.nc", 3, [entry("u", ""), entry("w"), entry("v", "")]).splitlines()
+    assert lines == [
+        "a b.nc (3 files; shapes are of the first): 2 variables to encode",
+        "",
+        "variable  type     dimensions",
+        "u         float32  time=2 (t), x=2",
+        "v         float32  time=2 (t), x=2",
+        "",
+        "fhash encode 'a b.nc' -o 'a b.fhz' --var all",
+        "",
+        "not to be encoded: w (2,): too few dimensions",
     ]
-    line = "\nall in one file:\n  fhash encode 'a b.nc' -o 'a b.fhz' --var all"
-    assert listing("a b.nc", 1, variables).endswith(line)
-    assert "all in one file" not in listing("a b.nc", 1, variables[:1])
-    variables[0]["commands"] *= 2
-    assert "all in one file" not in listing("a b.nc", 1, variables)
+
+
+def test_what_differs_between_variables_has_a_column() -> None:
+    fills = (1e20, 1.00000002004e20, -9.0)
+    good = [entry("u", "--axes t,x", "--axes z,x"), entry("v", "--select m=0", missing=fills)]
+    lines = listing("a.nc", 1, good).splitlines()
+    assert lines[2:5] == [
+        "variable  type     dimensions       missing    needs",
+        "u         float32  time=2 (t), x=2             --axes t,x or --axes z,x",
+        "v         float32  time=2 (t), x=2  1e+20, -9  --select m=0",
+    ]
+    assert lines[6:] == ["fhash encode a.nc -o v.fhz --var v --select m=0"]
+    assert listing("a.nc", 1, good[:1]).splitlines()[5:] == [
+        "fhash encode a.nc -o u.fhz --var u --axes t,x",
+        "fhash encode a.nc -o u.fhz --var u --axes z,x",
+    ]
+
+
+def test_a_listing_is_for_one_screen() -> None:
+    many = [entry(f"v{n}", "") for n in range(100)] + [entry(f"w{n}") for n in range(100)]
+    text = listing("a.nc", 1, many)
+    assert text.count("\n") < 36
+    assert "and 76 more: v24, v25," in text
+    assert "not to be encoded: w0 (2,), w1 (2,)" in text
 
 
 PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
@@ -139,7 +174,8 @@ def test_info_of_data_lists_variables_and_their_commands(
 ) -> None:
     result = fhash("info", data)
     assert (result.exit_code, result.stderr) == (0, "")
-    assert "density: float32, time=3 (t), z=6, y=7, x=8, in kg m-3" in result.stdout
+    row = ["density", "float32", "time=3", "(t),", "z=6,", "y=7,", "x=8", "kg", "m-3"]
+    assert row in [line.split() for line in result.stdout.splitlines()]
     with h5py.File(tmp_path / "flow data.h5", "w") as file:
         file["flow"] = np.ones((16, 12, 12, 3), "f4")
         file["ensemble"] = np.ones((2, 3, 4, 5, 6), "f4")
@@ -166,6 +202,17 @@ def test_options_for_data_are_refused_for_a_run(refused: Refused, run: Path) -> 
     assert "--raw-values is for data" in refused(2, "info", run, "--raw-values")
 
 
+def test_data_of_which_nothing_can_be_encoded(fhash: Fhash, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["line"] = np.ones(4)
+    told = fhash("info", tmp_path / "a.h5")
+    assert (told.exit_code, told.stderr.count("\n")) == (2, 1)
+    assert "holds nothing that can be encoded" in told.stderr
+    assert "line (4,)" in told.stdout
+    result = json.loads(fhash("info", tmp_path / "a.h5", "--json").stdout)
+    assert (result["exit_code"], result["variables"][0]["name"]) == (2, "line")
+
+
 def several(path: Path) -> Path:
     with h5py.File(path, "w") as file:
         for number, name in enumerate(["u", "w"]):
@@ -185,7 +232,7 @@ def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
     result = fhash("info", path, "--var", "w", "--t", "1:3")
     assert (result.exit_code, result.stderr) == (0, "")
     for text in (
-        "w: float32, time=4 (t)",
+        "w         float32  time=4 (t)",
         "--var w --t 1:3",
         "t, z, y, x  2 x 3 x 2 x 5",
         "time 2001-02-03T06:00 to 2001-02-03T12:00",
@@ -193,7 +240,7 @@ def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
     ):
         assert text in result.stdout
     assert "speed u" not in result.stdout
-    assert "u: " not in result.stdout
+    assert "\nu " not in result.stdout
     parsed = json.loads(fhash("info", path, "--var", "w", "--json").stdout)
     assert [variable["name"] for variable in parsed["variables"]] == ["w"]
     assert parsed["series"]["coordinates"][0]["dates"] == ["2001-02-03", "2001-02-03T18:00"]
