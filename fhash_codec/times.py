@@ -192,6 +192,15 @@ def time_text(coordinate: Coordinate, time: float) -> str:
     return f"{number_text(coordinate, time)} {'' if units == '1' else units}".rstrip()
 
 
+def is_static(coordinate: Coordinate) -> bool:
+    """Whether a series is one volume without a time: its only step is at 0, in no units."""
+    return (
+        len(coordinate.values) == 1
+        and coordinate.values[0] == 0
+        and not coordinate.attributes.get("units")
+    )
+
+
 def number_text(coordinate: Coordinate, time: float) -> str:
     """A time as a number, with as many digits as tell neighbouring steps apart, at least 6."""
     gap = _gap(coordinate)

@@ -78,7 +78,7 @@ class Rays:
         half = float(np.tan(np.radians(camera.view_angle) / 2))
         narrow = float(np.sin(np.arctan(half * min(aspect, 1.0))))
         distance, parallel_half = radius / narrow, radius / min(aspect, 1.0)
-        if camera.view == AUTO and grid.flat:
+        if camera.view == AUTO and grid.thin is not None:
             parallel_half = _half_height(grid, view, aspect)
             thickness = float(np.abs(np.diff(grid.corners, axis=1)[:, 0] @ VIEWS[view][0]))
             distance = parallel_half / half + thickness / 2
@@ -160,14 +160,30 @@ class Rays:
 def view_of(name: str, grid: Grid) -> str:
     """The key of VIEWS that the name of a view stands for.
 
-    'auto' is 'iso', but the view along an axis of one vertex: the plane is seen from above.
+    'auto' is 'iso', but of a plane or a thin volume (`Grid.thin`) it is the view from above.
     """
     if name != AUTO:
         return name
-    for axis, view in ((2, "xy"), (1, "xz"), (0, "yz")):
-        if grid.counts[axis] == 1:
-            return view
-    return "iso"
+    return "iso" if grid.thin is None else ("yz", "xz", "xy")[grid.thin]
+
+
+USUAL_SIZE = 512
+"""Pixels of the longer side of a picture."""
+LEAST_SIZE = 128
+"""Pixels of the shorter side, at least."""
+
+
+def usual_size(camera: Camera, grid: Grid) -> tuple[int, int]:
+    """Pixels across and down where nobody says them: a plane seen from above fills its picture."""
+    view = view_of(camera.view, grid)
+    if camera.view != AUTO or not grid.flat or grid.counts.count(1) > 1:
+        return USUAL_SIZE, USUAL_SIZE
+    away, up = (np.abs(np.array(axis, dtype=np.float64)) for axis in VIEWS[view])
+    extent = np.abs(np.diff(grid.corners, axis=1)[:, 0])
+    sides = np.array([extent @ (1 - up - away), extent @ up])
+    # even, as films need them
+    across, down = np.maximum(2 * np.round(USUAL_SIZE / 2 * sides / sides.max()), LEAST_SIZE)
+    return int(across), int(down)
 
 
 def _half_height(grid: Grid, view: str, aspect: float) -> float:

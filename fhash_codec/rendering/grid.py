@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,9 @@ import numpy.typing as npt
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Coordinate
 from fhash_formats.support.arrays import Double
+
+if TYPE_CHECKING:
+    from fhash_codec.volume import Volume
 
 Vector = tuple[float, float, float]
 
@@ -47,6 +52,16 @@ PRESSURES = frozenset(
     {"pa", "hpa", "kpa", "mb", "mbar", "millibar", "millibars", "bar", "dbar", "decibar", "atm"}
 )
 """Units of pressure in lower case: CF takes an axis in such units for a vertical one."""
+
+
+NORTH = re.compile(r"degrees?_?(?:n|north)|degrees?_?(?P<east>e|east)", re.IGNORECASE)
+"""Units of latitudes and of longitudes (CF 1.11, sections 4.1 and 4.2)."""
+MAX_DEGREES = 1e4
+"""What is above it is a missing latitude or longitude."""
+THICK = 0.25
+"""Length of an axis in other units than the rest have, as a share of the longest one, at least."""
+THIN = 1 / 16
+"""Share of both other axes below which one is thin: the volume is seen along it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,7 +197,8 @@ def downward(coordinate: Coordinate) -> bool:
 def proportions(coords: Sequence[Coordinate], spacing: Double) -> Double:
     """Factors (3,) that draw vertices of axes in uncommon units as far apart as the others.
 
-    Axes in the commonest units keep their lengths. Where an axis has no units, all do.
+    Such an axis has at least THICK of the length of the longest other one. Axes in the commonest
+    units keep their lengths. Where an axis has no units, all do.
 
     Args:
         coords: of x, y, z.
@@ -198,8 +214,36 @@ def proportions(coords: Sequence[Coordinate], spacing: Double) -> Double:
     is_usual = np.array([unit == usual for unit in units])
     across = float(np.mean(spacing[extended & is_usual]))
     other = extended & ~is_usual
-    factors[other] = across / spacing[other]
+    counts = np.array([len(coordinate.values) for coordinate in coords])
+    longest = float(np.max((spacing * (counts - 1))[extended & is_usual]))
+    factors[other] = np.maximum(across, THICK * longest / (counts[other] - 1)) / spacing[other]
     return factors
+
+
+def northward(coords: Mapping[str, Coordinate], volume: Volume) -> dict[str, Coordinate]:
+    """Coordinates by axis for a curvilinear grid that is drawn with the north up and east right.
+
+    Along y or x without positions, vertices lie downwards or leftwards where two-dimensional
+    latitudes or longitudes descend.
+    """
+    found = dict(coords)
+    bare = [axis for axis in "yx" if len(coords[axis].values) > 1 and not coords[axis].attributes]
+    metadata = volume.metadata if bare else None
+    for each in () if metadata is None else metadata.variables:
+        match = NORTH.fullmatch(str(each.attributes.get("units", "")))
+        axis = "x" if match is not None and match["east"] else "y"
+        axes = [metadata.dimensions.get(name) for name in each.dimensions] if metadata else []
+        if match is None or axis not in bare or sorted(map(str, axes)) != ["x", "y"]:
+            continue
+        values = np.where(each.values < MAX_DEGREES, each.values, np.nan).astype(np.float64)
+        steps = [np.diff(values, axis=axes.index(name)) for name in (axis, "xy".strip(axis))]
+        if not all(np.isfinite(step).any() for step in steps):
+            continue
+        # half of all steps, so that a seam does not count
+        own, across = map(np.nanmedian, steps)
+        if own < 0 and -own > abs(across):
+            found[axis] = replace(coords[axis], attributes={"positive": "down"})
+    return found
 
 
 def _plain_units(coordinate: Coordinate) -> str:
@@ -247,6 +291,11 @@ class Grid:
     coarseness: Vector = (1.0, 1.0, 1.0)
 
     @classmethod
+    def of_volume(cls, volume: Volume, scale: Vector | None = None) -> Grid:
+        """The grid of a volume, `of` its coordinates; north is up on a curvilinear grid."""
+        return cls.of(northward(volume.coords, volume), scale)
+
+    @classmethod
     def of(cls, coords: Mapping[str, Coordinate], scale: Vector | None = None) -> Grid:
         """Make the grid of a volume's coordinates.
 
@@ -257,8 +306,7 @@ class Grid:
         Args:
             coords: by axis.
             scale: factors by which the axes are stretched. If None, axes have the lengths of their
-                coordinates, except an axis in other units than most have: its length cannot be
-                compared, so its vertices are drawn as far apart as those of the others.
+                coordinates, except an axis in other units than most have, see `proportions`.
 
         Raises InputError where axes have lengths too different to place rays.
         """
@@ -306,6 +354,16 @@ class Grid:
     def flat(self) -> bool:
         """Whether an axis has one vertex, so that a plane, a line or a point is drawn."""
         return 1 in self.counts
+
+    @property
+    def thin(self) -> int | None:
+        """The axis (0, 1 or 2) along which the volume is seen: of one vertex, or a thin one."""
+        lengths = np.abs(np.diff(self.corners, axis=1)[:, 0])
+        for axis in (2, 1, 0):
+            others = np.delete(lengths, axis)
+            if self.counts[axis] == 1 or lengths[axis] < THIN * others.min():
+                return axis
+        return None
 
     @property
     def thinnest(self) -> tuple[int, float]:

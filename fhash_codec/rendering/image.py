@@ -432,7 +432,12 @@ def _around(pen: Pen, layout: Layout, colours: ColourMap) -> list[Layer]:
 
 
 def time_text(step: float, time: float, coordinate: Coordinate) -> str:
-    """The time label: step and physical time, which is a date where the series has dates."""
+    """The time label: step and physical time, which is a date where the series has dates.
+
+    A volume without a time has none.
+    """
+    if times.is_static(coordinate):
+        return ""
     text = times.time_text(coordinate, time)
     if times.is_dated(coordinate):
         return f"step {step:g}   {text.replace('T', ' ')}"

@@ -345,7 +345,7 @@ def plan_picture(
     _check(scene)
     step = _step_of(volume, scene)
     units = Units.of(volume)
-    grid = Grid.of(volume.coords, scene.scale)
+    grid = Grid.of_volume(volume, scene.scale)
     function = _function(volume, scene, grid, histogram)
     _warn_of_unseen_surfaces(volume, scene)
     layout, rays = lay_out(

@@ -399,7 +399,8 @@ class Scene(Record):
     scale: Vector | None = limits(
         None,
         "factors by which the axes (x, y, z) are stretched; if left out, one in other units than "
-        "the rest has its vertices as far apart. The camera lives in the stretched coordinates",
+        "the rest has its vertices as far apart, or a quarter of the longest. The camera lives in "
+        "the stretched coordinates",
         low=1e-30,
         high=1e30,
     )

@@ -130,7 +130,7 @@ class Timeline:
         self._path = CameraPath(
             at=self._at,
             cameras=tuple(scene.camera for scene in self._scenes),
-            grid=Grid.of(volume.coords, scale),
+            grid=Grid.of_volume(volume, scale),
             size=self._scenes[0].size,
         )
         # The steps of the keys are checked in any case.

@@ -191,7 +191,7 @@ def _transfer_function(
         histogram=None,
     )
     if given.unit_distance is None:
-        points = raised(points, Grid.of(volume.coords, scene.scale).thinnest)
+        points = raised(points, Grid.of_volume(volume, scene.scale).thinnest)
     return TransferFunctionSpec(
         colours=_colours(filled, low, high),
         opacity=tuple((float(value), float(opacity)) for value, opacity in points),

@@ -153,6 +153,12 @@ class SceneOptions:
             _put(values, place.strip(), _json(text))
         if isinstance(values.get("time"), str):
             values["time"] = time_of(volume, values["time"])
+        if self.file is None and "size" not in self.places and 1 in volume.shape[1:]:
+            from fhash_codec.rendering.cameras import usual_size
+            from fhash_codec.rendering.grid import Grid
+
+            scene = Scene.from_dict(values)
+            values["size"] = usual_size(scene.camera, Grid.of_volume(volume, scene.scale))
         return Scene.from_dict(values)
 
 
@@ -209,7 +215,8 @@ SETTINGS = (
             " first"),
     Setting("--time", "time", "T", click.STRING, "a time instead of a step: a number, or a date"
             " such as 2001-02-10T06:00"),
-    Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 512x512]"),
+    Setting("--size", "size", kind=SIZE, help="pixels across and down.  [default: 512x512,"
+            " a map as its shape is]"),
     Setting("--view", "camera.view", "NAME"),
     Setting("--azimuth", "camera.azimuth", "DEGREES"),
     Setting("--elevation", "camera.elevation", "DEGREES"),
@@ -658,12 +665,12 @@ def command(
 ) -> None:
     """Draw RUN.fhz at one time; unless options say more, the file's features decide what is shown.
 
-    A volume with an axis of one vertex is drawn as an opaque plane, seen from above.
-    With --animate the output is NAME.png for numbered pictures, of which only missing ones are
+    A volume with an axis of one vertex is drawn as an opaque plane, seen from above as a thin one
+    is. With --animate the output is NAME.png for numbered pictures, of which only missing ones are
     drawn, or a film NAME.mp4 or NAME.gif.
     """
     from fhash_codec.rendering.renderer import Renderer
-    from fhash_codec.times import time_text
+    from fhash_codec.times import is_static, time_text
     from fhash_codec.volume import open as open_volume
 
     output = picture.output if picture.output is not None else Path(file_name(run)).stem + ".png"
@@ -687,7 +694,8 @@ def command(
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
         image = renderer.render(plan=plan, progress=progress)
-        time = time_text(volume.coords["t"], plan.time)
+        times = volume.coords["t"]
+        time = "" if is_static(times) else f"{plan.step:g}, t = {time_text(times, plan.time)}"
     paths = [str(written) for written in _save(image, path, picture)]
     result = {
         "paths": paths,
@@ -737,7 +745,8 @@ def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) 
     lines = [("written", path) for path in paths]
     if not explain:
         height, width = image.rgba.shape[:2]
-        lines += [("size", extent((width, height))), ("step", f"{plan.step:g}, t = {time}")]
+        lines.append(("size", extent((width, height))))
+        lines += [("step", time)] if time else []
     if Path(paths[-1]).suffix.lower() != ".png" and len(paths) == 1:
         lines.append(("scene", "not in a JPEG; --save-scene FILE.json keeps it"))
     lines.append(("seconds", number(image.seconds, digits=3)))

@@ -495,6 +495,8 @@ def test_the_text_of_a_time() -> None:
     def times(values: list[float], units: str) -> Coordinate:
         return Coordinate(name="time", values=np.array(values), attributes={"units": units})
 
+    assert time_text(0, 0.0, times([0], "")) == ""
+    assert time_text(0, 0.0, times([0], "s")) == "step 0   t = 0 s"
     assert time_text(3, 0.25, times([0, 0.25], "s")) == "step 3   t = 0.25 s"
     assert time_text(3.5, 1e-9, times([0, 2e-9], "")) == "step 3.5   t = 1e-09"
     late = times([347921.001, 347921.002], "s")

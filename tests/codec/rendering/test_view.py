@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
-from fhash_codec import Scene, Volume
+from fhash_codec import EncodeConfig, Scene, Volume, encode
+from fhash_codec import open as open_volume
 from fhash_codec.rendering import grid as module
-from fhash_codec.rendering.cameras import VIEWS, CameraPath, Rays, pchip
+from fhash_codec.rendering import render
+from fhash_codec.rendering.cameras import VIEWS, CameraPath, Rays, pchip, usual_size, view_of
 from fhash_codec.rendering.grid import Axis, Grid, downward, drawn_counts
 from fhash_codec.rendering.plan import plan_picture
 from fhash_codec.rendering.scenes import Camera, Clip
@@ -235,6 +239,67 @@ def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() ->
     given = in_units("m", scale=(1, 2, 0.01))
     np.testing.assert_allclose(given.spacing, [0.25, -1.5, 1.0])
     assert given.scale == (1, 2, 0.01)
+
+
+def test_an_axis_in_other_units_is_no_thinner_than_a_quarter() -> None:
+    units = {"x": "degrees_east", "y": "degrees_north", "z": "hPa"}
+    coords = {
+        axis: Coordinate(name=axis, values=np.arange(float(count)), attributes={"units": unit})
+        for (axis, unit), count in zip(units.items(), (41, 21, 3), strict=True)
+    }
+    np.testing.assert_allclose(Grid.of(coords).spacing, [1, 1, -5])
+
+
+@pytest.mark.parametrize(
+    ("axes", "view", "size"),
+    [
+        ({}, "iso", (512, 512)),
+        ({"z": [0]}, "xy", (512, 512)),
+        ({"z": [0], "y": range(3)}, "xy", (512, 128)),
+        ({"z": [0], "y": range(6)}, "xy", (512, 256)),
+        ({"x": [0], "y": range(6)}, "yz", (256, 512)),
+        ({"z": [0], "y": [0]}, "xy", (512, 512)),
+        ({"z": [0, 0.6]}, "xy", (512, 512)),
+        ({"y": [0, 0.3, 0.6]}, "xz", (512, 512)),
+        ({"y": [0, 0.3, 0.7]}, "iso", (512, 512)),
+    ],
+)
+def test_a_plane_or_a_thin_volume_is_seen_from_above(
+    axes: dict[str, Any], view: str, size: tuple[int, int]
+) -> None:
+    where = grid(**axes)
+    assert view_of("auto", where) == view
+    assert usual_size(Camera(), where) == size
+    assert usual_size(Camera(view="iso"), where) == (512, 512)
+    if view != "iso":
+        origins, directions = Rays.of(Camera(projection="parallel"), where, (8, 8)).pixels()
+        assert np.count_nonzero(directions[0, 0]) == 1
+        edge = np.abs(origins * where.spacing).max(axis=(0, 1))
+        assert edge.max() < 13  # the volume, 10 long, fills the picture
+
+
+def test_a_curvilinear_grid_has_its_north_up_and_its_east_right(tmp_path: Path) -> None:
+    north = np.linspace(-60, 60, 8)[:, None] + np.linspace(0, 3, 12)
+    east = np.linspace(355, 375, 12) % 360 + np.linspace(0, 1, 8)[:, None]
+    north[:, 3] = np.nan
+    values = np.random.default_rng(0).normal(size=(8, 12)).astype("f4")
+    pictures = []
+    for turn in (np.s_[:, :], np.s_[::-1, :], np.s_[:, ::-1]):
+        array = xr.DataArray(
+            values[turn],
+            dims=("j", "i"),
+            coords={
+                "lat": (("j", "i"), north[turn], {"units": "degrees_north"}),
+                "lon": (("j", "i"), east[turn], {"units": "degrees_east"}),
+            },
+            name="t",
+        )
+        encode(array, tmp_path / "a.fhz", EncodeConfig(max_error=0.0), force=True)
+        with open_volume(tmp_path / "a.fhz") as volume:
+            pictures.append(render(volume, Scene(size=(48, 32))).rgba)
+    for other in pictures[1:]:
+        np.testing.assert_allclose(other, pictures[0], atol=2e-3)
+    assert np.ptp(pictures[0]) > 0.5
 
 
 def test_coordinates_that_are_no_places_are_told() -> None:
