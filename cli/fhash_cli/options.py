@@ -122,8 +122,6 @@ class IntervalsType(TextType):
         if len(ends) > 2:
             raise ValueError(f"'{part}' has more than two ends")
         low, high = (_position(end) for end in ends)
-        if low is not None and high is not None and low > high:
-            raise ValueError(f"'{part}' ends before it begins")
         return low, high
 
 
@@ -458,6 +456,7 @@ class SourceOptions:
     raw_values: bool = False
     keep_extremes: bool = False
     no_external: bool = False
+    overlap: str | None = None
 
     @property
     def part(self) -> bool:
@@ -519,6 +518,7 @@ class SourceOptions:
             "raw_values": self.raw_values,
             "select": dict(self.select),
             "no_external": self.no_external,
+            "overlap": self.overlap,
         }
 
 
@@ -557,6 +557,11 @@ series_options = option_group(
         "--no-external",
         is_flag=True,
         help="Read no file outside the folder of DATA, whatever a header or a link in it names.",
+    ),
+    click.option(
+        "--overlap",
+        type=click.Choice(["first", "last"]),
+        help="Which of the files of a pattern counts where several have the same time.",
     ),
     click.option(
         "--axes",

@@ -87,8 +87,26 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     import numpy as np
 
     positions = volume.coords[axis].values
+    degrees = axis == "x" and str(volume.coords[axis].attributes.get("units")).startswith("degree")
+    if degrees:
+        from fhash_codec.rendering.grid import unwrapped
+
+        positions = unwrapped(positions)
     first, last = float(positions.min()), float(positions.max())
     start, end = first if low is None else low, last if high is None else high
+    if degrees and low is not None and not first <= start <= last:
+        start, end = (each + 360 * np.ceil((first - start) / 360) for each in (start, end))
+    if degrees and end < start:
+        end += 360
+    if degrees and first <= start <= last < end and first <= end - 360 <= last:
+        raise RegionError(
+            f"--box along {axis} is {start:.12g}:{end:.12g}, across the seam of the longitudes;"
+            f" take two boxes, {start:.12g}:{last:.12g} and {first:.12g}:{end - 360:.12g}"
+        )
+    if end < start:
+        raise RegionError(
+            f"--box along {axis} is {start:.12g}:{end:.12g}: it ends before it begins"
+        )
     if not first <= start <= last or not first <= end <= last:
         raise RegionError(
             f"--box along {axis} is {start:.12g}:{end:.12g};"

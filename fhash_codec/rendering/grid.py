@@ -57,7 +57,7 @@ PRESSURES = frozenset(
 NORTH = re.compile(r"degrees?_?(?:n|north)|degrees?_?(?P<east>e|east)", re.IGNORECASE)
 """Units of latitudes and of longitudes (CF 1.11, sections 4.1 and 4.2)."""
 MAX_DEGREES = 1e4
-"""What is above it is a missing latitude or longitude."""
+"""Degrees above which a latitude or longitude is a missing one."""
 THICK = 0.25
 """Length of an axis in other units than the rest have, as a share of the longest one, at least."""
 THIN = 1 / 16
@@ -110,7 +110,7 @@ class Axis:
         if not np.all(np.abs(values) <= MAX_POSITION):
             return cls._unplaced(len(values), "are no positions along a line")
         if str(coordinate.attributes.get("units", "")).lower().startswith("degree"):
-            values = _unwrapped(values)
+            values = unwrapped(values)
         extent = float(values[-1] - values[0])
         if abs(extent) < 1 / MAX_POSITION:
             return cls._unplaced(len(values), "are no positions along a line")
@@ -252,7 +252,7 @@ def _plain_units(coordinate: Coordinate) -> str:
     return "degrees" if units.lower().startswith("degree") else units
 
 
-def _unwrapped(degrees: Double) -> Double:
+def unwrapped(degrees: Double) -> Double:
     """Longitudes without their jump by 360 degrees; others as they are."""
     steps = np.abs(np.diff(degrees))
     return np.unwrap(degrees, period=360.0) if np.any(np.abs(steps - 360) < 180) else degrees

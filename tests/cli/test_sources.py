@@ -158,6 +158,7 @@ REGIONS = [
     (["--box", "-5:1"], "is -5:1; the domain has positions 0 to 2.5"),
     (["--roi", ":,:,:", "--box", ":,:,:"], "exclude"),
     (["--box", "0:2.6,:,:"], "positions 0 to 2.5"),
+    (["--box", "2:1,:,:"], "ends before it begins"),
     (["--box", "0.6:0.9,:,:"], "no vertex"),
     (["--outside", "zero"], "--outside"),
     (["--dtype", "uint8"], "--outside background"),

@@ -278,8 +278,13 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         help="A surface; may be repeated.",
     ),
     click.option("--no-volume", is_flag=True, help="Surfaces alone."),
-    click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy."),
-    click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy."),
+    click.option(
+        "--buffer",
+        "buffers",
+        metavar="NAME",
+        multiple=True,
+        help="Write depth or normal too, as NAME.depth.npy; repeat for both.",
+    ),
     click.option(
         "--set",
         "settings",
@@ -305,9 +310,8 @@ def scene_options(command: Command) -> Command:
             given["features"] = features
         if (box := given.get("effects.clip")) is not None:
             given["effects.clip"] = _clip(box)
-        buffers = [name for name in ("depth", "normal") if values.pop(name)]
-        if buffers:
-            given["effects.buffers"] = buffers
+        if buffers := values.pop("buffers"):
+            given["effects.buffers"] = list(buffers)
         if values.pop("no_volume"):
             given["transfer_function.nothing"] = True
         if "step" in given and "time" in given:

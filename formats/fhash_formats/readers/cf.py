@@ -551,26 +551,36 @@ def _is_replaced(variable: SourceVariable | None) -> bool:
     return not _decodable(attributes) and in_days(values.tolist(), attributes) is not None
 
 
-def join_times(source: str, parts: Parts) -> Coordinate:
-    """The times of files one after the other, counted as in the first.
+def counted_times(source: str, parts: Parts) -> list[npt.NDArray[np.float64]]:
+    """The times of each file, counted as in the first.
 
     Files may count since different dates and in different units, in one calendar. Raises InputError
-    for times that cannot be compared, that do not increase, or that float64 cannot hold as counted
-    in the first file.
+    for times that cannot be compared.
     """
     first_path, first = parts[0]
-    values = [
+    return [
         time.values
         if _units(time) == _units(first)
         else _converted(source, path, time, first_path, first)
         for path, time in parts
     ]
+
+
+def join_times(source: str, parts: Parts) -> Coordinate:
+    """The times of files one after the other, counted as in the first; see `counted_times`.
+
+    Raises InputError for times that do not increase, or that float64 cannot hold as counted in the
+    first file.
+    """
+    first = parts[0][1]
+    values = counted_times(source, parts)
     ends = zip(values, (path for path, _ in parts), strict=True)
     for (before, path), (after, next_path) in pairwise(ends):
         if not before[-1] < after[0]:
             passed = f"{after[0]:g} in {next_path} after {before[-1]:g} in {path}"
+            advice = "; --overlap first or last says which counts" if before[0] < after[-1] else ""
             raise InputError(
-                f"{source}: times do not increase in the order of the file names: {passed}"
+                f"{source}: times do not increase in the order of the file names: {passed}{advice}"
             )
     joined = np.concatenate(values)
     _check_exact(source, parts, joined)

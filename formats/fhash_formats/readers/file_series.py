@@ -155,6 +155,7 @@ class Request:
         keep_extremes: extreme values that repeat are data, see `Series`.
         digested: the digest of the file is taken where its metadata are asked for.
         no_external: no file outside the folder of the one that is read may be read for it.
+        overlap: "first" or "last", which file of a pattern counts where several have the same time.
         asked: a last dimension that may hold components is asked about; else it is x.
     """
 
@@ -169,6 +170,7 @@ class Request:
     asked: bool = True
     digested: bool = True
     no_external: bool = False
+    overlap: str | None = None
 
     def require_inside(self, path: Path, *files: Path) -> None:
         """Raise InputError if a file refers to others that may not be read; see `no_external`."""

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.cf import is_numbered, join_times
+from fhash_formats.readers.cf import counted_times, is_numbered, join_times
 from fhash_formats.readers.file_series import FileSeries, FolderStamp, Stamp
 from fhash_formats.readers.surroundings import warn_left_out
 from fhash_formats.series import (
@@ -258,11 +258,11 @@ def warn_of_gaps(pattern: str, paths: Sequence[Path]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """State of one file when the series was opened."""
+    """State of one file when the series was opened: its steps, of which some may count."""
 
     path: Path
     stamps: tuple[Stamp | FolderStamp, ...]
-    steps: int
+    steps: range
     time: Coordinate | None
 
     def check(self) -> None:
@@ -278,7 +278,8 @@ class JoinedSeries(Series):
     the files if they give them, counted as in the first one, and must then increase from file to
     file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
 
-    times: of all steps, in place of those of the files.
+    times: of all steps, in place of those of the files. overlap: where files have the same span of
+    time, the "first" or the "last" file counts; None refuses such files.
     """
 
     def __init__(
@@ -288,6 +289,7 @@ class JoinedSeries(Series):
         open_part: Callable[[Path], FileSeries],
         *,
         times: Coordinate | None = None,
+        overlap: str | None = None,
     ) -> None:
         self.source = pattern
         self._open_part = open_part
@@ -296,7 +298,7 @@ class JoinedSeries(Series):
         names: list[str] = []
         counted = True
         files: list[Path] = []
-        shares: list[npt.NDArray[np.float64]] = []
+        shares: dict[Path, npt.NDArray[np.float64]] = {}
         never: NotStored | None = None
         first: Series | None = None
         for path in paths:
@@ -305,11 +307,11 @@ class JoinedSeries(Series):
                 _check_alike(part, path, first, paths[0])
                 time = part.coords["t"] if "t" in part.given else None
                 self._parts.append(
-                    _Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time)
+                    _Part(path=path, stamps=part.stamps, steps=range(part.shape[0]), time=time)
                 )
                 never = never or part.not_stored
                 told = part.not_stored
-                shares.append(np.zeros(part.shape[0]) if told is None else told.shares)
+                shares[path] = np.zeros(part.shape[0]) if told is None else told.shares
                 names.append(part.name)
                 self.remark = self.remark or part.remark
                 counted = counted and not is_numbered(part.remark)
@@ -318,13 +320,18 @@ class JoinedSeries(Series):
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self.inherit(first)
+        if overlap is not None:
+            if not counted:
+                raise InputError(f"{pattern}: --overlap is for files with times; some count steps")
+            self._parts = _without_overlap(pattern, self._parts, overlap)
         if never is not None:
-            self.not_stored = replace(never, shares=np.concatenate(shares))
+            cut = [shares[part.path][list(part.steps)] for part in self._parts]
+            self.not_stored = replace(never, shares=np.concatenate(cut))
         self._met = set(first.occurring)
         self.occurring = self._met
         self._defaults = set(first.defaults)
         self.defaults = self._defaults
-        self._ends = list(accumulate(part.steps for part in self._parts))
+        self._ends = list(accumulate(len(part.steps) for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times(counted)}
         self.metadata = self._joined_metadata
@@ -336,7 +343,7 @@ class JoinedSeries(Series):
             self.close()
             self._current = (number, self._reopened(self._parts[number]))
         part = self._current[1]
-        frame = part.read(step - (self._ends[number] - self._parts[number].steps))
+        frame = part.read(self._parts[number].steps[step - self._ends[number]])
         self._met.update(part.occurring)
         self._defaults.update(part.defaults)
         return frame
@@ -372,14 +379,15 @@ class JoinedSeries(Series):
                     if number:
                         warnings.simplefilter("ignore")  # it was said of the first file
                     metadata = series.metadata
-                yield metadata
+                cut = metadata is not None and len(part.steps) < series.shape[0]
+                yield metadata.cut({"t": part.steps}) if metadata and cut else metadata
 
         return joined_metadata(self.source, each(), self.coords["t"])
 
     def _times(self, counted: bool) -> Coordinate:
         """The times of all files; the numbers of the steps unless all files count theirs."""
         times = [(part.path, part.time) for part in self._parts if part.time is not None]
-        if not times and all(part.steps == 1 for part in self._parts):
+        if not times and all(len(part.steps) == 1 for part in self._parts):
             warn_of_gaps(self.source, [part.path for part in self._parts])
         if not times or not counted:
             return index_coordinate("t", self.shape[0])
@@ -389,6 +397,39 @@ class JoinedSeries(Series):
                     f"{self.source}: {part.path} has no time, and {times[0][0]} has one"
                 )
         return join_times(self.source, times)
+
+
+def _without_overlap(source: str, parts: Sequence[_Part], overlap: str) -> list[_Part]:
+    """Files with the steps that count where several have the same span of time.
+
+    A file of which no step counts is left out. Raises InputError where a file has no times, or its
+    own do not increase.
+    """
+    timed = [(part.path, part.time) for part in parts if part.time is not None]
+    if len(timed) < len(parts):
+        raise InputError(f"{source}: --overlap is for files with times; some have none")
+    values = counted_times(source, timed)
+    for each, (path, _) in zip(values, timed, strict=True):
+        if not (np.isfinite(each).all() and (np.diff(each) > 0).all()):
+            raise InputError(f"{source}: times do not increase in {path}")
+    kept: dict[int, range] = {}
+    if overlap == "first":
+        end = -np.inf
+        for number, each in enumerate(values):
+            kept[number] = range(int(np.searchsorted(each, end, "right")), len(each))
+            end = max(end, each[-1])
+    else:
+        begin = np.inf
+        for number, each in reversed(list(enumerate(values))):
+            kept[number] = range(int(np.searchsorted(each, begin, "left")))
+            begin = min(begin, each[0])
+    found = []
+    for number, part in enumerate(parts):
+        steps, (_, time) = kept[number], timed[number]
+        if steps:
+            time = replace(time, values=time.values[steps.start : steps.stop])
+            found.append(replace(part, steps=steps, time=time))
+    return found
 
 
 def _common_name(names: Sequence[str]) -> str:

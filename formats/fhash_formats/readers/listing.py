@@ -246,6 +246,8 @@ def _given(request: Request) -> tuple[str, ...]:
             words += ["--endian", raw.endian]
     if request.raw_values:
         words.append("--raw-values")
+    if request.overlap is not None:
+        words += ["--overlap", request.overlap]
     for value in request.missing:
         words += ["--missing", repr(value)]
     return tuple(words)

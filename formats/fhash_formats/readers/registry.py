@@ -129,6 +129,7 @@ class Wishes(TypedDict, total=False):
     select: Mapping[str, int | str] | None
     keep_extremes: bool
     no_external: bool
+    overlap: str | None
 
 
 def _request(
@@ -170,6 +171,8 @@ def open_series(
         no_external: whether no file outside the folder of the one that is read may be read for it:
             data behind a header, external links, sources of virtual datasets, pieces of a grid,
             links of the file system. For a service that encodes what others upload.
+        overlap: of files that have the same span of time, as restarts write them, the steps of the
+            "first" or of the "last" file count; None refuses them.
 
     Warns (FhashWarning) of values that nobody wrote, such as chunks that are not there. Raises
     MissingInputError, InputError for an unsuitable input, and MissingDependencyError that names
@@ -234,6 +237,8 @@ def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
     if not is_pattern(text):
+        if request.overlap is not None:
+            raise InputError(f"{path}: --overlap is for a pattern of files")
         return _open_one(Path(path), request)
     files = files_of(text)
     if all(tiff.matches(b"", file) for file in files):
@@ -241,7 +246,9 @@ def open_whole(path: str | Path, request: Request) -> Series:
         if pages is not None:
             warn_of_gaps(text, files)
             return open_selected(pages, request)
-    return JoinedSeries(text, files, lambda file: _open_of_pattern(file, request))
+    return JoinedSeries(
+        text, files, lambda file: _open_of_pattern(file, request), overlap=request.overlap
+    )
 
 
 def _open_of_pattern(path: Path, request: Request) -> FileSeries:

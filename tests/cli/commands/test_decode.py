@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+import xarray as xr
 from command_line import Fhash, Refused
 
 import fhash_codec
@@ -341,3 +342,40 @@ def test_figures_and_files_of_integers_far_from_zero_are_exact(
         if not more:
             assert (found == values).all()
             assert report["mean"] == 2**64 - 480
+
+
+@pytest.mark.parametrize(
+    ("longitudes", "box", "chosen"),
+    [
+        (np.arange(300.0, 420, 2) % 360, "350:20", slice(25, 41)),
+        (np.arange(300.0, 420, 2) % 360, "-10:20", slice(25, 41)),
+        (np.arange(300.0, 420, 2) % 360, "350:380", slice(25, 41)),
+        (np.arange(300.0, 420, 2) % 360, "350:", slice(25, 60)),
+        (np.arange(-179.0, 180, 2), "350:2", slice(85, 91)),
+        (np.arange(1.0, 360, 2), "-340:-330", slice(10, 15)),
+        (np.arange(1.0, 360, 2), "-10:20", "two boxes, 350:359 and 1:20"),
+        (np.arange(1.0, 360, 2), "350:20", "two boxes, 350:359 and 1:20"),
+        (np.arange(10.0, 60, 2), "350:20", "positions 10 to 58"),
+    ],
+)
+def test_a_box_of_longitudes(
+    fhash: Fhash, tmp_path: Path, longitudes: np.ndarray, box: str, chosen: slice | str
+) -> None:
+    values = np.arange(longitudes.size, dtype="f4") + np.zeros((3, 1), "f4")
+    xr.DataArray(
+        values,
+        dims=("lat", "lon"),
+        coords={
+            "lat": ("lat", [0.0, 1, 2], {"units": "degrees_north"}),
+            "lon": ("lon", longitudes, {"units": "degrees_east"}),
+        },
+        name="v",
+    ).to_netcdf(tmp_path / "a.nc")
+    words = ["--max-error", "0", "--quiet"]
+    assert fhash("encode", tmp_path / "a.nc", "-o", tmp_path / "a.fhz", *words).exit_code == 0
+    out = tmp_path / "a.npy"
+    done = fhash("decode", tmp_path / "a.fhz", "-o", out, "--box", f":,:,{box}", "--quiet")
+    if isinstance(chosen, str):
+        assert (done.exit_code, chosen in done.stderr) == (2, True)
+    else:
+        np.testing.assert_array_equal(np.load(out)[0, 0], values[:, chosen])

@@ -267,7 +267,17 @@ def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Pat
         run,
         "-o",
         tmp_path / "v.png",
-        *["--size", "24x20", "--depth", "--normal", "--json", "--opacity", "5:0,6:0.9"],
+        *[
+            "--size",
+            "24x20",
+            "--buffer",
+            "depth",
+            "--buffer",
+            "normal",
+            "--json",
+            "--opacity",
+            "5:0,6:0.9",
+        ],
     )
     assert result.exit_code == 0, result.stderr
     names = [Path(path).name for path in json.loads(result.stdout)["paths"]]
@@ -293,7 +303,7 @@ def test_without_a_name_the_picture_is_called_as_the_run(
         (["--march", "gpu"], "allowed: auto"),
         (["--opacity", "0:0,99:0"], "shows nothing"),
         (["--gradient-opacity", "0.1"], "points [gradient, factor 0..1]"),
-        (["--clip-box", "1:0,:,:"], "'1:0' ends before it begins"),
+        (["--clip-box", "1:0,:,:"], "the first end must be below the second"),
         (["--clip-plane", "0,0,1"], "neither a normal and an offset"),
         (
             ["--effect", "minimum-intensity", "--set", "effects.maximum_intensity=true"],

@@ -591,6 +591,47 @@ def test_times_of_the_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("overlap", "steps", "times"),
+    [
+        ("first", [0, 1, 2, 5, 7], [0, 1, 2, 3, 4]),
+        ("last", [0, 3, 4, 6, 7], [0, 1, 2, 3, 4]),
+    ],
+)
+def test_files_of_a_restart_overlap(
+    tmp_path: Path, overlap: str, steps: list[int], times: list[float]
+) -> None:
+    frames_of = np.arange(8.0)[:, None, None, None] * np.ones((1, 2, 3, 4))
+    spans = {"0": [0.0, 1, 2], "1": [24.0, 48, 72], "2": [3.0, 4]}
+    units = {"0": "days since 2001-01-01", "1": "hours since 2001-01-01"}
+    first = 0
+    for name, hours in spans.items():
+        xr.Dataset(
+            {"v": (("time", "z", "y", "x"), frames_of[first : first + len(hours)])},
+            coords={"time": ("time", hours, {"units": units.get(name, units["0"])})},
+        ).assign(dt=("time", np.arange(first, first + len(hours)) * 0.5)).to_netcdf(
+            tmp_path / f"r{name}.nc"
+        )
+        first += len(hours)
+    pattern = tmp_path / "r*.nc"
+    with pytest.raises(InputError, match="--overlap first or last"):
+        open_series(pattern, var="v")
+    with open_series(pattern, var="v", overlap=overlap) as series:
+        assert [frame[0, 0, 0] for frame in series.frames()] == steps
+        assert series.coords["t"].values.tolist() == times
+        beside = series.metadata.named("dt")
+        assert beside.values.tolist() == [0.5 * step for step in steps]
+
+
+def test_what_cannot_overlap(tmp_path: Path) -> None:
+    for name in "01":
+        np.save(tmp_path / f"{name}.npy", VALUES_JOINED)
+    with pytest.raises(InputError, match="overlap is for files with times"):
+        open_series(tmp_path / "*.npy", overlap="last")
+    with pytest.raises(InputError, match="overlap is for a pattern"):
+        open_series(tmp_path / "0.npy", overlap="last")
+
+
+@pytest.mark.parametrize(
     ("other", "words"),
     [
         (VALUES_JOINED[:, :2], r"a frame \(z, y, x\) of shape \(2, 5, 6\), .*a_1.npy \(3, 5, 6\)"),
