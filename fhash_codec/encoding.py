@@ -32,6 +32,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.header import RESIDUAL, TRANSFORM_FEATURE
 from fhash_formats.errors import FhashWarning, InputError, QualityError
+from fhash_formats.readers.labelled import fields_of, labelled_series
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.series import AXES, ArraySeries, Series, index_coordinate, shown_name
@@ -380,7 +381,7 @@ def encode_dataset(
     variable makes a file of several as well; `encode` makes the file of one.
 
     source: a file, or sources of `encode` by name, such as a dict of arrays or an xarray.Dataset,
-        of which arrays of numbers with 3 dimensions and more are variables.
+        of which arrays of numbers with 3 dimensions and more are variables, or its maps.
     config: the settings of all, or of each by name; the defaults where a name is not in it.
     variables: names of those to encode, in this order. All by default: of a file those that
         `fhash info` says a command for without `--select` and the like.
@@ -446,7 +447,10 @@ class _Sources:
     @contextmanager
     def opened(self, name: str) -> Iterator[Series]:
         """The series of a variable, closed at the end of the context where it was opened here."""
-        if isinstance(self._source, Mapping):
+        dataset: Any = self._source
+        if hasattr(dataset, "data_vars"):
+            yield labelled_series(dataset, name)  # with all that lies beside it there
+        elif isinstance(self._source, Mapping):
             try:
                 source = self._source[name]
             except KeyError:
@@ -456,9 +460,9 @@ class _Sources:
                 if not isinstance(source, Series | str | Path):
                     series.name = shown_name(name, [each.name for each in series.coords.values()])
                 yield series
-            return
-        with (self._open or self._open_file)(name) as series:
-            yield series
+        else:
+            with (self._open or self._open_file)(name) as series:
+                yield series
 
     def _open_file(self, name: str) -> Series:
         assert isinstance(self._source, str | Path)
@@ -534,8 +538,7 @@ def _all_variables(source: str | Path | Mapping[str, Source]) -> list[str]:
     if isinstance(source, str | Path):
         names = encodable(list_variables(source))
     elif hasattr(source, "data_vars"):
-        arrays = source.data_vars.items()
-        names = [str(name) for name, a in arrays if a.ndim >= 3 and a.dtype.kind in "iuf"]
+        names = [str(name) for name in fields_of(source)]
     else:
         names = [str(name) for name in source]
     if not names:

@@ -586,3 +586,22 @@ def test_a_file_and_its_dataset_give_the_same_bytes(tmp_path, kind: str, form: s
             fhash_codec.encode(series, tmp_path / f"{name}.fhz", QUICK)
         same = (tmp_path / f"{name}.fhz").read_bytes() == (tmp_path / "path.fhz").read_bytes()
         assert same, name
+
+
+def test_a_file_and_its_dataset_of_two_variables_give_the_same_bytes(tmp_path) -> None:
+    times = ("time", [0.0, 1.0], {"units": "s", "bounds": "time_bnds"})
+    made = xr.Dataset(
+        {
+            "u": (("time", "y", "x"), np.random.default_rng(0).normal(size=(2, 8, 9))),
+            "v": (("time", "y", "x"), np.random.default_rng(1).normal(size=(2, 8, 9))),
+            "time_bnds": (("time", "ends"), [[0.0, 1.0], [1.0, 2.0]]),
+            "area": (("y", "x"), np.ones((8, 9)), {"units": "m2"}),
+        },
+        coords={"time": times},
+        attrs={"title": "two"},
+    )
+    made.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    fhash_codec.encode_dataset(tmp_path / "a.nc", tmp_path / "path.fhz", QUICK)
+    with xr.open_dataset(tmp_path / "a.nc", decode_times=False) as data:
+        fhash_codec.encode_dataset(data, tmp_path / "data.fhz", QUICK)
+    assert (tmp_path / "path.fhz").read_bytes() == (tmp_path / "data.fhz").read_bytes()

@@ -139,15 +139,20 @@ def labelled_series(source: xr.DataArray | xr.Dataset, variable: Hashable = None
     return series
 
 
-def _only(dataset: xr.Dataset) -> Hashable:
-    """The only variable of a dataset that can be encoded; raises InputError otherwise."""
+def fields_of(dataset: xr.Dataset) -> list[Hashable]:
+    """The variables of a dataset that can be encoded: maps only where there is nothing larger."""
     bounds = {array.attrs.get("bounds") for array in dataset.variables.values()}
     found = {
         name: array.ndim
         for name, array in dataset.data_vars.items()
         if array.ndim >= MIN_DIMENSIONS and array.dtype.kind in "iuf" and name not in bounds
     }
-    fitting = [name for name, count in found.items() if count >= FIELD_DIMENSIONS] or [*found]
+    return [name for name, count in found.items() if count >= FIELD_DIMENSIONS] or [*found]
+
+
+def _only(dataset: xr.Dataset) -> Hashable:
+    """The only variable of a dataset that can be encoded; raises InputError otherwise."""
+    fitting = fields_of(dataset)
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:
