@@ -32,7 +32,7 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.container.header import RESIDUAL, TRANSFORM_FEATURE
 from fhash_formats.errors import FhashWarning, InputError, QualityError
-from fhash_formats.readers.labelled import fields_of, labelled_series
+from fhash_formats.readers.labelled import labelled_series, list_dataset
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.registry import list_variables, open_series
 from fhash_formats.series import AXES, ArraySeries, Series, index_coordinate, shown_name
@@ -381,7 +381,7 @@ def encode_dataset(
     variable makes a file of several as well; `encode` makes the file of one.
 
     source: a file, or sources of `encode` by name, such as a dict of arrays or an xarray.Dataset,
-        of which arrays of numbers with 3 dimensions and more are variables, or its maps.
+        of which those are variables that `fhash info` would list for its file.
     config: the settings of all, or of each by name; the defaults where a name is not in it.
     variables: names of those to encode, in this order. All by default: of a file those that
         `fhash info` says a command for without `--select` and the like.
@@ -481,6 +481,8 @@ def _encoded(
     with recording() as clock, _named(name), sources.opened(name) as series:
         encoded = encode_variable(writer, series, config, None, path, progress)
         writer.finish(encoded.header)
+        if not writer.attributes and series.metadata is not None:
+            writer.attributes = json_attributes(series.metadata.attributes)
     return encoded, clock.to_list()
 
 
@@ -538,7 +540,8 @@ def _all_variables(source: str | Path | Mapping[str, Source]) -> list[str]:
     if isinstance(source, str | Path):
         names = encodable(list_variables(source))
     elif hasattr(source, "data_vars"):
-        names = [str(name) for name in fields_of(source)]
+        dataset: Any = source
+        names = encodable(list_dataset(dataset))
     else:
         names = [str(name) for name in source]
     if not names:

@@ -14,6 +14,7 @@ from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.file_series import FileSeries, Request, condense
 from fhash_formats.readers.hdf5 import default_fill, says_netcdf
 from fhash_formats.readers.layout import must_select, single
+from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.netcdf3 import matches as is_classic
 from fhash_formats.readers.registry import HEAD_BYTES
 from fhash_formats.readers.select import Selection
@@ -139,20 +140,25 @@ def labelled_series(source: xr.DataArray | xr.Dataset, variable: Hashable = None
     return series
 
 
-def fields_of(dataset: xr.Dataset) -> list[Hashable]:
-    """The variables of a dataset that can be encoded: maps only where there is nothing larger."""
+def list_dataset(dataset: xr.Dataset) -> list[Listed]:
+    """The variables of a Dataset in its order, as `list_variables` gives those of a file."""
+    order = [str(name) for name in dataset.data_vars]
+    if not order:
+        return []
+    opened = replace(_source(dataset[order[0]], dataset, order[0]), only="", name="the dataset")
+    found = {each.name: each for each in Selection(opened, Request()).listed()}
+    return [found[name] for name in order if name in found]
+
+
+def _only(dataset: xr.Dataset) -> Hashable:
+    """The only variable of a dataset that can be encoded; raises InputError otherwise."""
     bounds = {array.attrs.get("bounds") for array in dataset.variables.values()}
     found = {
         name: array.ndim
         for name, array in dataset.data_vars.items()
         if array.ndim >= MIN_DIMENSIONS and array.dtype.kind in "iuf" and name not in bounds
     }
-    return [name for name, count in found.items() if count >= FIELD_DIMENSIONS] or [*found]
-
-
-def _only(dataset: xr.Dataset) -> Hashable:
-    """The only variable of a dataset that can be encoded; raises InputError otherwise."""
-    fitting = fields_of(dataset)
+    fitting = [name for name, count in found.items() if count >= FIELD_DIMENSIONS] or [*found]
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:

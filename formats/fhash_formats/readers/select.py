@@ -55,8 +55,10 @@ from fhash_formats.readers.surroundings import (
     MAX_ARRAYS,
     Arranged,
     Wanted,
+    is_small,
     metadata_of,
     named_dimensions,
+    size_of,
     warn_left_out,
 )
 from fhash_formats.readers.variables import (
@@ -102,7 +104,10 @@ class Selection:
             replace(each, auxiliary=each.name in self._auxiliary) for each in opened.variables
         ]
         found = join(expand(marked), self.attributes)
-        fields = any(len(each.shape) > 2 for each in series_like(found))
+        fields = max(
+            (size_of(each.shape, each.dtype) for each in series_like(found) if len(each.shape) > 2),
+            default=0,
+        )
         self.variables = [
             replace(each, note=self._no_map(each, fields)) if len(each.shape) == 2 else each
             for each in found
@@ -133,16 +138,19 @@ class Selection:
             found |= {arrays[name].name for name in names if name in arrays}
         return found
 
-    def _no_map(self, variable: Variable, fields: bool) -> str:
+    def _no_map(self, variable: Variable, fields: int) -> str:
         """Why an array of two dimensions is no map that anybody meant, "" if it is one.
 
-        fields: whether there are arrays of three and more; other arrays are then their tables.
+        fields: bytes of the largest array of three and more, beside which maps are small, and
+            other arrays are tables; 0 without any.
         """
         roles = [
             None if each is None else self._role(each, variable) for each in variable.dimensions
         ]
         if set(roles) == {"y", "x"}:
-            return ""
+            small = self.opened.naming and is_small(size_of(variable.shape, variable.dtype), fields)
+            told = f"a map that is kept beside the others; --var {variable.name} encodes it"
+            return told if fields and small else ""
         if fields or not {*roles} <= {"y", "x", None}:
             return (
                 f"2 dimensions {variable.shape} that are no y and x; --var {variable.name} reads it"

@@ -133,11 +133,11 @@ def surroundings(
     names = _named(wanted, own, variables, attributes)
     for name, is_coordinate in names.items():
         found.add(name, is_coordinate)
-    limit = max(_size(own.shape, own.dtype), SMALL * SMALL_BYTES)
+    whole = size_of(own.shape, own.dtype)
     for name, other in variables.items():
         if name in names or set(own.names) <= set(other.names):
             continue  # another field can be encoded itself
-        if SMALL * _size(other.shape, other.dtype) < limit:
+        if is_small(size_of(other.shape, other.dtype), whole):
             found.add(name, False)
         elif len(other.shape) < FIELD_DIMENSIONS:
             left_out[name] = "large, and nothing refers to it"
@@ -284,7 +284,7 @@ class _Collected:
             self._left_out[name] = f"values of type {values.dtype}"
             return
         dimensions = tuple(each for each in stored.names if each not in picked)
-        self._bytes += _size(values.shape, values.dtype)
+        self._bytes += size_of(values.shape, values.dtype)
         self._lengths |= dict(zip(dimensions, values.shape, strict=True))
         self.variables.append(
             SourceVariable(
@@ -305,7 +305,7 @@ class _Collected:
         ]
         names = [each for each, _ in kept]
         shape = tuple(length for _, length in kept)
-        size = _size(shape, stored.dtype)
+        size = size_of(shape, stored.dtype)
         if len(set(names)) < len(names):
             return "its dimensions have no form in all formats"
         if len(self.variables) == MAX_ARRAYS:
@@ -326,7 +326,13 @@ class _Collected:
         return ""
 
 
-def _size(shape: Sequence[int], dtype: np.dtype[Any]) -> int:
+def is_small(size: int, whole: int) -> bool:
+    """Whether an array is kept beside a variable that nothing ties it to; both in bytes."""
+    return SMALL * size < max(whole, SMALL * SMALL_BYTES)
+
+
+def size_of(shape: Sequence[int], dtype: np.dtype[Any]) -> int:
+    """Bytes of an array, of texts approximately."""
     return prod(shape) * (TEXT_BYTES if dtype.kind in "UTO" else dtype.itemsize)
 
 
