@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
+import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +29,9 @@ from fhash_formats.series import (
     plain_form,
 )
 from fhash_formats.support.values import plain_text
+
+HEAD_BYTES = 4096
+"""Bytes of a file by which its format is known; HDF5 may begin at byte 2048."""
 
 DTYPES = {
     f"{kind}{8 * size}": f"{letter}{size}"
@@ -192,12 +197,22 @@ LONGEST_MESSAGE = 240
 
 
 def condense(error: BaseException) -> str:
-    """A library's message on one line, cut to a length that a terminal shows.
+    """A library's message on one line without colours, cut to a length that a terminal shows.
 
     The name of the error's type stands for an empty message.
     """
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split()) or type(error).__name__
     return text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 3] + "..."
+
+
+def library(source: str, what: str, module: str, extra: str) -> Any:
+    """A library that reads a format; raises MissingDependencyError that names what to install."""
+    try:
+        return importlib.import_module(module)
+    except (ImportError, OSError, RuntimeError) as error:  # also without the library below it
+        raise MissingDependencyError(
+            f"{source}: {what} needs {module}: pip install '{extra}'"
+        ) from error
 
 
 @contextmanager

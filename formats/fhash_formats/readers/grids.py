@@ -1,4 +1,4 @@
-"""Readers of volumes behind a short header: NIfTI, MRC, OpenDX and legacy VTK."""
+"""Readers of volumes behind a short header: NIfTI, MRC, OpenDX, legacy VTK and SEG-Y."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashWarning, InputError, MissingInputError
-from fhash_formats.readers.file_series import Request, Stamp, naming
+from fhash_formats.readers.file_series import Request, Stamp, library, naming
 from fhash_formats.readers.stored_bytes import (
     GZIP,
     CompressedFile,
@@ -30,6 +30,7 @@ from fhash_formats.readers.stored_bytes import (
 from fhash_formats.readers.variables import (
     Source,
     Variable,
+    by_ranges,
     components,
     file_source,
     placed,
@@ -607,3 +608,74 @@ def _numbers(words: Sequence[str], count: int) -> list[float]:
     """The numbers behind the first word of a line."""
     numbers: list[float] = numbers_of(" ".join(words[1 : count + 1]), count).tolist()
     return numbers
+
+
+SEGY_SUFFIXES = (".sgy", ".segy")
+LINES = {"inline": 189, "crossline": 193}
+"""Bytes of the numbers of lines in the header of a trace (SEG-Y revision 1)."""
+
+
+def is_segy(head: bytes, path: Path) -> bool:
+    """Whether this is SEG-Y by its suffix: its first bytes are any text."""
+    return path.suffix.lower() in SEGY_SUFFIXES
+
+
+def open_segy(path: Path, request: Request) -> Source:
+    """The traces of a SEG-Y file: inlines along y, crosslines along x, samples in ms along z.
+
+    Those of one line are along x. Raises MissingDependencyError without segyio, and InputError for
+    traces that make no regular grid, or were not stacked.
+    """
+    source, stamp = str(path), Stamp.of(path)
+    segyio = library(source, "SEG-Y", "segyio", "fhash[segy]")
+    with naming(source):
+        file = segyio.open(source, ignore_geometry=True)
+    try:
+        with naming(source):
+            found = _traces(path, file)
+    except BaseException:
+        file.close()
+        raise
+    return file_source(path, found, stamp=stamp, close=file.close)
+
+
+def _traces(path: Path, file: Any) -> list[Variable]:
+    told = {name: file.attributes(byte)[:] for name, byte in LINES.items()}
+    lines = {name: np.array(list(dict.fromkeys(each.tolist()))) for name, each in told.items()}
+    if len(lines["inline"]) == 1 and len(lines["crossline"]) < file.tracecount:
+        lines = {"inline": lines["inline"], "trace": np.arange(file.tracecount)}
+    elif len(np.unique(told["inline"][: len(lines["crossline"])])) > 1:
+        lines = dict(reversed(lines.items()))  # one crossline after the other
+    columns = lines | {"sample": file.samples}
+    shape = tuple(len(each) for each in columns.values())
+    regular = prod(shape[:-1]) == file.tracecount and all(
+        np.array_equal(told[name].reshape(shape[:-1]), grid)
+        for name, grid in zip(lines, np.meshgrid(*lines.values(), indexing="ij"), strict=True)
+        if name in told
+    )
+    if not regular:
+        raise InputError(
+            f"its {file.tracecount} traces make no regular grid of lines {shape[:-1]}, or are not"
+            " stacked"
+        )
+
+    def get(ranges: list[range]) -> npt.NDArray[Any]:
+        slow, fast, samples = ranges
+        raw, kept = file.trace.raw, slice(samples.start, samples.stop)
+        starts = [line * shape[1] for line in slow]
+        return np.stack([raw[n + fast.start : n + fast.stop][:, kept] for n in starts])
+
+    axes = {"inline": "Y", "crossline": "X", "trace": "X", "sample": "Z"}
+    whole = Variable(
+        name=path.stem,
+        shape=shape,
+        dtype=np.dtype(file.dtype),
+        dimensions=tuple(columns),
+        read=by_ranges(shape, get),
+    )
+    units = {"sample": {"units": "ms"}}
+    coords = [
+        positions(name, each, {"axis": axes[name], **units.get(name, {})})
+        for name, each in columns.items()
+    ]
+    return [whole, *coords]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,9 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.file_series import Request, Stamp, refusing
+from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError
+from fhash_formats.readers.file_series import Request, Stamp, naming, refusing
 from fhash_formats.readers.layout import Read
+from fhash_formats.readers.simulations import athena_variables, flash_variables, in_place_of
+from fhash_formats.readers.stored_bytes import lattice
 from fhash_formats.readers.stored_parts import Hdf5Sources
 from fhash_formats.readers.variables import (
     Behind,
@@ -23,13 +26,14 @@ from fhash_formats.readers.variables import (
     Variable,
     file_source,
     parent,
+    placed,
     plain_name,
     positions,
 )
-from fhash_formats.series import AXES
+from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import PLUMBING, decoded_text, json_attributes, text_of
 
-SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5", ".mnc", ".athdf")
 NETCDF_SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
 
 NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
@@ -261,13 +265,20 @@ def open_hdf5(path: Path, request: Request, *, netcdf: bool = False) -> Source:
     wrote are the format's fill values.
     """
     source, stamp = str(path), Stamp.of(path)
-    with refusing(f"{source} cannot be read as {'NetCDF' if netcdf else 'HDF5'}"):
+    kind = "NetCDF" if netcdf else "HDF5"
+    with naming(source), refusing(f"{source} cannot be read as {kind}"):
         import h5py
 
         file = h5py.File(path, "r")
         try:
             tree = walk(file)
             variables = _Variables(path, tree, netcdf=netcdf).listed()
+            if MINC_IMAGE in tree.datasets:
+                variables = minc_variables(path, tree, variables, raw=request.raw_values)
+            elif "unknown names" in tree.datasets:
+                variables = flash_variables(variables)
+            elif "NumMeshBlocks" in file.attrs:
+                variables = athena_variables(variables, Attributes(file))
             var = request.var and _own_name(file, tree.datasets, request.var)
         except BaseException:
             file.close()
@@ -545,3 +556,98 @@ def _numbers(value: Any, count: int, default: float) -> npt.NDArray[np.float64]:
     if isinstance(value, list) and len(value) == count:
         return np.asarray(value, np.float64)
     return np.full(count, default)
+
+
+MINC_IMAGE = "minc-2.0/image/0/image"
+"""Full name of the values of MINC2 in full resolution."""
+MINC_NAMES = {axis: f"{axis}space" for axis in AXES[1:]} | {"t": AXIS_NAMES["t"]}
+
+
+def minc_variables(
+    path: Path, tree: Tree, variables: Sequence[Variable], *, raw: bool
+) -> list[Variable]:
+    """The variables of a MINC2 file, with one of its image in real values before all others.
+
+    Integers are scaled between the least and the greatest value of their slice; those outside of
+    the valid range are missing. Positions are along the axes of the image, as MINC counts them, and
+    a warning (FhashWarning) says where these are turned against the scanner's. Raises InputError
+    for labels and other scales.
+
+    raw: whether the values are left as they are stored.
+    """
+    known = {each.name: each for each in variables}
+    image = replace(known[MINC_IMAGE], name=path.stem, scales={})
+    names = _minc_dimensions(image)
+    if len(names) != len(image.shape):
+        raise InputError(f"its image has the shape {image.shape} and the dimensions {names}")
+    if tree.datasets[MINC_IMAGE].dtype.metadata:
+        raise InputError("its image holds labels of an enumeration, no numbers")
+    axes = {name: axis for axis, name in MINC_NAMES.items()}
+    found = [AXIS_NAMES[axes[name]] if name in axes else "component" for name in names]
+    image = replace(image, dimensions=tuple(found))
+    if image.dtype.kind in "iu" and not raw:
+        around = MINC_IMAGE.removesuffix("image")
+        ends = [known[around + "image-min"], known[around + "image-max"]]
+        image = _minc_scaled(image, names, *ends)
+    coords, turns = {}, np.eye(3)
+    for length, name in zip(image.shape, names, strict=True):
+        place = f"minc-2.0/dimensions/{name}"
+        if name not in axes or place not in tree.datasets:
+            continue
+        axis, told = axes[name], Attributes(tree.datasets[place])
+        start, step = float(told.get("start", 0)), float(told.get("step", 1))
+        units = text_of(told.get("units", ""))
+        coords[axis] = lattice(axis, start, step, length, units=units)
+        if text_of(told.get("spacing", "")).startswith("irregular"):
+            listed = known[place].whole().reshape(length)
+            coords[axis] = positions(AXIS_NAMES[axis], listed, {"units": units})
+        if axis != "t" and "direction_cosines" in told:
+            turns["xyz".index(axis)] = told["direction_cosines"]
+    if not np.allclose(turns, np.eye(3), rtol=0, atol=1e-6):
+        warnings.warn(
+            f"{path}: its axes are turned against those of the scanner; positions are along its"
+            " own axes",
+            FhashWarning,
+            stacklevel=2,
+        )
+    return in_place_of(variables, placed([image], coords))
+
+
+def _minc_dimensions(variable: Variable) -> list[str]:
+    """Names of the dimensions, the slowest first."""
+    listed = text_of(variable.attributes.get("dimorder", "")).split(",")
+    return listed[: len(variable.shape)]
+
+
+def _minc_scaled(
+    image: Variable, names: Sequence[str], least: Variable, greatest: Variable
+) -> Variable:
+    """The image in real values, float64, NaN outside of the valid range."""
+    count = len(least.shape)
+    for each in (least, greatest):
+        fits = each.shape == image.shape[:count] and _minc_dimensions(each) == list(names[:count])
+        if count > 2 or not fits:
+            raise InputError(f"{each} does not scale slices of the image {image.shape}")
+    limits = np.iinfo(image.dtype)
+    told = image.attributes.get("valid_range", (limits.min, limits.max))
+    low, high = (float(each) for each in told)
+    if not limits.min <= low < high <= limits.max:
+        raise InputError(f"its valid range is {low} to {high}, of values of type {image.dtype}")
+    slopes = (greatest.whole() - least.whole()) / (high - low)
+    offsets = least.whole() - low * slopes
+    if not np.isfinite(slopes + offsets).all():
+        raise InputError(f"{least} and {greatest} are not finite")
+
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        stored = image.read(places)
+        values = stored.astype(np.float64)
+        kept = sum(isinstance(each, slice) for each in places[count:])
+        part = (*places[:count], *[np.newaxis] * kept)
+        values *= slopes[part]
+        values += offsets[part]
+        values[(stored < low) | (stored > high)] = np.nan
+        return values
+
+    one = np.unique(np.stack([slopes.ravel(), offsets.ravel()]), axis=1)
+    told = {"scale_factor": one[0, 0], "add_offset": one[1, 0]} if one.shape[1] == 1 else {}
+    return replace(image, values=np.dtype(np.float64), read=read, handle=told)

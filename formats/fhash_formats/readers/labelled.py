@@ -1,4 +1,4 @@
-"""Arrays in memory as sources: xarray's objects, and arrays of dask."""
+"""Arrays in memory as sources: xarray's objects, and arrays of dask; GRIB through xarray."""
 
 from __future__ import annotations
 
@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.readers.file_series import FileSeries, Request, condense
+from fhash_formats.readers.file_series import (
+    HEAD_BYTES,
+    FileSeries,
+    Request,
+    Stamp,
+    condense,
+    library,
+    naming,
+)
 from fhash_formats.readers.hdf5 import default_fill, says_netcdf
 from fhash_formats.readers.layout import must_select, single
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.netcdf3 import matches as is_classic
-from fhash_formats.readers.registry import HEAD_BYTES
 from fhash_formats.readers.select import Selection
 from fhash_formats.readers.stored_parts import labelled_parts
 from fhash_formats.readers.variables import (
@@ -26,6 +33,7 @@ from fhash_formats.readers.variables import (
     Behind,
     Source,
     Variable,
+    file_source,
 )
 from fhash_formats.series import (
     AXES,
@@ -335,3 +343,38 @@ def _origin(array: Any, beside: Any) -> Path | None:
     if not isinstance(place, str) or array.variable._in_memory or not Path(place).exists():
         return None
     return Path(place)
+
+
+GRIB_SUFFIXES = (".grib", ".grib2", ".grb", ".grb2", ".grb1", ".grib1")
+
+
+def is_grib(head: bytes, path: Path) -> bool:
+    """Whether this is GRIB by its first bytes."""
+    return head.startswith(b"GRIB")
+
+
+def open_grib(path: Path, request: Request) -> Source:
+    """The variables of a GRIB file as cfgrib makes them of its messages.
+
+    Grids that do not fit together are groups by their kind of level: `surface/t`. Raises
+    MissingDependencyError without cfgrib, and InputError for messages that are damaged.
+    """
+    stamp = Stamp.of(path)
+    cfgrib = library(str(path), "GRIB", "cfgrib", "fhash[grib]")
+    with naming(str(path)), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of xarray, about cfgrib
+        # no index is left beside the file
+        wishes = {"indexpath": "", "errors": "raise"}
+        datasets = cfgrib.open_datasets(str(path), backend_kwargs=wishes, cache=False)
+        variables: list[Variable] = []
+        groups: dict[str, Mapping[str, Any]] = {}
+        for number, dataset in enumerate(datasets):
+            levels = {each.attrs.get("GRIB_typeOfLevel") for each in dataset.data_vars.values()}
+            group = "" if len(datasets) == 1 else "_".join(sorted(map(str, levels)))
+            group = f"{group}_{number}" if group in groups else group
+            groups[group] = dataset.attrs
+            for name, each in dataset.variables.items():
+                made = _stored(str(name), each, auxiliary=name in dataset.coords)
+                full = f"{group}/{name}".lstrip("/")
+                variables.append(replace(made, name=full, flat=False))
+    return file_source(path, variables, groups=groups, stamp=stamp, naming=True)

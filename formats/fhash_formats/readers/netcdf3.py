@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Request, Stamp, refusing
 from fhash_formats.readers.hdf5 import default_fill
 from fhash_formats.readers.variables import Source, Variable, file_source
@@ -235,6 +236,8 @@ def open_classic(path: Path, request: Request) -> Source:
     stamp = Stamp.of(path)
     with refusing(f"{path} cannot be read as classic NetCDF"):
         header = read_header(path)
+    if {"image", "image-min", "image-max"} <= header.variables.keys():
+        raise InputError(f"{path} is MINC1; mincconvert -2 makes MINC2 of it, which can be read")
     variables = [
         Variable(
             name=name,

@@ -12,8 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, FhashWarning, InputError, MissingInputError
-from fhash_formats.readers import grids, hdf5, images, netcdf3, tiff, vtk, zarr_store
+from fhash_formats.readers import (
+    grids,
+    hdf5,
+    images,
+    labelled,
+    netcdf3,
+    simulations,
+    tiff,
+    vtk,
+    zarr_store,
+)
 from fhash_formats.readers.file_series import (
+    HEAD_BYTES,
     FileSeries,
     RawLayout,
     Request,
@@ -28,9 +39,6 @@ from fhash_formats.readers.select import list_selected, open_selected
 from fhash_formats.readers.stored_parts import require_inside
 from fhash_formats.readers.variables import Source
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
-
-HEAD_BYTES = 4096
-"""Bytes that `matches` gets; HDF5 may begin at byte 2048."""
 
 CONTAINER_SUFFIX = ".fhz"
 
@@ -61,6 +69,20 @@ RAW = Reader(
 ZARR = Reader(
     name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
 )
+PLOTFILE = Reader(
+    name="AMReX",
+    suffixes=(),
+    matches=simulations.is_plotfile,
+    open=simulations.open_plotfile,
+)
+ADIOS = Reader(
+    name="ADIOS2",
+    suffixes=simulations.ADIOS_SUFFIXES,
+    matches=simulations.is_adios,
+    open=simulations.open_adios,
+)
+FOLDERS = (ZARR, PLOTFILE, ADIOS)
+"""Formats of folders."""
 REGISTRY = (
     RAW,
     Reader(
@@ -110,6 +132,15 @@ REGISTRY = (
         open=grids.open_legacy_vtk,
     ),
     Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
+    Reader(name="SEG-Y", suffixes=grids.SEGY_SUFFIXES, matches=grids.is_segy, open=grids.open_segy),
+    Reader(
+        name="GRIB",
+        suffixes=labelled.GRIB_SUFFIXES,
+        matches=labelled.is_grib,
+        open=labelled.open_grib,
+    ),
+    PLOTFILE,
+    ADIOS,
 )
 """Formats in the order in which they are tried.
 
@@ -277,18 +308,20 @@ def find_reader(path: Path, request: Request) -> Reader:
     if not path.exists():
         raise MissingInputError(f"{path} does not exist")
     if path.is_dir():
-        if not ZARR.matches(b"", path):
+        found = next((reader for reader in FOLDERS if reader.matches(b"", path)), None)
+        if found is None:
             raise InputError(
-                f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a"
-                f" pattern such as '{path}/*.raw'"
+                f"{path} is a folder without zarr metadata, and none of AMReX or ADIOS2; give a"
+                f" file, such a folder, or a pattern such as '{path}/*.raw'"
             )
         if request.raw is not None:
             raise InputError(
-                f"{path} is a zarr folder; shape, type and byte order are given for raw files only"
+                f"{path} is a folder of {found.name}; shape, type and byte order are given for raw"
+                " files only"
             )
         if request.no_external:
             request.require_inside(path, path, *path.rglob("*"))
-        return ZARR
+        return found
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; write its data to a file first")
     request.require_inside(path, path)
@@ -320,16 +353,13 @@ def find_reader(path: Path, request: Request) -> Reader:
 
 
 ELSEWHERE = {
-    "xarray (engine='cfgrib')": ".grib .grib2 .grb .grb2 .grb1",
-    "segyio or xarray (engine='segy')": ".sgy .segy",
     "ParaView, with the filter ResampleToImage": ".vtu .vts .pvtu .pvts .vtp .vtm .foam .case"
     " .e .exo .cgns .xmf .xdmf .plt .silo .msh .stl .ply .obj",
     "pydicom or SimpleITK": ".dcm .dicom",
     "rioxarray": ".hgt .asc .adf .vrt .ecw .jp2",
     "astropy.io.fits": ".fits .fit .fts",
-    "adios2": ".bp .bp4 .bp5",
     "pyopenvdb": ".vdb",
-    "yt": ".plt0000 .athdf .enzo",
+    "yt": ".enzo",
     "scipy.io.loadmat": ".mat",
     "pyarrow": ".parquet .feather",
     "pyhdf": ".hdf4 .h4",

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.file_series import Request, Stamp, condense, naming
+from fhash_formats.errors import InputError
+from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming
 from fhash_formats.readers.stored_bytes import PlainFile, lattice
 from fhash_formats.readers.stored_parts import StoredParts
 from fhash_formats.readers.variables import (
@@ -51,12 +51,7 @@ def matches(head: bytes, path: Path) -> bool:
 
 
 def _tifffile(source: str) -> Any:
-    try:
-        return importlib.import_module("tifffile")
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{source}: TIFF needs tifffile: pip install 'fhash[formats]'"
-        ) from error
+    return library(source, "TIFF", "tifffile", "fhash[formats]")
 
 
 class _Complaints(logging.Handler):

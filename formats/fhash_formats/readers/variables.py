@@ -601,6 +601,19 @@ def stacked(reads: Sequence[Read]) -> Read:
     return read
 
 
+def by_ranges(shape: Sequence[int], get: Callable[[list[range]], npt.NDArray[Any]]) -> Read:
+    """A read of an array of a shape, of which `get` gives a range along each dimension."""
+
+    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
+        ranges = [
+            range(each, each + 1) if isinstance(each, int) else range(*each.indices(length))
+            for each, length in zip(places, shape, strict=True)
+        ]
+        return get(ranges)[tuple(0 if isinstance(n, int) else slice(None) for n in places)]
+
+    return read
+
+
 def components(
     whole: Variable, place: int, given: Sequence[str | None] = (), *, interleaved: bool = True
 ) -> list[Variable]:

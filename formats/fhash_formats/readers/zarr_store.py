@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,21 @@ from fhash_formats.readers.file_series import (
     Request,
     Stamp,
     condense,
+    naming,
     refusing,
 )
+from fhash_formats.readers.stored_bytes import lattice
 from fhash_formats.readers.stored_parts import zarr_parts
-from fhash_formats.readers.variables import Behind, Source, Variable, file_source
+from fhash_formats.readers.variables import (
+    HEADER,
+    Behind,
+    Source,
+    Variable,
+    components,
+    file_source,
+    placed,
+)
+from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import PLUMBING
 
 if TYPE_CHECKING:
@@ -174,7 +185,7 @@ def open_zarr(path: Path, request: Request) -> Source:
             )
         return file_source(
             path,
-            _variables(path, arrays, failed),
+            _with_images(path, _variables(path, arrays, failed), groups),
             groups=groups,
             close=store.close,
             stamp=Stamp.of((metadata_file(path) or path) if path.is_dir() else path),
@@ -208,6 +219,85 @@ def _variables(
         Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error)
         for name, error in failed.items()
     ]
+
+
+CHANNEL = "channel"
+OME_AXES = "tczyx"
+"""Axes before version 0.3 of OME-Zarr, which has no names of them."""
+OME_NAMES = {"c": CHANNEL, "t": AXIS_NAMES["t"]}
+"""Names of dimensions for those of axes."""
+
+
+def _with_images(
+    root: Path, arrays: Sequence[Variable], groups: Mapping[str, Mapping[str, Any]]
+) -> list[Variable]:
+    """The variables, with one for each image by OME-Zarr (NGFF), or for each of its channels.
+
+    It has the name of the group, "A_1_0" on a plate: its fields are no steps. The arrays of an
+    image, which are its levels of detail, and images of labels are read only where they are named.
+    """
+    known, images = {each.name: each for each in arrays}, []
+    for group, attributes in groups.items():
+        told = attributes.get("ome")
+        told = told if isinstance(told, Mapping) else attributes
+        with naming(str(root)):
+            entries = told.get("multiscales", ())
+            for entry, scales in enumerate(entries):
+                name = group.replace("/", "_") or root.stem.removesuffix(".ome")
+                if len(entries) > 1:
+                    name += f"_{scales.get('name', entry)}"
+                for number, each in enumerate(scales["datasets"]):
+                    array = known.get(f"{group}/{each['path']}".strip("/"))
+                    if array is None or array.error:
+                        continue  # a group, as programs of other conventions have it
+                    *coords, level = _level(array, scales, each)
+                    known[array.name] = replace(level, auxiliary=True)
+                    images += coords
+                    if number == 0:
+                        labels = level.auxiliary or "labels" in group.split("/")
+                        whole = replace(level, name=name, auxiliary=labels)
+                        images += _channels(whole, told)
+    return [*images, *known.values()]
+
+
+def _level(
+    array: Variable, scales: Mapping[str, Any], dataset: Mapping[str, Any]
+) -> list[Variable]:
+    """The positions of a level of detail, and the level.
+
+    scales: an entry of `multiscales`, and dataset: that of the level in it.
+    """
+    listed = scales.get("axes") or OME_AXES
+    given = [each if isinstance(each, Mapping) else {"name": each} for each in listed]
+    axes = [str(each["name"]) for each in given]
+    if len(axes) != len(array.shape) or len(set(axes)) < len(axes):
+        raise InputError(f"{array} has the axes {', '.join(axes)}")
+    step, first = np.ones(len(axes)), np.zeros(len(axes))
+    for place in (dataset, scales):
+        for each in place.get("coordinateTransformations", ()):
+            kind = each["type"]
+            values = np.array(each.get(kind, ()), np.float64)
+            if kind in ("scale", "translation") and values.shape == step.shape:
+                step = step * values if kind == "scale" else step
+                first = first * values if kind == "scale" else first + values
+            elif kind != "identity":
+                raise InputError(f"{array} has a transformation {str(each)[:60]}")
+    coords = {
+        axis: lattice(axis, first[n], step[n], array.shape[n], units=str(given[n].get("unit", "")))
+        for n, axis in enumerate(axes)
+        if axis in AXES
+    }
+    named = replace(array, dimensions=tuple(OME_NAMES.get(axis, axis) for axis in axes))
+    return placed([named], coords, f"{HEADER}/{array.name}")
+
+
+def _channels(image: Variable, told: Mapping[str, Any]) -> list[Variable]:
+    """The channels of an image, by the names in the metadata for programs that show it."""
+    if CHANNEL not in image.dimensions:
+        return [image]
+    channels = told.get("omero", {}).get("channels", ())
+    labels = [str(each.get("label", "")).replace("/", "_") for each in channels]
+    return components(image, image.dimensions.index(CHANNEL), labels, interleaved=False)
 
 
 def _behind(folder: Path | None, array: zarr.Array[Any]) -> Behind:

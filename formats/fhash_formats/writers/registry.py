@@ -14,8 +14,7 @@ import numpy.typing as npt
 from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.files import check_output, replacing_all
 from fhash_formats.writers.common import Frame, Put, Region, Writer, safe_name
-from fhash_formats.writers.labelled import HDF5, NETCDF, ZARR
-from fhash_formats.writers.raw import NPY, RAW
+from fhash_formats.writers.labelled import HDF5, NETCDF, NPY, RAW, ZARR
 from fhash_formats.writers.vtk import VTK, VTKHDF
 
 WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK, VTKHDF)

@@ -143,7 +143,7 @@ def test_an_unknown_format_lists_what_is_known(tmp_path: Path) -> None:
         assert all(suffix in str(caught.value) for suffix in reader.suffixes)
 
 
-@pytest.mark.parametrize(("name", "way"), [("a.grib2", "cfgrib"), ("a.VTU", "ResampleToImage")])
+@pytest.mark.parametrize(("name", "way"), [("a.fits", "astropy"), ("a.VTU", "ResampleToImage")])
 def test_other_formats_have_a_way(tmp_path: Path, name: str, way: str) -> None:
     (tmp_path / name).write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=f"read it by .*{way}.*fhash_codec.encode"):
