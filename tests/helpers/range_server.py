@@ -11,6 +11,9 @@ from typing import Any
 __all__ = ["RangeServer"]
 
 
+MADE = "Thu, 01 Jan 2026 00:00:00 GMT"
+
+
 class RangeServer:
     """The server; a context manager.
 
@@ -107,7 +110,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, b"", {}, body)
             return
         tag = f'"{hashlib.sha256(data).hexdigest()[:16]}"'
-        headers = {"ETag": tag} if owner.validators else {}
+        headers = {"ETag": tag, "Last-Modified": MADE} if owner.validators else {}
         if owner.conditions and self.headers.get("If-Match", tag) != tag:
             self._send(412, b"", headers, body)
             return

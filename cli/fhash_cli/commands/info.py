@@ -365,8 +365,12 @@ def _is_run(path: str) -> bool:
     """Whether a path is, or is meant to be, a container."""
     from fhash_formats.support.files import is_url
 
+    if is_url(path):
+        from fhash_formats.readers.labelled import is_data_url
+
+        return not is_data_url(path)
     place = Path(path)
-    if is_url(path) or place.suffix.lower() == ".fhz":
+    if place.suffix.lower() == ".fhz":
         return True
     with suppress(OSError), place.open("rb") as file:
         if file.read(2) == b"PK":

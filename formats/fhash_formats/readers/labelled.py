@@ -1,10 +1,12 @@
-"""Arrays in memory as sources: xarray's objects, and arrays of dask; GRIB through xarray."""
+"""Arrays in memory as sources: xarray's objects, and arrays of dask; by xarray URLs and GRIB."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +21,10 @@ from fhash_formats.readers.file_series import (
     condense,
     library,
     naming,
+    refusing,
 )
-from fhash_formats.readers.hdf5 import default_fill, says_netcdf
-from fhash_formats.readers.layout import must_select, single
+from fhash_formats.readers.hdf5 import NETCDF_SUFFIXES, default_fill, says_netcdf
+from fhash_formats.readers.layout import Read, must_select, single
 from fhash_formats.readers.listing import Listed
 from fhash_formats.readers.netcdf3 import matches as is_classic
 from fhash_formats.readers.select import Selection
@@ -45,6 +48,7 @@ from fhash_formats.series import (
     warn_not_stored,
 )
 from fhash_formats.support.dates import clock
+from fhash_formats.support.files import file_name, is_url, without_secrets
 from fhash_formats.support.values import PACKING
 
 if TYPE_CHECKING:
@@ -343,6 +347,78 @@ def _origin(array: Any, beside: Any) -> Path | None:
     if not isinstance(place, str) or array.variable._in_memory or not Path(place).exists():
         return None
     return Path(place)
+
+
+DATA_SUFFIXES = (".zarr", ".nc", ".nc4", ".cdf", ".h5", ".hdf5", ".he5")
+"""Suffixes of data that are read where they lie; other URLs are those of containers."""
+
+
+BLOCK = 1 << 18
+"""Bytes that are asked for at once of a file elsewhere."""
+
+
+def is_data_url(place: object) -> bool:
+    """Whether a place is the URL of a Zarr store, or of a file of NetCDF or HDF5."""
+    return is_url(place) and Path(file_name(str(place))).suffix.lower() in DATA_SUFFIXES
+
+
+def open_url(url: str, request: Request) -> Source:
+    """A Zarr store, or a file of NetCDF-4 or HDF5, elsewhere; values are fetched as they are read.
+
+    xarray opens its uppermost group, by obstore where that is installed, else by fsspec: keys and
+    secrets are those of their environment. Raises MissingDependencyError without either, and
+    InputError for what cannot be opened.
+    """
+    xr = library(url, "a URL", "xarray", "fhash[remote]")
+    wishes = {"decode_cf": False, "cache": False, "chunks": None}
+    place, shown = url.split("?")[0].rstrip("/"), without_secrets(url)
+    suffix = Path(file_name(url)).suffix.lower()
+    direct = "::" not in url and "?" not in url and find_spec("obstore") is not None
+    with refusing(f"{shown} cannot be read"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a store without consolidated metadata
+        if suffix == ".zarr":
+            stored: Any = url
+            if direct:
+                store = import_module("obstore.store").from_url(
+                    place, client_options={"allow_http": True}
+                )
+                stored = import_module("zarr.storage").ObjectStore(store, read_only=True)
+            dataset = xr.open_dataset(stored, engine="zarr", **wishes)
+        else:
+            fsspec = library(url, "a URL", "fsspec", "fhash[remote]")
+            # blocks, since HDF5 reads few bytes here and there
+            if direct and not place.startswith("http"):
+                files = import_module("obstore.fsspec").FsspecStore(place.split("://")[0])
+                stored = files.open(place, buffer_size=BLOCK)
+            else:
+                files, inside = fsspec.core.url_to_fs(url)
+                stored = files.open(inside, cache_type="blockcache", block_size=BLOCK)
+            dataset = xr.open_dataset(stored, engine="h5netcdf", phony_dims="sort", **wishes)
+
+    def reader(array: Any) -> Read:
+        return lambda places: np.asarray(array[places].values)
+
+    variables = [
+        Variable(
+            name=str(key),
+            flat=True,
+            shape=each.shape,
+            dtype=each.dtype,
+            dimensions=tuple(map(str, each.dims)),
+            attributes=each.attrs,
+            read=reader(each),
+            chunks=each.encoding.get("chunks") or each.encoding.get("chunksizes"),
+        )
+        for key, each in dataset.variables.items()
+    ]
+    return Source(
+        name=shown,
+        variables=variables,
+        groups={"": dataset.attrs},
+        close=dataset.close,
+        naming=True,
+        default_fill=default_fill if suffix in NETCDF_SUFFIXES else lambda dtype: None,
+    )
 
 
 GRIB_SUFFIXES = (".grib", ".grib2", ".grb", ".grb2", ".grb1", ".grib1")

@@ -186,7 +186,8 @@ def open_series(
     """Open a time-varying volume in any supported format; its frames are read later, one by one.
 
     Args:
-        path: a file, a zarr folder, or a pattern of files ("frames_*.raw") with one or more steps
+        path: a file, a zarr folder, the URL of a Zarr store or of a file of NetCDF-4 or HDF5
+            ("s3://bucket/a.zarr"), or a pattern of files ("frames_*.raw") with one or more steps
             each, sorted by the numbers in their names.
         var: name of the variable.
         axes: the file's dimensions in its own order, such as "x,y,z,t"; axes left out have length
@@ -234,8 +235,11 @@ def list_variables(
     variable has one of the steps.
     """
     text, request = str(path), _request(**wishes)
-    place = files_of(text)[0] if is_pattern(text) else Path(path)
-    opened = find_reader(place, request).open(place, request)
+    if labelled.is_data_url(path):
+        opened: Source | JoinedSeries = labelled.open_url(text, request)
+    else:
+        place = files_of(text)[0] if is_pattern(text) else Path(path)
+        opened = find_reader(place, request).open(place, request)
     if isinstance(opened, Source):
         listed = list_selected(opened, request)
     else:
@@ -267,6 +271,8 @@ def _check_stride(path: str | Path, steps: slice) -> None:
 def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
+    if labelled.is_data_url(path):
+        return open_selected(labelled.open_url(text, request), request)
     if not is_pattern(text):
         if request.overlap is not None:
             raise InputError(f"{path}: --overlap is for a pattern of files")
