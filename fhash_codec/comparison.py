@@ -48,6 +48,7 @@ def report(
 
     Of the values returned:
         bytes, raw_bytes: of the whole file, and of the series in its own number type.
+        split: `bytes` by what they hold, as `Container.split` has them.
         ratio: raw_bytes / bytes.
         source_bytes, source_ratio: of the files that were read, as they lie on disk, and their
             ratio to `bytes`; None where there are no files.
@@ -67,6 +68,7 @@ def report(
     return {
         "path": str(volume.path),
         "bytes": info["bytes"],
+        "split": info["split"],
         "raw_bytes": info["raw_bytes"],
         "ratio": info["ratio"],
         "source_bytes": source,

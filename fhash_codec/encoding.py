@@ -388,9 +388,9 @@ def encode_dataset(
     open_variable: opens a variable of a file, in place of `open_series(source, var=name)`.
     force: replace a file that exists.
 
-    Returns the figures of the written file: `path`, `bytes`, `raw_bytes`, `ratio`, `seconds`, and
-    in `variables` those of each by name, as `encode` returns them; their `bytes` are those of its
-    own arrays, without shared coordinates and the header.
+    Returns the figures of the written file: `path`, `bytes`, `split` (`Container.split`),
+    `raw_bytes`, `ratio`, `seconds`, and in `variables` those of each by name, as `encode` returns
+    them; their `bytes` are those of its own arrays, without shared coordinates and the header.
 
     Raises what `encode` raises, with the name of the variable. All variables are opened before the
     first is encoded. QualityError names each variable that misses its promise.
@@ -580,11 +580,12 @@ def _report(
             took = sum(stage["seconds"] for stage in stages[name])
             figures[name] = report(volume, encoded[name].quality, seconds=took)
             figures[name]["stages"] = stages[name]
-        size = dataset.container.size
+        size, split = dataset.container.size, dataset.container.split()
     raw = sum(each["raw_bytes"] for each in figures.values())
     return {
         "path": str(path),
         "bytes": size,
+        "split": split,
         "raw_bytes": raw,
         "ratio": raw / size,
         "seconds": seconds,

@@ -591,6 +591,7 @@ def describe_file(container: Container, path: object, key_frames: Sequence[int])
         "path": str(path),
         "bytes": container.size,
         "overhead_bytes": container.overhead(),
+        "split": container.split(),
         "raw_bytes": raw,
         "ratio": raw / container.size,
         "key_frames": list(key_frames),

@@ -363,6 +363,12 @@ def compared(report: Mapping[str, Any], *, part: bool = False) -> str:
     return f"{text}, {ratio} than {source} on disk ({size(report['source_bytes'])})"
 
 
+def split_row(report: Mapping[str, Any]) -> tuple[str, str]:
+    """The row of a file's bytes by what they hold, without what takes none."""
+    parts = [f"{name} {size(count)}" for name, count in report["split"].items() if count]
+    return "split", ", ".join(parts)
+
+
 def _smaller(ratio: float) -> str:
     return f"{factor(ratio)} smaller" if ratio >= 1 else f"{factor(1 / ratio)} larger"
 

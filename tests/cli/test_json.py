@@ -113,6 +113,8 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)
+    for report in (*outputs["encode"], *outputs["info"]):
+        assert sum(report["split"].values()) == report["bytes"]
 
 
 def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

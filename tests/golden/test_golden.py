@@ -12,7 +12,13 @@ from zarr.storage import ZipStore
 
 import fhash_codec
 from fhash_formats.container.reader import Container
-from fhash_formats.transform.tile_format import LABELS, PREDICTED, TRANSFORMED, parse_stream
+from fhash_formats.transform.tile_format import (
+    DIFFERENCES,
+    LABELS,
+    PREDICTED,
+    TRANSFORMED,
+    parse_stream,
+)
 
 HERE = Path(__file__).parent
 COMPACT = [
@@ -145,7 +151,8 @@ def test_goldens_have_tiles_of_every_coder() -> None:
                 if array.coding == "fhash.transform":
                     streams = (array.coded(index) for index in np.ndindex(*array.grid))
                     found |= {(s.kind, s.fast) for s in map(parse_stream, map(bytes, streams))}
-    assert found >= {(TRANSFORMED, False), (TRANSFORMED, True), (PREDICTED, False), (LABELS, False)}
+    plain = {(kind, False) for kind in (TRANSFORMED, PREDICTED, LABELS, DIFFERENCES)}
+    assert found >= {*plain, (TRANSFORMED, True)}
 
 
 def test_a_golden_that_grew_goes_on(tmp_path: Path) -> None:

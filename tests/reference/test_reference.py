@@ -24,9 +24,9 @@ from fhash_formats.transform.chunk import encode_chunk
 from fhash_formats.transform.coder import MaskLevels, encode_block
 from fhash_formats.transform.decoding import decode_tile_mask
 from fhash_formats.transform.encoding import Coding, encode_tile
-from fhash_formats.transform.predict import encode_predicted
+from fhash_formats.transform.predict import encode_differences, encode_predicted
 from fhash_formats.transform.stream import ArrayAxes
-from fhash_formats.transform.tile_format import TileSettings
+from fhash_formats.transform.tile_format import DIFFERENCES, TileSettings, seal
 from reference import predictor as reference_predictor
 from reference.tile import chunk_of, decode_tile
 
@@ -68,6 +68,28 @@ def test_goldens() -> None:
     found = [tile for path in sorted(GOLDEN.glob("*.fhz")) for tile in differing(path)]
     assert len(found) > 20
     assert not any(found), [tile for tile in found if tile]
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int16", "uint64"])
+@pytest.mark.parametrize("shape", [(2, 3, 5, 12), (1, 2, 9, 4), (1, 1, 30, 1), (1, 1, 1, 1)])
+def test_differences(dtype: str, shape: tuple[int, int, int, int]) -> None:
+    """Smooth values of a type, then decimals, values of float32, fills, and any bits."""
+    t, z, y, x = np.indices(shape)
+    smooth = (40 + np.sin(x / 9 + z) * np.cos(y / 7 + t) * 30).astype(dtype)
+    several = [smooth, np.round(smooth, 1), smooth.astype(np.float16).astype(dtype)]
+    several += [np.where(x % 5 > y % 7, several[0].dtype.type(fill), smooth) for fill in (0, 100)]
+    if smooth.dtype.kind == "f":
+        odd = np.resize([np.nan, -np.inf, -0.0, 3e-5, -7.25, np.nan, 6e4], shape).astype(dtype)
+        several += [odd, np.where(x % 5 > y % 7, odd, smooth)]
+    noise = np.random.default_rng(1).bytes(smooth.nbytes)
+    several.append(np.frombuffer(noise, dtype).reshape(shape))
+    for values in several:
+        body = encode_differences(values)
+        if body is not None:
+            data = seal(DIFFERENCES, [body])
+            theirs = decode_tile_mask(data, shape, values.dtype)
+            assert equal(decode_tile(data, shape, values.dtype), theirs)
+            assert theirs[0].tobytes() == values.tobytes()
 
 
 @pytest.mark.parametrize("quality", [{"max_error_rel": 1e-3}, {"max_error": 0.0}])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numcodecs.zstd import decompress
 
 from reference.bands import bands_of, single_band
 from reference.fast import decode_fast
@@ -21,7 +22,7 @@ from reference.transform import Axis, inverse, unpack_basis
 Values = npt.NDArray[Any]
 Settings = dict[str, Any]
 
-TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY = range(5)
+TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES = range(6)
 """Kinds of streams, the lower three bits of the flags."""
 OWN, MISSING, RESIDUAL, MASKED, FAST = 8, 16, 32, 64, 128
 """Other bits of the flags."""
@@ -150,6 +151,8 @@ def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
     if stream.kind == EXACT:
         values = unpack_planes(sections["body"], dtype).reshape(stream.shape)
         return values, unpack_mask(sections["mask"], (nothing, nothing)) if stream.masked else None
+    if stream.kind == DIFFERENCES:
+        return unpack_differences(sections["body"], stream.shape, dtype), None
     if stream.kind == EMPTY:
         values = cast(np.full(stream.shape, float(settings["center"])), dtype)
         mask = np.zeros(stream.shape, bool) if stream.masked else None
@@ -169,6 +172,51 @@ def decode_stream(stream: Stream) -> tuple[Values, Values | None]:
         for mark, value in ((1, np.nan), (2, np.inf), (3, -np.inf)):
             values[marks == mark] = value
     return values, mask
+
+
+def unpack_differences(body: memoryview, shape: Sequence[int], dtype: np.dtype[Any]) -> Values:
+    """The values of a tile of differences, one after the other, in Python's integers."""
+    data = bytes(decompress(body))
+    flags, scale, hole, orders = struct.unpack_from("<BdQB", data)
+    kind = np.dtype(np.float32) if flags & 4 else dtype
+    count, size = int(np.prod(shape)), kind.itemsize
+    shape = (1, 1, 1, *shape)[-4:]
+    _, z, y, x = shape
+    apart = x <= 8 < y
+    order = np.arange(count).reshape(shape)
+    order = order.transpose(0, 3, 1, 2) if apart else order
+    planes = order.reshape(-1, *((z, y) if apart else (y, x)))
+    marks = np.unpackbits(np.frombuffer(data[18 + count * size * (2 if flags & 2 else 1) :], "u1"))
+
+    def integer(first: int, number: int) -> int:
+        parts = data[first + number : first + count * size : count]
+        coded = int.from_bytes(parts, "little")
+        return coded // 2 if coded % 2 == 0 else -(coded + 1) // 2
+
+    numbers = np.array([integer(18, number) for number in range(count)], dtype=object)
+    numbers = numbers.reshape(planes.shape)
+    for axis, times in ((1, orders // 16), (2, orders % 16)):
+        for _ in range(times):
+            numbers = np.cumsum(numbers, axis)
+    bits = []
+    for number, value in enumerate(wrapped(each, size) for each in numbers.flat):
+        if kind.kind == "f":
+            near = np.array(np.float64(value) / scale).astype(kind)
+            place = int(near.view(f"i{size}"))
+            place = place if place >= 0 else ~place - (1 << 8 * size - 1)
+            place += integer(18 + count * size, number) if flags & 2 else 0
+            place = wrapped(place, size)
+            value = place if place >= 0 else ~(place + (1 << 8 * size - 1))
+        bits.append(hole if flags & 1 and marks[number] else value % (1 << 8 * size))
+    values = np.empty(count, f"u{size}")
+    values[planes.reshape(-1)] = bits
+    return values.view(kind).astype(dtype).reshape(shape)
+
+
+def wrapped(number: int, size: int) -> int:
+    """A whole number as a signed one of `size` bytes."""
+    half = 1 << 8 * size - 1
+    return (number + half) % (2 * half) - half
 
 
 def predicted(stream: Stream) -> tuple[Values, Values]:

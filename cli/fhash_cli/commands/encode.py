@@ -42,6 +42,7 @@ from fhash_cli.output import (
     say,
     size,
     spans,
+    split_row,
     table,
 )
 from fhash_cli.variables import config_of, configs_of, report_table, variables_to_encode
@@ -264,6 +265,7 @@ def _emit_several(
     rows = [
         ("written", str(report["path"])),
         ("size", compared(report)),
+        split_row(report),
         ("time", duration(report["seconds"])),
     ]
     text = f"{table(rows)}\n\n{table(report_table(variables))}"
@@ -435,6 +437,7 @@ def report_rows(
     return [
         ("written", str(report["path"])),
         ("size", compared(report, part=part)),
+        split_row(report),
         *(gain_rows(report) if verbose else ()),
         ("steps, z, y, x", extent(report["shape"])),
         *([("key frames", str(len(report["key_frames"])))] if paper else []),

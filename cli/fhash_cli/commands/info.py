@@ -25,6 +25,7 @@ from fhash_cli.output import (
     quality_rows,
     size,
     spans,
+    split_row,
     table,
 )
 from fhash_cli.variables import info_table
@@ -349,6 +350,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
         "path": str(dataset.path),
         "format_version": version,
         "bytes": container.size,
+        "split": container.split(),
         "raw_bytes": raw,
         "ratio": raw / container.size,
         "variables": infos,
@@ -356,6 +358,7 @@ def _emit_dataset(dataset: Dataset, as_json: bool) -> None:
     rows = [
         ("file", f"{dataset.path}, format {'.'.join(map(str, version))}"),
         ("size", compared(result)),
+        split_row(result),
     ]
     more = one_line(f"fhash info {dataset.path} --var {next(iter(dataset))} tells all of one")
     emit(result, f"{table(rows)}\n\n{table(info_table(infos))}\n\n{more}", as_json)
@@ -392,6 +395,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             f" by fhash {info['encoder']['version']}",
         ),
         ("size", compared(info)),
+        split_row(info),
         (
             "variable",
             f"{volume.name}, {dtype}"

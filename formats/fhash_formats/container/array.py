@@ -19,6 +19,7 @@ from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileEr
 from fhash_formats.native import crc32c
 from fhash_formats.support.threads import chunk_region
 from fhash_formats.support.values import DTYPES
+from fhash_formats.transform.values import ZSTD_LEVEL, from_zstd
 
 if TYPE_CHECKING:
     from fhash_formats.transform.stream import TransformCoder
@@ -27,17 +28,9 @@ if TYPE_CHECKING:
 Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
 
-ZSTD_LEVEL = 9
-"""Level at which arrays are written; a reader takes any."""
-ZSTD_MAX_RATIO = 32 << 10
-"""Decoded bytes per byte of zstd data.
-
-A block of at most 128 KiB takes at least a header of three bytes and one more (RFC 8878, 3.1.1.2).
-"""
 CRC32C: Codec = {"name": "crc32c"}
 
 _CRC = struct.Struct("<I")
-_ZSTD_MARK = 0xFD2FB528
 _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
@@ -84,28 +77,10 @@ class PlainCoder:
 
         Raises InputError for a level of detail other than 0.
         """
-        from numcodecs.zstd import decompress
-
         if lod:
             raise InputError(f"level of detail {lod}; the array has none but 0")
-        data = without_crc32c(data)
-        declared = zstd_content_size(data)
-        if declared != self._size:
-            raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
-        if declared > ZSTD_MAX_RATIO * len(data):
-            raise DamagedFileError(
-                f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold"
-            )
-        # The buffer has exactly the chunk's size, which bounds what a hostile frame can write.
-        values = np.empty(self._shape, dtype=self._stored)
-        try:
-            decompress(data, values)
-        except (RuntimeError, ValueError) as error:
-            # zstd found no memory for its own work space: the data may be sound.
-            if "Allocation error" in str(error):
-                raise MemoryError("no memory to decompress a chunk") from error
-            raise DamagedFileError(f"zstd data are damaged: {error}") from error
-        return values.astype(self._native, copy=False)
+        values = from_zstd(without_crc32c(data), self._size, self._size)
+        return values.view(self._stored).reshape(self._shape).astype(self._native, copy=False)
 
 
 def _transform_coder(
@@ -168,24 +143,6 @@ def without_crc32c(data: memoryview) -> memoryview:
     if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
         raise DamagedFileError("its CRC-32C differs, the data are damaged")
     return coded
-
-
-def zstd_content_size(data: memoryview | bytes) -> int | None:
-    """The content size in the header of a zstd frame; None where the header has none.
-
-    Raises DamagedFileError for data that do not begin with such a header (RFC 8878, 3.1.1.1).
-    """
-    if len(data) < 6 or int.from_bytes(data[:4], "little") != _ZSTD_MARK:
-        raise DamagedFileError("not a zstd frame")
-    descriptor = data[4]
-    single_segment = bool(descriptor & 0x20)
-    size_bytes = (1 if single_segment else 0, 2, 4, 8)[descriptor >> 6]
-    at = 5 + (0 if single_segment else 1) + (0, 1, 2, 4)[descriptor & 3]
-    if len(data) < at + size_bytes:
-        raise DamagedFileError("the header of the zstd frame is cut short")
-    if size_bytes == 0:
-        return None
-    return int.from_bytes(data[at : at + size_bytes], "little") + (256 if size_bytes == 2 else 0)
 
 
 def _names(codecs: Sequence[Codec]) -> str:

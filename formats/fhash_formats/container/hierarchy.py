@@ -129,10 +129,11 @@ def read_variables(
     free = frozenset(others)
     own = {name: tuple(found) for name, found in places.items()}
     for name, header in headers.items():
-        for part, number in header.get(SHARES, {}).items():
-            if part not in own[names[number]]:
-                raise DamagedFileError(f"array {array_path(number, part)} is missing")
-            _add_path(places[name], part, places[names[number]][part])
+        for part, place in header.get(SHARES, {}).items():
+            number, other = place if isinstance(place, list) else (place, part)
+            if other not in own[names[number]]:
+                raise DamagedFileError(f"array {array_path(number, other)} is missing")
+            _add_path(places[name], part, places[names[number]][other])
         for axis, dimension in zip(POSITIONS, header[DIMENSIONS], strict=True):
             if dimension in free:
                 places[name][f"{COORDINATES}{axis}"] = dimension
@@ -209,8 +210,10 @@ def _check_shares(header: Record, count: int) -> None:
     if not header.has(SHARES):
         return
     header.record(SHARES)
-    for part, number in header.get(SHARES).items():
-        fits = part.startswith(AUXILIARY) and type(number) is int and 0 <= number < count
+    for part, place in header.get(SHARES).items():
+        number, other = place if isinstance(place, list) and len(place) == 2 else (place, part)
+        names = isinstance(other, str) and other.startswith(AUXILIARY)
+        fits = part.startswith(AUXILIARY) and names and type(number) is int and 0 <= number < count
         header.need(fits, SHARES, f"names of arrays {AUXILIARY}... with the number of a variable")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import chain, pairwise
@@ -47,7 +47,7 @@ from fhash_formats.container.hierarchy import (
     variable_named,
 )
 from fhash_formats.container.record import MAX_LENGTH, Record
-from fhash_formats.container.source_entry import check_source
+from fhash_formats.container.source_entry import AUXILIARY, check_source
 from fhash_formats.container.stored import ChunkCache, StoredArray
 from fhash_formats.container.zip_file import (
     DOCUMENT,
@@ -264,7 +264,8 @@ def _check_codecs(required_features: Sequence[str], arrays: Mapping[str, ArrayMe
     if TRANSFORM_FEATURE in required_features:
         return
     for name, array in arrays.items():
-        if array.sharding is not None or array.coding == TRANSFORM:
+        beside = name.startswith(AUXILIARY) and PLAIN_FEATURE not in required_features
+        if array.sharding is not None or (array.coding == TRANSFORM and not beside):
             raise DamagedFileError(
                 f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
                 "which the header does not require"
@@ -349,6 +350,25 @@ def _refuse_options(storage_options: StorageOptions, place: str) -> None:
 
 CACHE_BYTES = 256 << 20
 """Bytes of decoded chunks that an open container keeps."""
+SPLIT = {
+    "field": ("tables", "corrections", RESIDUAL, "occupancy", "missing"),
+    "coordinates": ("coords",),
+    "beside": ("auxiliary",),
+    "model": ("mlp",),
+}
+"""First parts of the names of arrays, by what `Container.split` calls their bytes."""
+
+
+def split_bytes(total: int, arrays: Iterable[tuple[str, StoredArray]]) -> dict[str, int]:
+    """Bytes by what they hold, as `Container.split` has them, of so many in all."""
+    found = dict.fromkeys(SPLIT, 0)
+    for name, array in arrays:
+        for part, beginnings in SPLIT.items():
+            if name.split("/")[0] in beginnings:
+                found[part] += array.nbytes_stored
+                coded = part == "field" and array.settings is not None
+                found["model"] += array.document_bytes if coded else 0
+    return found | {"index": total - sum(found.values())}
 
 
 def is_container(path: str | Path) -> bool:
@@ -424,7 +444,15 @@ class Container:
             self.header_bytes = members[DOCUMENT].size
             self.attributes = MappingProxyType(dict(tree.attributes))
             stored = {
-                name: StoredArray(path, name, metadata, tree.chunks[name], source, self._cache)
+                name: StoredArray(
+                    path,
+                    name,
+                    metadata,
+                    tree.chunks[name],
+                    source,
+                    self._cache,
+                    members[f"{name}/{DOCUMENT}"].size,
+                )
                 for name, metadata in tree.arrays.items()
             }
             if len(tree.variables) == 1:
@@ -556,6 +584,20 @@ class Container:
         """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
 
+    def split(self) -> dict[str, int]:
+        """Bytes of the file by what they hold, which add up to `size`.
+
+        Keys: `field` (tables, residual, corrections, and which vertices have values), `coordinates`
+        and `beside` (arrays of either), `model` (layers, and documents of coded tables: they have
+        head, bases and steps) and `index` (header, directory, names, and all else).
+        """
+        arrays = {
+            array.name: (name, array)
+            for each in self.variables.values() or [self]
+            for name, array in each.arrays.items()
+        }
+        return split_bytes(self.size, arrays.values())
+
     @property
     def names(self) -> list[str]:
         """Names of the variables, in the order of the file."""
@@ -645,6 +687,10 @@ class VariableContainer(Container):
     def overhead(self) -> int:
         """Bytes of the variable's arrays that are no data of chunks."""
         return self.size - sum(self.arrays[name].nbytes_stored for name in self._own)
+
+    def split(self) -> dict[str, int]:
+        """Bytes of the variable's arrays by what they hold, as of a file."""
+        return split_bytes(self.size, [(name, self.arrays[name]) for name in self._own])
 
     def close(self) -> None:
         """Release the file after `closing_file`, else nothing: other variables need it."""

@@ -413,11 +413,13 @@ def _described(
             entry["dimensions"] = list(variable.dimensions)
         listed = inline_values(values, kind) if _fits_header(values) else None
         if listed is None:
+            stored = np.atleast_1d(values)
+            equal = [name for name, array in arrays.items() if _same_bits(array, stored)]
             place = variable.name if _PLAIN.fullmatch(variable.name) else "variable"
-            while place in {name.removeprefix(AUXILIARY) for name in arrays}:
+            while AUXILIARY + place in arrays and not equal:
                 place += "_"
-            entry["array"] = place
-            arrays[AUXILIARY + place] = np.atleast_1d(values)
+            entry["array"] = equal[0].removeprefix(AUXILIARY) if equal else place
+            arrays.setdefault(AUXILIARY + entry["array"], stored)
         else:
             entry["values"] = listed
     if kind != "float64":
@@ -426,6 +428,12 @@ def _described(
         entry["coordinate"] = variable.is_coordinate
     changed = _difference(variable.attributes, base)
     return entry | ({"attributes": changed} if changed else {})
+
+
+def _same_bits(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
+    """Whether two arrays have the same type, shape and bits."""
+    alike = one.dtype == other.dtype and one.shape == other.shape
+    return alike and one.tobytes() == other.tobytes()
 
 
 def _fits_header(values: npt.NDArray[Any]) -> bool:

@@ -286,6 +286,7 @@ class StoredArray:
         chunks: members of the file, in its order, by index of the chunk or, where there are
             shards, of the shard.
         nbytes_stored: bytes of the members' data in the file.
+        document_bytes: bytes of its metadata in the file.
     """
 
     def __init__(
@@ -296,8 +297,10 @@ class StoredArray:
         chunks: Mapping[Index, Member],
         source: Source,
         cache: ChunkCache,
+        document_bytes: int,
     ) -> None:
         self._path, self._source, self._cache = path, source, cache
+        self.document_bytes = document_bytes
         self._metadata = metadata
         self.name = name
         self.chunks = chunks

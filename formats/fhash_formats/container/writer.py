@@ -18,8 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.array import (
+    TRANSFORM,
     ArrayMetadata,
     Codec,
+    chunk_coder,
     pack_index,
     plain_codecs,
     sharding_codecs,
@@ -151,6 +153,26 @@ def full_chunk(
 
 USUAL_CHUNK_BYTES = 2 << 20
 """Bytes of a decoded chunk that `add_whole` aims at."""
+BESIDE_CHUNK_BYTES = 32 << 20
+"""The same for arrays beside the data, which readers take whole."""
+
+
+def coded_beside(
+    array: npt.NDArray[Any], chunk_shape: Sequence[int]
+) -> tuple[list[Codec], list[bytes]]:
+    """The codecs of an array beside the data, of at most four axes, and its chunks, coded by them.
+
+    They are those of ordinary arrays, or differences of neighbours, whichever takes fewer bytes.
+    """
+    found = []
+    differences: list[Codec] = [{"name": TRANSFORM, "configuration": {}}]
+    for codecs in (plain_codecs(array.dtype), differences):
+        coder, coded = chunk_coder(codecs, array.dtype, tuple(chunk_shape)), []
+        for chunk in cut(array, chunk_shape):
+            room = zip(chunk_shape, chunk.shape, strict=True)
+            coded.append(coder.encode(np.pad(chunk, [(0, whole - n) for whole, n in room])))
+        found.append((codecs, coded))
+    return min(found, key=lambda each: sum(map(len, each[1])))
 
 
 class _Abandoned(Exception):
@@ -171,7 +193,8 @@ class _Variable:
         dimensions: names at the root by axis.
         lengths: positions of the axes that are known.
         boxes: names by axis of those axes of the table that have not every position.
-        shares: numbers of other variables by name of the array that is theirs.
+        shares: number of a variable, and the array's name there if it has another, by name of an
+            array that lies there.
     """
 
     name: str | None
@@ -183,7 +206,7 @@ class _Variable:
     dimensions: dict[str, str] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     boxes: dict[str, str] = field(default_factory=dict)
-    shares: dict[str, int] = field(default_factory=dict)
+    shares: dict[str, Any] = field(default_factory=dict)
 
 
 class Mark(NamedTuple):
@@ -246,7 +269,7 @@ class ContainerWriter:
             self._nodes[name] = free_node(name, self._nodes.values())
         self._names_taken = set(self._nodes.values())
         self._coordinates: dict[str, tuple[Any, ...]] = {}
-        self._auxiliary: dict[tuple[Any, ...], int] = {}
+        self._auxiliary: dict[tuple[Any, ...], tuple[int, str]] = {}
 
     def begin(self, variable: Mapping[str, Any]) -> None:
         """Begin a variable, whose table has a name as near as possible to that of the variable.
@@ -372,7 +395,9 @@ class ContainerWriter:
         slabs along its leading axes. Arguments and errors are those of `add_array`.
 
         A coordinate, or an array beside the data, is written only where no other variable has it.
+        The latter is coded as differences of neighbours where that takes fewer bytes.
         """
+        chunks: Iterable[Coded] | None = None
         if name.startswith(COORDINATES):
             attributes = dict(attributes or {})
             wish = str(attributes.pop("name", name.removeprefix(COORDINATES)))
@@ -382,11 +407,14 @@ class ContainerWriter:
                 attributes["name"] = wish
         elif name.startswith(AUXILIARY):
             variable = self._current()
-            content = (name, array.dtype.str, array.shape, sha256(array.tobytes()).digest())
-            owner = self._auxiliary.setdefault(content, variable.number)
-            if owner != variable.number:
-                variable.shares[name] = owner
+            content = (array.dtype.str, array.shape, sha256(array.tobytes()).digest())
+            owner = self._auxiliary.setdefault(content, (variable.number, name))
+            if owner[0] != variable.number:
+                variable.shares[name] = owner[0] if owner[1] == name else list(owner)
                 return
+            if codecs is None and chunk_shape is None and array.ndim <= len(POSITIONS):
+                chunk_shape = slab_shape(array.shape, array.dtype.itemsize, BESIDE_CHUNK_BYTES)
+                codecs, chunks = coded_beside(array, chunk_shape)
         if chunk_shape is None:
             chunk_shape = slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES)
         self.add_array(
@@ -394,7 +422,7 @@ class ContainerWriter:
             shape=array.shape,
             dtype=array.dtype,
             chunk_shape=chunk_shape,
-            chunks=cut(array, chunk_shape),
+            chunks=cut(array, chunk_shape) if chunks is None else chunks,
             dimension_names=dimension_names,
             attributes=attributes,
             codecs=codecs,

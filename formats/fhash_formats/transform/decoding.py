@@ -15,9 +15,15 @@ from fhash_formats.support.arrays import Integers, Mask, Values
 from fhash_formats.support.threads import in_threads
 from fhash_formats.transform.coder import decode_integers, single_band
 from fhash_formats.transform.lifting import Transform, band_table
-from fhash_formats.transform.predict import Predictor, decode_predicted, values_of
+from fhash_formats.transform.predict import (
+    Predictor,
+    decode_differences,
+    decode_predicted,
+    values_of,
+)
 from fhash_formats.transform.spec import TransformSpec
 from fhash_formats.transform.tile_format import (
+    DIFFERENCES,
     EMPTY,
     EXACT,
     LABELS,
@@ -174,6 +180,9 @@ def _decode_stream(
     """The values of a stream less the origin of its settings, and which are occupied."""
     if stream.kind == EXACT:
         return _decode_exact(stream, shape, kind, lod)
+    if stream.kind == DIFFERENCES:
+        assert stream.body is not None, "a stream of differences has a body"
+        return decode_differences(stream.body, shape, kind)[_every(lod)], None
     if settings is None and not (stream.kind == LABELS and not stream.masked):
         raise DamagedFileError("a coded tile has no settings")
     if stream.kind == LABELS:

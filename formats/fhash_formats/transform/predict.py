@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import struct
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from itertools import combinations
@@ -23,7 +24,7 @@ from fhash_formats.transform.coder import (
     state_arguments,
     with_room,
 )
-from fhash_formats.transform.values import pieces
+from fhash_formats.transform.values import ZSTD_LEVEL, from_zstd, pieces
 
 CLASSES = 16
 """Kinds of passes, each with statistics of its own.
@@ -336,3 +337,226 @@ def _geometry(shape: tuple[int, ...], predictor: Predictor) -> list[Any]:
         taps.ctypes.data_as(ctypes.c_void_p),
         weights.ctypes.data_as(ctypes.c_void_p),
     ]
+
+
+MAX_ORDER = 6
+"""Most differences along an axis."""
+_CORNERS = 8
+"""Longest last axis whose places are planes of their own, such as the corners of cells."""
+_HOLES = 1
+"""Flag of a tile of differences in which one value stands at places told apart."""
+_RESTS = 2
+"""Flag of a tile of differences whose numbers are not all whole in their unit."""
+_NARROW = 4
+"""Flag of a tile of differences of float64 whose values are those of float32."""
+_FRONT = struct.Struct("<BdQB")
+_FAR = 1e15
+"""Magnitude from which a number that comes often stands for none."""
+_DECIMALS = 7
+"""Powers of ten that are tried as units."""
+_SHIFTS = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+"""Shifts (y, x) of a plane that may give the next one, as one corner of cells gives another."""
+
+
+def _planes(tile: Values) -> Values:
+    """The planes (planes, rows, columns) of a tile (t, z, y, x)."""
+    t, z, y, x = tile.shape
+    if x <= _CORNERS < y:
+        return tile.transpose(0, 3, 1, 2).reshape(t * x, z, y)
+    return tile.reshape(t * z, y, x)
+
+
+def _tile(planes: Values, shape: Axes) -> Values:
+    """The tile of a shape that has these planes; the inverse of `_planes`."""
+    t, z, y, x = shape
+    if x <= _CORNERS < y:
+        return np.ascontiguousarray(planes.reshape(t, x, z, y).transpose(0, 2, 3, 1))
+    return planes.reshape(shape)
+
+
+def _ordered(words: Values) -> Values:
+    """Integers in the order of the floats whose bits are `words`, or the other way round."""
+    signs: Values = words >> (8 * words.itemsize - 1)
+    ordered: Values = words ^ (signs & np.iinfo(words.dtype).max)
+    return ordered
+
+
+def _bytes(planes: Values) -> bytes:
+    """Integers with their sign in the lowest bit, the lowest bytes of all first."""
+    words = ((planes << 1) ^ (planes >> (8 * planes.itemsize - 1))).astype(f"<i{planes.itemsize}")
+    return words.view(np.uint8).reshape(-1, words.itemsize).T.tobytes()
+
+
+def _integers(data: npt.NDArray[np.uint8], shape: tuple[int, ...], size: int) -> Values:
+    """Integers of `size` bytes; the inverse of `_bytes`."""
+    words = np.ascontiguousarray(data.reshape(size, -1).T).view(f"<u{size}").reshape(shape)
+    words = words.astype(f"u{size}", copy=False)
+    return ((words >> 1) ^ -(words & 1)).view(f"i{size}")
+
+
+def _rounded(integers: Values, scale: float, kind: np.dtype[Any]) -> Values:
+    """The ordered floats of integers in a unit of 1 / scale."""
+    with np.errstate(over="ignore"):
+        return _ordered((integers.astype(np.float64) / scale).astype(kind).view(integers.dtype))
+
+
+def decode_differences(data: memoryview, shape: Axes, dtype: np.dtype[Any]) -> Values:
+    """The tile (t, z, y, x) that `encode_differences` coded. Raises DamagedFileError."""
+    grid = _planes(np.broadcast_to(np.int8(0), shape)).shape
+    count, marks = math.prod(shape), -(-math.prod(shape) // 8)
+    found = from_zstd(data, _FRONT.size, _FRONT.size + 2 * count * dtype.itemsize + marks)
+    flags, scale, hole, order = _FRONT.unpack_from(found.data)
+    holes, rests, narrow = (bool(flags & flag) for flag in (_HOLES, _RESTS, _NARROW))
+    kind = np.dtype(np.float32) if narrow and dtype == np.float64 else dtype
+    size = kind.itemsize
+    lengths = [count * size, count * size * rests, marks * holes]
+    sound = len(found) == _FRONT.size + sum(lengths) and hole >> 8 * size == 0
+    sound = sound and max(divmod(order, 16)) <= MAX_ORDER and flags < 2 * _NARROW
+    sound = sound and (0 < scale < math.inf if kind.kind == "f" else flags == 0 == scale)
+    if not sound or narrow is (kind == dtype):
+        raise DamagedFileError("a tile of differences has numbers that no encoder writes")
+    first, rest, last = np.split(found[_FRONT.size :], np.cumsum(lengths[:2]))
+    words = _integers(first, grid, size)
+    for axis, sums in enumerate(divmod(order, 16), start=1):
+        for _ in range(sums):
+            np.cumsum(words, axis, words.dtype, words)
+    if kind.kind == "f":
+        words = _rounded(words, scale, kind)
+        words = _ordered(words + _integers(rest, grid, size) if rests else words)
+    if holes:
+        words.view(f"u{size}")[np.unpackbits(last, count=count).reshape(grid).view(bool)] = hole
+    return _tile(words.view(kind), shape).astype(dtype, copy=False)
+
+
+def encode_differences(tile: Values) -> bytes | None:
+    """The body of a tile (t, z, y, x) as differences of neighbours, which keeps every bit.
+
+    FORMAT.md, Differences, says what they are. None for floats of which none is a usual number.
+    """
+    flags, scale, hole = 0, 0.0, 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        narrow = tile.astype(np.float32)
+        if tile.dtype == np.float64 and narrow.astype(np.float64).tobytes() == tile.tobytes():
+            tile, flags = narrow, _NARROW
+    kind = tile.dtype
+    planes = np.ascontiguousarray(_planes(tile))
+    words = planes.view(f"i{kind.itemsize}")
+    parts, missing = [words.copy()], np.zeros(planes.shape, bool)
+    if kind.kind == "f":
+        with np.errstate(invalid="ignore"):
+            numbers = planes.astype(np.float64)
+            usual = np.abs(numbers) < _FAR
+        if not usual.any():
+            return None
+        if not usual.all():
+            bits = words.view(f"u{kind.itemsize}")
+            kinds, counts = np.unique(bits[~usual], return_counts=True)
+            hole, flags = int(kinds[counts.argmax()]), flags | _HOLES
+            missing = bits == hole
+        numbers[~usual] = 0
+        scale = _scale(numbers, kind)
+        parts[0] = np.rint(numbers * scale).astype(words.dtype)
+        parts.append(_ordered(words) - _rounded(parts[0], scale, kind))
+        parts[1][missing] = 0
+        if flags & _HOLES:
+            _fill(parts, missing)
+    order, differences = _differences(parts[0])
+    body = [_bytes(differences)]
+    if len(parts) > 1 and parts[1].any():
+        body.append(_bytes(parts[1]))
+        flags |= _RESTS
+    if flags & _HOLES:
+        body.append(np.packbits(missing).tobytes())
+    from numcodecs.zstd import compress
+
+    return bytes(compress(_FRONT.pack(flags, scale, hole, order) + b"".join(body), ZSTD_LEVEL))
+
+
+def _scale(numbers: Values, kind: np.dtype[Any]) -> float:
+    """The number of units in 1: a power of ten if numbers are decimals, else a power of two."""
+    largest = float(np.abs(numbers).max())
+    bits = min(53, 8 * kind.itemsize - 1)
+    for scale in (10.0**digits for digits in range(_DECIMALS)):
+        if largest * scale >= 1 << bits:
+            break
+        for some in (numbers.reshape(-1)[:256], numbers):
+            if ((np.rint(some * scale) / scale).astype(kind) != some).any():
+                break
+        else:
+            return scale
+    exponent = max(math.frexp(largest)[1], -900)
+    return 2.0 ** (np.finfo(kind).nmant + 1 - exponent)
+
+
+def _shift(planes: Values, missing: Mask) -> tuple[int, int] | None:
+    """The shift of the first of two planes that gives most of the second; None for under half."""
+    best: tuple[float, tuple[int, int] | None] = (0.5, None)
+    for shift in _SHIFTS:
+        known = ~np.roll(missing[0], shift, (0, 1)) & ~missing[1]
+        equal = (np.roll(planes[0], shift, (0, 1)) == planes[1])[known]
+        share = float(equal.mean()) if equal.size else 0.0
+        best = (share, shift) if share > best[0] else best
+    return best[1]
+
+
+def _fill(parts: list[Values], missing: Mask) -> None:
+    """Put numbers that cost few bytes where values are missing, in place.
+
+    They come from the planes before and after where those show the same places, and else go on as
+    the rows around them do.
+    """
+    lacking, shifts = missing.copy(), {}
+
+    def copy(source: int, target: int, shift: tuple[int, int]) -> None:
+        known = lacking[target] & ~np.roll(lacking[source], shift, (0, 1))
+        for part in parts:
+            part[target][known] = np.roll(part[source], shift, (0, 1))[known]
+        lacking[target][known] = False
+
+    for number in range(len(missing) - 1, 0, -1):
+        pair = slice(number - 1, number + 1)
+        if shift := _shift(parts[0][pair], missing[pair]):
+            shifts[number] = shift
+            copy(number, number - 1, (-shift[0], -shift[1]))
+    for number in range(len(missing)):
+        if number in shifts:
+            copy(number - 1, number, shifts[number])
+        if lacking[number].any():
+            _fill_plane(parts[0][number], ~lacking[number])
+            lacking[number] = False
+
+
+def _fill_plane(plane: Values, known: Mask) -> None:
+    """Fill a plane where nothing is known: each row differs from the one before as around there."""
+    places, slope = np.arange(plane.shape[1]), np.zeros(plane.shape[1])
+    rows = np.flatnonzero(known.any(1))
+    for row in range(rows[0] if len(rows) else len(plane), len(plane)):
+        if row == rows[0]:
+            both, base = known[row], np.zeros_like(plane[row])
+        else:
+            both, base = known[row] & known[row - 1], plane[row - 1]
+        if both.any():
+            slope = np.interp(places, places[both], (plane[row] - base)[both])
+        plane[row] = np.where(known[row], plane[row], base + np.rint(slope).astype(plane.dtype))
+    if len(rows):
+        plane[: rows[0]] = plane[rows[0]]
+
+
+def _differences(planes: Values) -> tuple[int, Values]:
+    """The orders along rows and columns, 16 y + x, that take the fewest bits, and differences."""
+    some, best = planes[:: 1 + len(planes) // 2], (math.inf, 0)
+    for y in range(MAX_ORDER + 1 if planes.shape[1] > 1 else 1):
+        along = some
+        for x in range(MAX_ORDER + 1):
+            bits = float(np.log2(np.abs(along.astype(np.float64)) + 1).sum())
+            best = min(best, (bits, 16 * y + x))
+            along = _differed(along, 2, 1)
+        some = _differed(some, 1, 1)
+    return best[1], _differed(_differed(planes, 1, best[1] >> 4), 2, best[1] & 15)
+
+
+def _differed(planes: Values, axis: int, order: int) -> Values:
+    """The differences of an order along an axis; the first value differs from 0."""
+    for _ in range(order):
+        planes = np.diff(planes, axis=axis, prepend=planes.dtype.type(0))
+    return planes

@@ -18,7 +18,15 @@ from fhash_formats.transform.decoding import (
     decode_tile_table,
     uncorrected,
 )
-from fhash_formats.transform.tile_format import Shape, TileSettings, parse_stream
+from fhash_formats.transform.predict import encode_differences
+from fhash_formats.transform.tile_format import (
+    DIFFERENCES,
+    Shape,
+    TileSettings,
+    build_exact_stream,
+    parse_stream,
+    seal,
+)
 
 KEY = "axes"
 """Key of the axes in the configuration of `fhash.transform`."""
@@ -172,16 +180,14 @@ class TransformCoder:
         self.parted = has_head and not self.masked and len(shape) == 4 and self.axes is None
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
-        """The stream of a full chunk."""
-        if self.settings is None:
-            raise InputError(
-                "fhash.transform without settings only decodes here; "
-                "fhash_formats.transform.zarr_codec chooses them"
-            )
+        """The stream of a full chunk, which keeps every bit where there are no settings."""
         from fhash_formats.transform.encoding import encode_tile  # which a decoder does without
 
         tile = chunk.reshape(self._tile_shape) if self.axes is None else self.axes.to_tile(chunk)
-        return encode_tile(tile, self.settings).data
+        if self.settings is not None:
+            return encode_tile(tile, self.settings).data
+        body = encode_differences(np.ascontiguousarray(tile, self._dtype))
+        return build_exact_stream(tile, None, None) if body is None else seal(DIFFERENCES, [body])
 
     def check(self, data: memoryview | bytes) -> None:
         """Raises DamagedFileError for a stream that is damaged."""

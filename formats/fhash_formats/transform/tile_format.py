@@ -350,7 +350,7 @@ def _check_finite(name: str, value: Any) -> None:
 Shape = tuple[int, int, int, int]
 """Lengths of a tile along (t, z, y, x)."""
 
-TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY = range(5)
+TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY, DIFFERENCES = range(6)
 """Kinds of streams."""
 KIND = 7
 """Bits of the flags that hold the kind."""
@@ -371,6 +371,7 @@ _ALLOWED = {
     LABELS: OWN | MASKED,
     EXACT: OWN | MASKED,
     EMPTY: OWN | MISSING | MASKED,
+    DIFFERENCES: 0,
 }
 """Flags that a stream of each kind may have."""
 _CHECKSUM = 4
@@ -386,12 +387,12 @@ class TileStream:
     """The sections of a stream. A section is None where the flags say that there is none.
 
     Attributes:
-        kind: TRANSFORMED, PREDICTED, LABELS, EXACT or EMPTY.
+        kind: TRANSFORMED, PREDICTED, LABELS, EXACT, EMPTY or DIFFERENCES.
         masked: whether the stream says which values are occupied.
         fast: whether coefficients and residual are those of the fast coder.
         settings: the tile's own settings.
         missing: missing values.
-        body: coefficients, predicted integers, labels or exact values.
+        body: coefficients, predicted integers, labels, exact values or differences.
         residual: the residual.
         mask: the mask.
     """

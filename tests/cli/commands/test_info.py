@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -48,7 +49,11 @@ def test_the_card_names_every_part_with_its_place(fhash: Fhash, name: str, said:
         assert f"\n{row}" in short
     for text in said:
         assert text in short
-    card = json.loads(fhash("info", path, "--json").stdout)["card"]
+    report = json.loads(fhash("info", path, "--json").stdout)
+    card, parts = report["card"], report["split"]
+    assert sum(parts.values()) == report["bytes"] == path.stat().st_size
+    listed = [name for name in parts if parts[name]]
+    assert re.findall(r"(\w+) [0-9.]+ k?B", short.split("\nsplit ")[1].split("\n")[0]) == listed
     full = fhash("info", path, "-v").stdout
     assert [line.split() for line in short.splitlines() if not added(line)] == [
         line.split() for line in full.splitlines() if not added(line)

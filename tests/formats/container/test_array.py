@@ -27,11 +27,11 @@ from fhash_formats.container.array import (
     plain_codecs,
     sharding_codecs,
     with_crc32c,
-    zstd_content_size,
 )
 from fhash_formats.container.zip_file import MAX_MEMBER
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.native import crc32c
+from fhash_formats.transform.values import zstd_content_size
 
 DAMAGED = [
     ("shape", [2**60], "chunks; .* are declared"),

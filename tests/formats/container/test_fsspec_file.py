@@ -262,8 +262,21 @@ def test_a_package_that_is_missing(monkeypatch, missing: str, url: str, told: st
     for scheme in ("http", "https", "s3"):
         monkeypatch.delitem(known, scheme, raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
+    monkeypatch.setattr(fsspec_file, "find_spec", lambda name: None)  # no obstore
     with pytest.raises(MissingDependencyError, match=told):
         FsspecFile.open(url, {})
+
+
+def test_obstore_reads_an_object_store(range_server, monkeypatch) -> None:
+    pytest.importorskip("obstore")
+    url = range_server.put("bucket/run.fhz", DATA)
+    monkeypatch.setenv("AWS_ENDPOINT", url.removesuffix("/bucket/run.fhz"))
+    for key, value in (("SKIP_SIGNATURE", "true"), ("ALLOW_HTTP", "true"), ("REGION", "x")):
+        monkeypatch.setenv(f"AWS_{key}", value)
+    file = FsspecFile.open("s3://bucket/run.fhz", {})
+    assert (file.size, file.fetch(5, 9), file.changed()) == (len(DATA), DATA[5:9], False)
+    range_server.put("bucket/run.fhz", DATA[::-1])
+    assert file.changed()
 
 
 @needs_fork

@@ -286,6 +286,14 @@ ROOTS = {
         {"auxiliary/a": 2},
         "array parts/2.auxiliary.a is missing",
     ),
+    "shares of another table": (f"{FIRST}.shares", {"auxiliary/a": [2, "tables/level_1"]}, "names"),
+    "shares of three": (f"{FIRST}.shares", {"auxiliary/a": [2, "auxiliary/a", 1]}, "names"),
+    "shares of names": (f"{FIRST}.shares", {"auxiliary/a": [["auxiliary/a"], 2]}, "names"),
+    "shares of another name that are not there": (
+        f"{FIRST}.shares",
+        {"auxiliary/a": [2, "auxiliary/b"]},
+        "array parts/2.auxiliary.b is missing",
+    ),
     "other documents at the root": (
         f"{META}.u.fill_value",
         1,
@@ -560,6 +568,8 @@ def test_everything_comes_back() -> None:
             variable("b", ("record", "bnds"), np.arange(6).reshape(3, 2)),
             variable("field", ("lat", "x"), np.tile(large, 1)),
             variable("wide", ("n",), np.arange(MAX_INLINE + 1, dtype="u2")),
+            variable("same", ("n",), np.arange(MAX_INLINE + 1, dtype="u2")),
+            variable("wider", ("n",), np.arange(MAX_INLINE + 1, dtype="u4")),
             variable("odd name", ("n",), np.random.default_rng(1).random(MAX_INLINE + 1)),
             variable("crs", (), np.int32(0), attributes={"name": "rotated", "a": np.int8(1)}),
             variable("label", ("one",), np.array(["é"], dtype=object), is_coordinate=True),
@@ -583,7 +593,8 @@ def test_everything_comes_back() -> None:
         assert one.values.tobytes() == other.values.tobytes() or one.values.dtype == object
         np.testing.assert_equal(dict(other.attributes), dict(one.attributes))
     assert set(arrays) == {
-        "auxiliary/wide",
+        "auxiliary/wide",  # and for same
+        "auxiliary/wider",
         "auxiliary/variable",
         "auxiliary/nan",
     }  # field is small

@@ -672,6 +672,8 @@ def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, sa
             writer.begin(PLAIN_VARIABLE)
             add_coordinates(writer)
             writer.add_whole("auxiliary/lat", places + (name == "w"))
+            if name != "u":
+                writer.add_whole(f"auxiliary/lat_{name}", places)
             table_parts().write(writer)
             writer.finish(compact_header(samples))
         writer.commit()
@@ -681,6 +683,60 @@ def test_arrays_beside_the_data_are_there_once_where_they_are_equal(tmp_path, sa
         u, v, w = (each.arrays["auxiliary/lat"] for each in file.variables.values())
         assert u is v
         assert (w.read() - u.read() == 1).all()
+        same = [file.variables[name].arrays[f"auxiliary/lat_{name}"] for name in "vw"]
+        assert same == [u, u]
+        assert file.header["variables"][2]["shares"] == {"auxiliary/lat_w": [0, "auxiliary/lat"]}
         assert file.variables["v"].size < file.variables["u"].size
         assert file.variables["v"].overhead() > 0
         assert sum(each.size for each in file.variables.values()) < file.size
+
+
+@pytest.mark.parametrize(("kind", "chunk"), [("<f8", 1 << 20), ("<i4", 3 << 10), ("|u1", 700)])
+def test_arrays_beside_the_data_are_coded_as_differences_where_that_is_smaller(
+    tmp_path, samples, monkeypatch, kind, chunk
+) -> None:
+    monkeypatch.setattr("fhash_formats.container.writer.BESIDE_CHUNK_BYTES", chunk)
+    smooth = (np.add.outer(np.arange(50) ** 2, np.arange(40)) / 8).astype(kind)
+    rough = np.frombuffer(np.random.default_rng(5).bytes(2000 * smooth.itemsize), kind)
+    header = samples.header()
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        writer.begin(PLAIN_VARIABLE)
+        for name, values in samples.arrays(header).items():
+            writer.add_whole(name, values)
+        writer.add_whole("auxiliary/smooth", smooth)
+        writer.add_whole("auxiliary/rough", rough)
+        writer.commit({**header, "required_features": []})
+    with Container.open(tmp_path / "a.fhz") as file:
+        arrays = file.arrays
+        assert arrays["auxiliary/smooth"].coding == "fhash.transform"
+        assert arrays["auxiliary/smooth"].grid == (-(-smooth.nbytes // chunk), 1)
+        assert arrays["auxiliary/rough"].coding == "bytes"
+        assert arrays["auxiliary/smooth"].read().tobytes() == smooth.tobytes()
+        assert arrays["auxiliary/rough"].read().tobytes() == rough.tobytes()
+        assert file.verify() == len(arrays)
+
+
+def test_the_bytes_of_a_file_are_split_without_a_rest(tmp_path, samples) -> None:
+    path = write_several(tmp_path / "a.fhz", samples)
+    with Container.open(path) as file:
+        parts = file.split()
+        assert list(parts) == ["field", "coordinates", "beside", "model", "index"]
+        assert sum(parts.values()) == file.size == path.stat().st_size
+        areas = [array for name, array in file.arrays.items() if name.endswith(".area")]
+        assert parts["beside"] == sum(array.nbytes_stored for array in areas) > 0
+        positions = ("time", "z", "y", "lon_deg_")
+        assert parts["coordinates"] > sum(file.arrays[name].nbytes_stored for name in positions)
+        each = {name: variable.split() for name, variable in file.variables.items()}
+        for name, variable in file.variables.items():
+            assert sum(each[name].values()) == variable.size
+        for part in ("field", "beside", "model"):
+            assert sum(found[part] for found in each.values()) == parts[part]
+        assert each["u"]["field"] == file.variables["u"].arrays["tables/level_1"].nbytes_stored
+        assert each["u"]["model"] > each["w"]["model"] > 0, "u has a head"
+        weights = sum(
+            array.nbytes_stored
+            for name, array in file.variables["paper"].arrays.items()
+            if name.startswith("mlp/")
+        )
+        assert each["paper"]["model"] == weights
+        assert file.variables["group/v"].split()["beside"] == 0, "the array is that of u"

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import ctypes
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 import tiles
+from numcodecs.zstd import compress, decompress
 from specs import spec_of
 from tiles import SETTINGS, Four, predictor_of, random_head, resealed, same, streams, wave
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.native import crc32c
+from fhash_formats.support.values import DTYPES
 from fhash_formats.transform import decoding, predict
 from fhash_formats.transform.coder import MaskLevels, State, state_arguments
 from fhash_formats.transform.decoding import decode_tile, decode_tile_mask
@@ -23,12 +27,15 @@ from fhash_formats.transform.encoding import Coding, encode_tile
 from fhash_formats.transform.predict import (
     MAX_PREDICTED_INTEGER,
     Predictor,
+    decode_differences,
     decode_predicted,
+    encode_differences,
     encode_predicted,
     integers_of,
     passes_of,
 )
 from fhash_formats.transform.tile_format import (
+    DIFFERENCES,
     EMPTY,
     EXACT,
     FAST,
@@ -467,7 +474,7 @@ def test_flags_that_say_something_else_are_damage_before_anything_is_decoded(
 
     for function in ("decode_integers", "decode_predicted", "unpack_planes"):
         monkeypatch.setattr(decoding, function, decoded)
-    for change in (5, 6, 7) if stream.kind == TRANSFORMED else (5, 6, 7, FAST):
+    for change in (6, 7) if stream.kind == TRANSFORMED else (6, 7, FAST):
         other = bytes([flags & ~KIND | change if change < 8 else flags | change])
         with pytest.raises(DamagedFileError, match="flags"):
             decode_tile(resealed(data[:4] + other + data[5:]), values.shape, values.dtype)
@@ -601,3 +608,114 @@ def test_text_that_holds_no_settings_is_damage(text: Any) -> None:
 def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(SETTINGS, **changes)
+
+
+def rotated_pole(rows: int, columns: int, *, corners: bool) -> npt.NDArray[np.float64]:
+    """Longitudes of a grid about a rotated pole at 39.25 N, 162 W: centres, or (.., 4) corners."""
+    y, x = (np.radians(np.arange(n + 1) * 0.22 - 20) for n in (rows, columns))
+    east = np.cos(y)[:, None] * np.sin(x)
+    ahead = np.cos(y)[:, None] * np.cos(x)
+    pole, north = np.radians(39.25), np.sin(y)[:, None]
+    away = np.arctan2(east, np.sin(pole) * ahead - north * np.cos(pole))
+    at = (np.degrees(away) - 162 + 180) % 360 - 180
+    if not corners:
+        return at[:-1, :-1].copy()
+    return np.stack([at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]], axis=-1)
+
+
+def differences(values: npt.NDArray[Any]) -> bytes:
+    """The body of differences, after it was decoded to the same bits."""
+    shape = (1,) * (4 - values.ndim) + values.shape
+    body = encode_differences(values.reshape(shape))
+    assert body is not None
+    decoded = decode_differences(memoryview(body), shape, values.dtype)
+    assert decoded.dtype == values.dtype
+    assert decoded.shape == shape
+    assert decoded.tobytes() == values.tobytes()
+    return body
+
+
+@pytest.mark.parametrize("corners", [False, True])
+@pytest.mark.parametrize("case", ["as it is", "rounded", "float32", "land"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_differences_of_a_grid_take_a_third_of_its_deflated_bytes(
+    dtype: str, case: str, corners: bool
+) -> None:
+    values = rotated_pole(60, 90, corners=corners)
+    if case == "rounded":
+        values = np.round(values, 4)
+    elif case == "float32":
+        values = values.astype(np.float32).astype(np.float64)
+    elif case == "land":
+        values[20:45, 30:50] = np.nan
+    values = values.astype(dtype)
+    assert 3 * len(differences(values)) < len(zlib.compress(values.tobytes(), 9))
+
+
+def test_corners_cost_little_more_than_centres() -> None:
+    centres, corners = (rotated_pole(60, 90, corners=each) for each in (False, True))
+    assert len(differences(corners)) < 1.6 * len(differences(centres))
+
+
+@pytest.mark.parametrize("kind", DTYPES)
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 1, 1, 9), (1, 1, 12, 2), (2, 3, 4, 9)])
+def test_differences_keep_every_bit_of_any_values(kind: str, shape: Four) -> None:
+    dtype, count = np.dtype(kind), prod(shape)
+    values = np.frombuffer(np.random.default_rng(3).bytes(count * dtype.itemsize), dtype)
+    differences(values.reshape(shape))
+    if dtype.kind == "f":
+        odd = np.resize([0.0, -0.0, 1.5, np.inf, np.nan, -np.inf, -3e-5, 7e4], count)
+        with np.errstate(over="ignore"):
+            differences(odd.astype(dtype).reshape(shape))
+        signalling = np.full(shape, np.array(-1).astype(f"i{dtype.itemsize}")).view(dtype)
+        mixed = np.where(np.arange(count).reshape(shape) % 2 > 0, signalling, values.dtype.type(2))
+        differences(mixed)
+
+
+def test_what_has_no_differences_is_told() -> None:
+    assert encode_differences(np.full((1, 1, 3, 9), np.nan)) is None
+
+
+WRONG_DIFFERENCES = {
+    "a flag that is not known": (0, b"\x08"),
+    "holes without bits": (0, b"\x01"),
+    "rests that are not there": (0, b"\x02"),
+    "float32 that is float64": (0, b"\x04"),
+    "a negative scale": (8, b"\xc0"),
+    "a scale of NaN": (7, b"\xf8\x7f"),
+    "a hole beyond the type": (16, b"\x01"),
+    "an order of seven": (17, b"\x70"),
+    "an order of seven along rows": (17, b"\x07"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_DIFFERENCES)
+def test_differences_that_no_encoder_writes(case: str) -> None:
+    values = np.round(rotated_pole(9, 12, corners=False), 3).astype(np.float32)
+    place, wrong = WRONG_DIFFERENCES[case]
+    plain = bytearray(decompress(differences(values)))
+    assert plain[0] == 0, "neither holes nor rests"
+    plain[place : place + len(wrong)] = wrong
+    with pytest.raises(DamagedFileError, match="numbers that no encoder writes"):
+        decode_differences(memoryview(compress(bytes(plain), 1)), (1, 1, 9, 12), values.dtype)
+
+
+def test_differences_that_are_cut_or_too_many_are_refused() -> None:
+    values = rotated_pole(9, 12, corners=False)
+    body, shape = memoryview(differences(values)), (1, 1, 9, 12)
+    for cut in (0, 5, 12, len(body) - 1):
+        with pytest.raises(DamagedFileError):
+            decode_differences(body[:cut], shape, values.dtype)
+    with pytest.raises(DamagedFileError, match="zstd declares"):
+        decode_differences(body, (1, 1, 9, 4), values.dtype)
+    with pytest.raises(DamagedFileError, match="zstd declares"):
+        decode_differences(memoryview(compress(bytes(1 << 20), 1)), shape, values.dtype)
+
+
+def test_a_stream_of_differences_has_details_and_no_flags() -> None:
+    values = rotated_pole(9, 12, corners=False)[None, None]
+    stream = seal(DIFFERENCES, [differences(values)])
+    assert same(decode_tile(stream, values.shape, values.dtype), values)
+    assert same(decode_tile(stream, values.shape, values.dtype, lod=1), values[..., ::2, ::2])
+    with pytest.raises(DamagedFileError, match="flags"):
+        parse_stream(seal(DIFFERENCES | MASKED, [differences(values), b""]))
