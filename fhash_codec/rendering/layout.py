@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -74,6 +75,21 @@ def font(size: int) -> FreeTypeFont | ImageFont:
     from PIL import ImageFont
 
     return ImageFont.load_default(size)
+
+
+def drawable(text: str) -> str:
+    """A text in letters that the font has: no accents, Greek ones by name, ? for what is left."""
+
+    def one(letter: str) -> str:
+        if letter.isascii() or letter == "\N{DEGREE SIGN}":
+            return letter
+        name = unicodedata.name(letter, "")
+        if letter == "\N{GREEK SMALL LETTER MU}":
+            return "u"
+        return name.split()[-1].lower() if name.startswith("GREEK") else "?"
+
+    parts = unicodedata.normalize("NFKD", text).replace("\N{MINUS SIGN}", "-")
+    return "".join(one(each) for each in parts if not unicodedata.combining(each))
 
 
 @cache
@@ -239,11 +255,12 @@ def overflow(labels: Sequence[Label], frame: Rectangle) -> tuple[float, float, f
 
 def _name(coordinate: Coordinate, size: int, breaking: int, limit: float) -> tuple[str, ...]:
     """The lines of an axis' name with its units."""
-    units = str(coordinate.attributes.get("units", ""))
+    units = drawable(str(coordinate.attributes.get("units", "")))
+    name = drawable(coordinate.name)
     if units in ("", "1"):
-        lines: tuple[str, ...] = (coordinate.name,)
+        lines: tuple[str, ...] = (name,)
     else:
-        lines = (coordinate.name, f"[{units}]")
+        lines = (name, f"[{units}]")
     if breaking == 2:
         return wrapped(" ".join(lines), size, limit)
     return lines if breaking else (" ".join(lines),)
@@ -478,8 +495,8 @@ class _Trial:
 
 
 def quantity_of(name: str, units: str) -> str:
-    """Name of a variable with its units, if it has any."""
-    return name if units in ("", "1") else f"{name} [{units}]"
+    """Name of a variable with its units, if it has any, as it can be drawn."""
+    return drawable(name if units in ("", "1") else f"{name} [{units}]")
 
 
 def _with_scales(

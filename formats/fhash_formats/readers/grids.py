@@ -673,7 +673,7 @@ def _traces(path: Path, file: Any) -> list[Variable]:
         dimensions=tuple(columns),
         read=by_ranges(shape, get),
     )
-    units = {"sample": {"units": "ms"}}
+    units = {"sample": {"units": "ms", "positive": "down"}}
     coords = [
         positions(name, each, {"axis": axes[name], **units.get(name, {})})
         for name, each in columns.items()

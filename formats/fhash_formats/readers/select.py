@@ -617,6 +617,9 @@ class Selection:
         for each in near.values():
             if each.name != variable.name and not each.error and not each.computed:
                 found.setdefault(self._flat(variable, each), each)
+        if self.opened.naming:  # where nothing else is beside, positions need no mention
+            tied = (self._by_name[name] for name in variable.first.scales.values())
+            found |= {each.label: each for each in tied if each.computed}
         return found
 
     def listed(self) -> list[Listed]:

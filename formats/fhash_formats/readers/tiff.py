@@ -122,7 +122,7 @@ def _variables(path: Path, file: Any) -> list[Variable]:
         return _pages(series, index)
 
     whole = Variable(
-        name=path.stem,
+        name=path.stem.removesuffix(".ome"),
         shape=tuple(shape[n] for n in kept),
         dtype=np.dtype(series.dtype),
         dimensions=tuple(AXIS_NAMES.get(axes[n]) for n in kept),

@@ -27,6 +27,7 @@ from fhash_codec.rendering.image import Image, Pen, overlay, surrounded, time_te
 from fhash_codec.rendering.layout import (
     TITLE_GAP,
     Layout,
+    drawable,
     end_texts,
     lay_out,
     length,
@@ -489,6 +490,20 @@ def test_from_inside_the_volume_the_overlay_is_finite() -> None:
         everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
     )
     assert np.all(np.isfinite(inside.rgba))
+
+
+@pytest.mark.parametrize(
+    ("text", "drawn"),
+    [
+        ("z [µm]", "z [um]"),
+        ("Température [°C]", "Temperature [°C]"),
+        ("u [m s⁻¹]", "u [m s-1]"),
+        ("\N{GREEK SMALL LETTER RHO} [kg m\N{MINUS SIGN}3]", "rho [kg m-3]"),
+        ("密度", "??"),
+    ],
+)
+def test_texts_are_drawn_in_letters_that_the_font_has(text: str, drawn: str) -> None:
+    assert drawable(text) == drawn
 
 
 def test_the_text_of_a_time() -> None:

@@ -62,6 +62,8 @@ def test_ome_zarr(tmp_path: Path, version: str) -> None:
     np.testing.assert_array_equal(values, -VALUES)
     assert ends == {"t": [0, 6], "z": [6, 7], "y": [4, 4.5], "x": [2, 2.25]}
     assert units == ["second", "micrometer", "micrometer", "micrometer"]
+    with open_series(path, var="GFP_488") as series:
+        assert {each.name for each in series.metadata.variables} == {"time", "z", "y", "x"}
     for place, wishes in ((path, {"var": "1"}), (path / "1", {})):
         values, ends, _ = positions(place, select={"channel": 0}, **wishes)
         np.testing.assert_array_equal(values, VALUES[..., ::2, ::2])
