@@ -24,6 +24,7 @@ from fhash_formats.readers.variables import (
     Behind,
     Source,
     Variable,
+    by_ranges,
     file_source,
     parent,
     placed,
@@ -469,23 +470,17 @@ def _padded(dataset: Any, shape: Sequence[int], dtype: np.dtype[Any], *, text: b
             return np.array(texts, dtype=object).reshape(values.shape)
         return values if dtype.names else values.astype(dtype, copy=False)
 
-    def grown(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
-        wanted = [
-            range(each, each + 1) if isinstance(each, int) else range(*each.indices(length))
-            for each, length in zip(places, shape, strict=True)
-        ]
+    def grown(wanted: list[range]) -> npt.NDArray[Any]:
         result = np.full([len(each) for each in wanted], dataset.fillvalue, dtype)
         there = [
-            range(each.start, max(each.start, min(each.stop, length)))
+            slice(each.start, max(each.start, min(each.stop, length)))
             for each, length in zip(wanted, dataset.shape, strict=True)
         ]
-        if all(there):
-            stored = dataset[tuple(slice(each.start, each.stop) for each in there)]
-            result[tuple(slice(0, len(each)) for each in there)] = stored
-        kept = [len(w) for w, each in zip(wanted, places, strict=True) if isinstance(each, slice)]
-        return result.reshape(kept)
+        stored = dataset[tuple(there)]
+        result[tuple(map(slice, stored.shape))] = stored
+        return result
 
-    return read if tuple(shape) == tuple(dataset.shape) else grown
+    return read if tuple(shape) == tuple(dataset.shape) else by_ranges(shape, grown)
 
 
 def require_filters(source: str, name: str, dataset: Any) -> None:
