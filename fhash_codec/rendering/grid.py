@@ -233,7 +233,8 @@ def northward(coords: Mapping[str, Coordinate], volume: Volume) -> dict[str, Coo
         match = NORTH.fullmatch(str(each.attributes.get("units", "")))
         axis = "x" if match is not None and match["east"] else "y"
         axes = [metadata.dimensions.get(name) for name in each.dimensions] if metadata else []
-        if match is None or axis not in bare or sorted(map(str, axes)) != ["x", "y"]:
+        numeric = each.values.dtype.kind in "iuf"
+        if match is None or axis not in bare or sorted(map(str, axes)) != ["x", "y"] or not numeric:
             continue
         values = np.where(each.values < MAX_DEGREES, each.values, np.nan).astype(np.float64)
         steps = [np.diff(values, axis=axes.index(name)) for name in (axis, "xy".strip(axis))]

@@ -375,6 +375,8 @@ def _is_run(path: str) -> bool:
     place = Path(path)
     if place.suffix.lower() == ".fhz":
         return True
+    if not place.is_file():
+        return False
     with suppress(OSError), place.open("rb") as file:
         if file.read(2) == b"PK":
             # the import takes as long as most listings

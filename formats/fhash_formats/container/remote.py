@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import count
 from typing import Any, TypeVar
 
@@ -25,6 +24,7 @@ from fhash_formats.errors import (
     MissingDependencyError,
     MissingInputError,
 )
+from fhash_formats.support.files import by_obstore
 
 TAIL_BYTES = 16 << 10
 """Bytes of the end of a file that are read first; directory and header of most files lie there."""
@@ -242,8 +242,6 @@ _PASSING = {408, 425, 429, 500, 502, 503, 504}
 """HTTP statuses that say that the same request may succeed later."""
 _CHANGED = 412
 """HTTP status that says that the file is not the one that was asked for."""
-OBJECT_STORES = ("s3", "gs", "az", "abfs")
-"""Schemes of URLs that obstore reads where it is installed and no options are given."""
 _STAMP = (
     *(
         "size",
@@ -319,11 +317,10 @@ class FsspecFile:
             raise MissingDependencyError(
                 f"{url}: URLs need fsspec; pip install 'fhash[remote]'"
             ) from error
-        scheme = url.partition("://")[0]
         try:
-            if scheme in OBJECT_STORES and not options and find_spec("obstore") is not None:
-                # imported in 5 ms, the packages that fsspec needs for them in a second
-                return cls(import_module("obstore.fsspec").FsspecStore(scheme), url, url)
+            if not options and by_obstore(url):
+                fs = import_module("obstore.fsspec").FsspecStore(url.partition("://")[0])
+                return cls(fs, url, url)
             fs, path = url_to_fs(url, **options)
         except ImportError as error:
             needed = "pip install 'fhash[remote]'" if url.startswith("http") else _first_line(error)

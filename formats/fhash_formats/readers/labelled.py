@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,7 @@ from fhash_formats.series import (
     warn_not_stored,
 )
 from fhash_formats.support.dates import clock
-from fhash_formats.support.files import file_name, is_url, without_secrets
+from fhash_formats.support.files import by_obstore, file_name, is_url, without_secrets
 from fhash_formats.support.values import PACKING
 
 if TYPE_CHECKING:
@@ -158,7 +157,7 @@ def list_dataset(dataset: xr.Dataset) -> list[Listed]:
     if not order:
         return []
     opened = replace(_source(dataset[order[0]], dataset, order[0]), only="", name="the dataset")
-    found = {each.name: each for each in Selection(opened, Request()).listed()}
+    found = {each.name: each for each in Selection(opened, Request(asked=False)).listed()}
     return [found[name] for name in order if name in found]
 
 
@@ -373,22 +372,20 @@ def open_url(url: str, request: Request) -> Source:
     wishes = {"decode_cf": False, "cache": False, "chunks": None}
     place, shown = url.split("?")[0].rstrip("/"), without_secrets(url)
     suffix = Path(file_name(url)).suffix.lower()
-    direct = "::" not in url and "?" not in url and find_spec("obstore") is not None
+    fsspec = library(url, "a URL", "fsspec", "fhash[remote]")
+    direct = by_obstore(url)
     with refusing(f"{shown} cannot be read"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a store without consolidated metadata
         if suffix == ".zarr":
             stored: Any = url
             if direct:
-                store = import_module("obstore.store").from_url(
-                    place, client_options={"allow_http": True}
-                )
+                store = import_module("obstore.store").from_url(place)
                 stored = import_module("zarr.storage").ObjectStore(store, read_only=True)
             dataset = xr.open_dataset(stored, engine="zarr", **wishes)
         else:
-            fsspec = library(url, "a URL", "fsspec", "fhash[remote]")
             # blocks, since HDF5 reads few bytes here and there
-            if direct and not place.startswith("http"):
-                files = import_module("obstore.fsspec").FsspecStore(place.split("://")[0])
+            if direct:
+                files = import_module("obstore.fsspec").FsspecStore(url.partition("://")[0])
                 stored = files.open(place, buffer_size=BLOCK)
             else:
                 files, inside = fsspec.core.url_to_fs(url)

@@ -618,8 +618,8 @@ class Selection:
             if each.name != variable.name and not each.error and not each.computed:
                 found.setdefault(self._flat(variable, each), each)
         if self.opened.naming:  # where nothing else is beside, positions need no mention
-            tied = (self._by_name[name] for name in variable.first.scales.values())
-            found |= {each.label: each for each in tied if each.computed}
+            tied = map(self._by_name.get, variable.first.scales.values())
+            found |= {each.label: each for each in tied if each is not None and each.computed}
         return found
 
     def listed(self) -> list[Listed]:

@@ -262,13 +262,14 @@ def test_a_package_that_is_missing(monkeypatch, missing: str, url: str, told: st
     for scheme in ("http", "https", "s3"):
         monkeypatch.delitem(known, scheme, raising=False)
     monkeypatch.setitem(sys.modules, missing, None)
-    monkeypatch.setattr(fsspec_file, "find_spec", lambda name: None)  # no obstore
+    monkeypatch.setattr(fsspec_file, "by_obstore", lambda url: False)
     with pytest.raises(MissingDependencyError, match=told):
         FsspecFile.open(url, {})
 
 
 def test_obstore_reads_an_object_store(range_server, monkeypatch) -> None:
-    pytest.importorskip("obstore")
+    stores = pytest.importorskip("obstore.fsspec")
+    stores.FsspecStore.clear_instance_cache()  # of other servers
     url = range_server.put("bucket/run.fhz", DATA)
     monkeypatch.setenv("AWS_ENDPOINT", url.removesuffix("/bucket/run.fhz"))
     for key, value in (("SKIP_SIGNATURE", "true"), ("ALLOW_HTTP", "true"), ("REGION", "x")):
