@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -43,8 +43,7 @@ from fhash_formats.series import Series, StepsSeries, warn_not_stored
 CONTAINER_SUFFIX = ".fhz"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reader:
+class Reader(NamedTuple):
     """One format.
 
     Attributes:
@@ -63,82 +62,31 @@ class Reader:
         return f"{self.name} ({' '.join(self.suffixes)})" if self.suffixes else self.name
 
 
-RAW = Reader(
-    name="raw", suffixes=(".raw", ".bin", ".dat"), matches=images.is_raw, open=images.open_raw
-)
-ZARR = Reader(
-    name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
-)
-PLOTFILE = Reader(
-    name="AMReX",
-    suffixes=(),
-    matches=simulations.is_plotfile,
-    open=simulations.open_plotfile,
-)
-ADIOS = Reader(
-    name="ADIOS2",
-    suffixes=simulations.ADIOS_SUFFIXES,
-    matches=simulations.is_adios,
-    open=simulations.open_adios,
-)
+RAW = Reader("raw", (".raw", ".bin", ".dat"), images.is_raw, images.open_raw)
+ZARR = Reader("Zarr", (".zarr", ".zip"), zarr_store.matches, zarr_store.open_zarr)
+PLOTFILE = Reader("AMReX", (), simulations.is_plotfile, simulations.open_plotfile)
+ADIOS = Reader("ADIOS2", simulations.ADIOS_SUFFIXES, simulations.is_adios, simulations.open_adios)
 FOLDERS = (ZARR, PLOTFILE, ADIOS)
 """Formats of folders."""
 REGISTRY = (
     RAW,
-    Reader(
-        name="VTKHDF",
-        suffixes=vtk.VTKHDF_SUFFIXES,
-        matches=vtk.is_vtkhdf,
-        open=vtk.open_vtkhdf,
-    ),
-    Reader(name="NetCDF-3", suffixes=(), matches=netcdf3.matches, open=netcdf3.open_classic),
-    Reader(
-        name="NetCDF",
-        suffixes=hdf5.NETCDF_SUFFIXES,
-        matches=hdf5.says_netcdf,
-        open=hdf5.open_netcdf,
-    ),
-    Reader(name="HDF5", suffixes=hdf5.SUFFIXES, matches=hdf5.matches, open=hdf5.open_hdf5),
-    Reader(name="NumPy", suffixes=(".npy",), matches=images.is_npy, open=images.open_npy),
+    Reader("VTKHDF", vtk.VTKHDF_SUFFIXES, vtk.is_vtkhdf, vtk.open_vtkhdf),
+    Reader("NetCDF-3", (), netcdf3.matches, netcdf3.open_classic),
+    Reader("NetCDF", hdf5.NETCDF_SUFFIXES, hdf5.says_netcdf, hdf5.open_netcdf),
+    Reader("HDF5", hdf5.SUFFIXES, hdf5.matches, hdf5.open_hdf5),
+    Reader("NumPy", (".npy",), images.is_npy, images.open_npy),
     ZARR,
-    Reader(name="VTK", suffixes=vtk.XML_SUFFIXES, matches=vtk.is_vtk_xml, open=vtk.open_vtk),
-    Reader(
-        name="collection",
-        suffixes=vtk.COLLECTION_SUFFIXES,
-        matches=vtk.is_collection,
-        open=vtk.open_pvd,
-    ),
-    Reader(
-        name="NRRD", suffixes=images.NRRD_SUFFIXES, matches=images.is_nrrd, open=images.open_nrrd
-    ),
-    Reader(
-        name="MetaImage",
-        suffixes=images.METAIMAGE_SUFFIXES,
-        matches=images.is_metaimage,
-        open=images.open_metaimage,
-    ),
-    Reader(
-        name="NIfTI",
-        suffixes=grids.NIFTI_SUFFIXES,
-        matches=grids.is_nifti,
-        open=grids.open_nifti,
-    ),
-    Reader(name="MRC", suffixes=grids.MRC_SUFFIXES, matches=grids.is_mrc, open=grids.open_mrc),
-    Reader(name="OpenDX", suffixes=grids.DX_SUFFIXES, matches=grids.is_dx, open=grids.open_dx),
-    Reader(
-        name="legacy VTK",
-        suffixes=grids.LEGACY_SUFFIXES,
-        matches=grids.is_legacy_vtk,
-        open=grids.open_legacy_vtk,
-    ),
-    Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
-    Reader(name="SEG-Y", suffixes=grids.SEGY_SUFFIXES, matches=grids.is_segy, open=grids.open_segy),
-    Reader(
-        name="GRIB",
-        suffixes=labelled.GRIB_SUFFIXES,
-        matches=labelled.is_grib,
-        open=labelled.open_grib,
-    ),
+    Reader("VTK", vtk.XML_SUFFIXES, vtk.is_vtk_xml, vtk.open_vtk),
+    Reader("collection", vtk.COLLECTION_SUFFIXES, vtk.is_collection, vtk.open_pvd),
+    Reader("NRRD", images.NRRD_SUFFIXES, images.is_nrrd, images.open_nrrd),
+    Reader("MetaImage", images.METAIMAGE_SUFFIXES, images.is_metaimage, images.open_metaimage),
+    Reader("NIfTI", grids.NIFTI_SUFFIXES, grids.is_nifti, grids.open_nifti),
+    Reader("MRC", grids.MRC_SUFFIXES, grids.is_mrc, grids.open_mrc),
+    Reader("OpenDX", grids.DX_SUFFIXES, grids.is_dx, grids.open_dx),
+    Reader("legacy VTK", grids.LEGACY_SUFFIXES, grids.is_legacy_vtk, grids.open_legacy_vtk),
+    Reader("TIFF", tiff.SUFFIXES, tiff.matches, tiff.open_tiff),
+    Reader("SEG-Y", grids.SEGY_SUFFIXES, grids.is_segy, grids.open_segy),
+    Reader("GRIB", labelled.GRIB_SUFFIXES, labelled.is_grib, labelled.open_grib),
     PLOTFILE,
     ADIOS,
 )
