@@ -78,7 +78,7 @@ class Rays:
         half = float(np.tan(np.radians(camera.view_angle) / 2))
         narrow = float(np.sin(np.arctan(half * min(aspect, 1.0))))
         distance, parallel_half = radius / narrow, radius / min(aspect, 1.0)
-        if camera.view == AUTO and grid.thin is not None:
+        if camera.view == AUTO and grid.flat:
             parallel_half = _half_height(grid, view, aspect)
             thickness = float(np.abs(np.diff(grid.corners, axis=1)[:, 0] @ VIEWS[view][0]))
             distance = parallel_half / half + thickness / 2
