@@ -366,8 +366,13 @@ def open_url(url: str, request: Request) -> Source:
 
     xarray opens its uppermost group, by obstore where that is installed, else by fsspec: keys and
     secrets are those of their environment. Raises MissingDependencyError without either, and
-    InputError for what cannot be opened.
+    InputError for what cannot be opened, and for a URL of other data.
     """
+    if not is_data_url(url):
+        raise InputError(
+            f"{without_secrets(url)}: data at a URL are a Zarr store or a file of NetCDF-4 or HDF5,"
+            f" with one of the suffixes {', '.join(DATA_SUFFIXES)}; others are to be downloaded"
+        )
     xr = library(url, "a URL", "xarray", "fhash[remote]")
     wishes = {"decode_cf": False, "cache": False, "chunks": None}
     place, shown = url.split("?")[0].rstrip("/"), without_secrets(url)

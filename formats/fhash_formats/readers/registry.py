@@ -39,6 +39,7 @@ from fhash_formats.readers.select import list_selected, open_selected
 from fhash_formats.readers.stored_parts import require_inside
 from fhash_formats.readers.variables import Source
 from fhash_formats.series import Series, StepsSeries, warn_not_stored
+from fhash_formats.support.files import is_url
 
 CONTAINER_SUFFIX = ".fhz"
 
@@ -183,7 +184,7 @@ def list_variables(
     variable has one of the steps.
     """
     text, request = str(path), _request(**wishes)
-    if labelled.is_data_url(path):
+    if is_url(path):
         opened: Source | JoinedSeries = labelled.open_url(text, request)
     else:
         place = files_of(text)[0] if is_pattern(text) else Path(path)
@@ -219,7 +220,7 @@ def _check_stride(path: str | Path, steps: slice) -> None:
 def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
-    if labelled.is_data_url(path):
+    if is_url(path):
         return open_selected(labelled.open_url(text, request), request)
     if not is_pattern(text):
         if request.overlap is not None:
