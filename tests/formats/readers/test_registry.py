@@ -835,7 +835,7 @@ def test_data_at_a_url_are_those_of_the_file(
 def test_a_url_without_data(elsewhere: tuple[xr.Dataset, str, RangeServer]) -> None:
     _, folder, server = elsewhere
     server.put("bucket/b.nc", b"nothing of the kind")
-    with pytest.raises(InputError, match="run.fhz: data at a URL are"):
+    with pytest.raises(InputError, match=r"run\.fhz: data at a URL are"):
         open_series(f"{folder}/run.fhz")
     for name in ("b.nc", "c.nc", "c.zarr"):
         with pytest.raises(InputError, match=f"{name} cannot be read"):
