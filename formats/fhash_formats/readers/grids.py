@@ -6,10 +6,11 @@ import re
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import replace
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +19,11 @@ from fhash_formats.errors import FhashWarning, InputError, MissingInputError
 from fhash_formats.readers.file_series import Request, Stamp, library, naming
 from fhash_formats.readers.stored_bytes import (
     GZIP,
+    TYPES,
     CompressedFile,
+    FlatArray,
     NumbersInText,
     PlainFile,
-    StoredArray,
     StoredBytes,
     axis_steps,
     lattice,
@@ -39,7 +41,6 @@ from fhash_formats.readers.variables import (
 from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import decoded_text
 
-PACKED_SUFFIX = ".gz"
 HEAD_BYTES = 1 << 13
 """Stored bytes in which a compressed header is."""
 
@@ -59,36 +60,29 @@ def _inflated(head: bytes) -> bytes:
         return b""
 
 
-def _array(
-    path: Path, packed: bool, shape: tuple[int, ...], dtype: np.dtype[Any], start: int
-) -> StoredArray:
-    """The array that begins at a byte of a file, or of its true bytes."""
-    end = start + prod(shape) * dtype.itemsize
-    stored: StoredBytes = (
-        CompressedFile(path, "deflate", start=0, size=end)
-        if packed
-        else PlainFile(path, start=0, size=end)
-    )
-    return StoredArray(path, shape, dtype, stored, offset=start)
+def _volume(
+    path: Path,
+    packed: bool,
+    sizes: Sequence[int],
+    names: Sequence[str],
+    dtype: np.dtype[Any],
+    start: int,
+) -> tuple[Variable, StoredBytes]:
+    """The array (the fastest dimension is the first) that begins at a byte of a file, or of its
+    true bytes."""
+    shape, size = tuple(reversed(sizes)), start + prod(sizes) * dtype.itemsize
+    stored: StoredBytes = PlainFile(path, start=0, size=0 if packed else size)
+    if packed:
+        stored = CompressedFile(path, "deflate", start=0, size=size)
+    array = FlatArray(path, shape, dtype, offset=start, stored=stored)
+    name = path.name.removesuffix(".gz").rpartition(".")[0] or path.name
+    return array.variable(name, names[::-1]), stored
 
 
 NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr")
 
-NIFTI_TYPES = {
-    2: "u1",
-    4: "i2",
-    8: "i4",
-    16: "f4",
-    32: "c8",
-    64: "f8",
-    256: "i1",
-    512: "u2",
-    768: "u4",
-    1024: "i8",
-    1280: "u8",
-    1792: "c16",
-}
-"""Number types by their code (nifti1.h)."""
+NIFTI_CODES = "2 u1 4 i2 8 i4 16 f4 32 c8 64 f8 256 i1 512 u2 768 u4 1024 i8 1280 u8 1792 c16"
+"""Number types behind their codes (nifti1.h)."""
 
 NIFTI_LENGTHS = {1: "m", 2: "mm", 3: "um"}
 NIFTI_TIMES = {8: "s", 16: "ms", 24: "us"}
@@ -103,21 +97,6 @@ vox_offset:i8 scl_slope:f8 scl_inter:f8 cal:2f8 slice_duration:f8 toffset:f8 sli
 slice_end:i8 descrip:S80 aux_file:S24 qform_code:i4 sform_code:i4 quatern:3f8 qoffset:3f8 srow:12f8
 slice_code:i4 xyzt_units:i4 intent_code:i4 intent_name:S16"""
 """Fields of the headers in their order (nifti1.h, nifti2.h)."""
-
-
-def _fields(form: str, data: bytes, order: str) -> Any:
-    """The fields of a header, as a numpy record."""
-    parts = []
-    for field in form.split():
-        name, _, kind = field.partition(":")
-        match = re.fullmatch(r"(\d*)([ifS])(\d+)", kind)
-        assert match is not None
-        letter = f"{match[2]}{match[3]}"
-        parts.append((name, order + letter if match[2] != "S" else letter, int(match[1] or 1)))
-    dtype = np.dtype([(name, kind) if n == 1 else (name, kind, (n,)) for name, kind, n in parts])
-    if len(data) < dtype.itemsize:
-        raise InputError(f"its header has {len(data)} bytes, {dtype.itemsize} are needed")
-    return np.frombuffer(data[: dtype.itemsize], dtype)[0]
 
 
 def is_nifti(head: bytes, path: Path) -> bool:
@@ -136,52 +115,41 @@ def open_nifti(path: Path, request: Request) -> Source:
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
         data, packed = _head(path, 540)
-        little = int.from_bytes(data[:4], "little")
-        big = int.from_bytes(data[:4], "big")
-        size = little if little in (348, 540) else big
+        end: Literal["little", "big"] = (
+            "little" if int.from_bytes(data[:4], "little") in (348, 540) else "big"
+        )
+        size = int.from_bytes(data[:4], end)
         if size not in (348, 540):
-            raise InputError(f"its header says that it has {little} bytes; NIfTI has 348 or 540")
-        order = "<" if size == little else ">"
-        header = _fields(NIFTI_1 if size == 348 else NIFTI_2, data, order)
+            raise InputError(f"its header says that it has {size} bytes; NIfTI has 348 or 540")
+        form = [tuple(each.split(":")) for each in (NIFTI_1 if size == 348 else NIFTI_2).split()]
+        if len(data) < size:
+            raise InputError(f"its header has {len(data)} bytes, {size} are needed")
+        header = np.frombuffer(data, np.dtype(form).newbyteorder(end), count=1)[0]
         count = int(header["dim"][0])
         if not 1 <= count <= 7 or (header["dim"][1 : count + 1] < 1).any():
             raise InputError(f"its dimensions are {header['dim'].tolist()}")
         sizes = [int(n) for n in header["dim"][1 : count + 1]]
         while len(sizes) > 2 and sizes[-1] == 1:
             sizes.pop()
-        kind = NIFTI_TYPES.get(int(header["datatype"]))
-        if kind is None:
-            raise InputError(f"its values are of type {int(header['datatype'])}, no numbers")
-        dtype = np.dtype(order + kind)
+        code, *codes = int(header["datatype"]), *NIFTI_CODES.split()
+        if str(code) not in codes[::2]:
+            raise InputError(f"its values are of type {code}, no numbers")
+        dtype = np.dtype(codes[codes.index(str(code)) + 1]).newbyteorder(end)
         pair = header["magic"][:2] == b"ni"
         file = path.with_suffix(".img") if pair else path
         if not file.is_file():
             raise MissingInputError(f"its values are in {file}, which is not there")
         offset = max(int(header["vox_offset"]), 0 if pair else size)
-        shape = tuple(reversed(sizes))
-        array = _array(file, packed, shape, dtype, offset)
-        names = ["x", "y", "z", AXIS_NAMES["t"]][: len(sizes)]
-        extra = [f"dim{n}" for n in range(5, len(sizes) + 1)]
-        whole = Variable(
-            name=_stem(path),
-            shape=shape,
-            dtype=dtype,
-            dimensions=tuple(reversed([*names, *extra])),
-            attributes=_nifti_attributes(header),
-            read=array.read,
-        )
+        names = ["x", "y", "z", AXIS_NAMES["t"], "dim5", "dim6", "dim7"][: len(sizes)]
+        whole, stored = _volume(file, packed, sizes, names, dtype, offset)
+        whole = replace(whole, attributes=_nifti_attributes(header))
         vector = len(sizes) == 5
         arrays = components(whole, 0, interleaved=False) if vector else [whole]
         if vector and sizes[3] == 1:
             arrays = [each for one in arrays for each in components(one, 0, interleaved=False)]
         found = placed(arrays, _nifti_positions(source, header, sizes))
     files = [file] if pair else []
-    return file_source(path, found, stamp=stamp, files=files, close=array.stored.close)
-
-
-def _stem(path: Path) -> str:
-    """The name of a file without its suffixes."""
-    return path.name.removesuffix(PACKED_SUFFIX).rpartition(".")[0] or path.name
+    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
 
 
 def _nifti_attributes(header: Any) -> dict[str, Any]:
@@ -272,16 +240,8 @@ def open_mrc(path: Path, request: Request) -> Source:
         letters = ["xyz"[n - 1] if 1 <= n <= 3 else "?" for n in words[16:19].tolist()]
         if set(letters) != set("xyz"):
             letters = ["x", "y", "z"]  # of programs that leave them out
-        dtype = np.dtype(order + kind)
-        shape = tuple(reversed(sizes))
-        array = _array(path, packed, shape, dtype, 1024 + int(words[23]))
-        whole = Variable(
-            name=_stem(path),
-            shape=shape,
-            dtype=dtype,
-            dimensions=tuple(reversed(letters)),
-            read=array.read,
-        )
+        start = 1024 + int(words[23])
+        whole, stored = _volume(path, packed, sizes, letters, np.dtype(order + kind), start)
         coords = {}
         for n, axis in enumerate("xyz"):
             cells, cell = int(words[7 + n]), floats[10 + n]
@@ -291,13 +251,13 @@ def open_mrc(path: Path, request: Request) -> Source:
             origin = floats[49 + n] if np.isfinite(floats[49 + n]) else 0.0
             first = int(words[4 + column]) if origin == 0 else 0
             coords[axis] = lattice(axis, origin, step, sizes[column], first=first, units=unit)
-    return file_source(path, placed([whole], coords), stamp=stamp, close=array.stored.close)
+    return file_source(path, placed([whole], coords), stamp=stamp, close=stored.close)
 
 
 DX_SUFFIXES = (".dx",)
 MAX_DX_HEADER = 1 << 20
 """Bytes of the longest header of OpenDX."""
-DX_TYPES = {"float": "f4", "double": "f8", "int": "i4", "short": "i2", "byte": "u1"}
+DX_TYPES = {"byte": "u1"} | {name: TYPES[name] for name in ("float", "double", "int", "short")}
 DX_NUMBER = r"[-+0-9.eE]+"
 
 
@@ -335,27 +295,14 @@ def open_dx(path: Path, request: Request) -> Source:
         steps = axis_steps(np.array(deltas))
         order = "<" if "lsb" in array[3] or "lsb" in array[1] else ">"
         dtype = np.dtype(order + DX_TYPES[array[1].lower()])
-        start = len(text[: array.end()].encode())
-        size = prod(sizes) * dtype.itemsize
-        stored: StoredBytes
-        if re.search("binary|ieee", array[0]):
-            stored = PlainFile(path, start=start, size=size)
-        else:
-            with path.open("rb") as file:
-                file.seek(start)
-                stop = _end_of_numbers(file)
-            stored = NumbersInText(path, dtype, start=start, size=size, stop=stop)
-        whole = Variable(
-            name=path.stem,
-            shape=tuple(sizes),
-            dtype=dtype,
-            dimensions=("x", "y", "z"),
-            read=StoredArray(path, tuple(sizes), dtype, stored).read,
-        )
+        with path.open("rb") as file:
+            file.seek(len(text[: array.end()].encode()))
+            is_text = re.search("binary|ieee", array[0]) is None
+            values = _values_at(path, file, tuple(sizes), dtype, is_text=is_text)
         coords = {
             axis: lattice(axis, origin[0][n], steps[n], sizes[n]) for n, axis in enumerate("xyz")
         }
-    return file_source(path, placed([whole], coords), stamp=stamp, close=stored.close)
+    return file_source(path, placed([values.variable(path.stem, "xyz")], coords), stamp=stamp)
 
 
 def _dx_numbers(text: str, key: str) -> list[list[float]]:
@@ -364,48 +311,35 @@ def _dx_numbers(text: str, key: str) -> list[list[float]]:
     return [numbers_of(each, 3).tolist() for each in found]
 
 
-def _end_of_numbers(file: BinaryIO) -> int:
-    """The place of the next line that begins with a word, or of the end; the file is there then."""
-    place = file.tell()
+def _values_at(
+    path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype[Any], *, is_text: bool
+) -> FlatArray:
+    """The array whose values begin where a file is; it is behind them then.
+
+    Text ends before the next line that begins with a word.
+    """
+    start, size = file.tell(), prod(shape) * dtype.itemsize
+    if not is_text:
+        file.seek(start + size)
+        return FlatArray(path, shape, dtype, stored=PlainFile(path, start=start, size=size))
+    stop = start
     while line := file.readline():
         first = line.split(maxsplit=1)[:1]
         if first and first[0][:1].isalpha() and first[0].lower() not in (b"nan", b"inf"):
             break
-        place = file.tell()
-    file.seek(place)
-    return place
+        stop = file.tell()
+    file.seek(stop)
+    stored = NumbersInText(path, dtype, start=start, size=size, stop=stop)
+    return FlatArray(path, shape, dtype, stored=stored)
 
 
 LEGACY_SUFFIXES = (".vtk",)
-LEGACY_TYPES = {
-    "unsigned_char": "u1",
-    "char": "i1",
-    "unsigned_short": "u2",
-    "short": "i2",
-    "unsigned_int": "u4",
-    "int": "i4",
-    "unsigned_long": "u8",
-    "long": "i8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "float": "f4",
-    "double": "f8",
-}
+LEGACY_TYPES = {name.replace(" ", "_"): kind for name, kind in TYPES.items()}
+LEGACY_TYPES |= {"char": "i1", "long": "i8", "unsigned_long": "u8"}
+LEGACY_TYPES |= {"vtktypeint64": "i8", "vtktypeuint64": "u8"}
 LEGACY_TIMES = ("TIME", "TimeValue")
 """Names of fields that hold the time: VisIt's and ParaView's."""
 MAX_LINE = 4096
-
-
-@dataclass(frozen=True, kw_only=True)
-class _LegacyArray:
-    """An array of a legacy file: its section ("POINT_DATA" and so on), name, and values."""
-
-    section: str
-    name: str
-    count: int
-    components: int
-    dtype: np.dtype[Any]
-    stored: StoredBytes
 
 
 def is_legacy_vtk(head: bytes, path: Path) -> bool:
@@ -422,44 +356,22 @@ def open_legacy_vtk(path: Path, request: Request) -> Source:
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
         reader = _LegacyReader(path)
-        arrays, lines = reader.arrays, reader.positions()
+        names = [name for _, name, _ in reader.arrays]
         found: list[Variable] = []
         for section, cells in (("POINT_DATA", False), ("CELL_DATA", True)):
             space = tuple(max(n - 1, 1) if cells else n for n in reversed(reader.sizes))
-            here = [each for each in arrays if each.section == section]
-            names = [each.name for each in arrays]
-            whole = [
-                _legacy_variable(path, each, space, names.count(each.name) > 1) for each in here
-            ]
-            coords = {
-                axis: positions(axis, _centres(values) if cells else values)
-                for axis, values in lines.items()
-            }
-            if reader.time is not None:
-                coords["t"] = positions(AXIS_NAMES["t"], [reader.time])
-            parts = [each for one in whole for each in components(one, len(AXES[1:]))]
+            parts: list[Variable] = []
+            for name, array in [each[1:] for each in reader.arrays if each[0] == section]:
+                count, shape = array.shape[0], (*space, array.shape[1])
+                if count != prod(space):
+                    told = f"the array {name} has {count} values, the grid {prod(space)}"
+                    raise InputError(told)
+                full = f"{section}/{name}" if names.count(name) > 1 else name
+                whole = FlatArray(path, shape, array.dtype, stored=array.stored)
+                parts += components(whole.variable(full, AXES[1:]), len(space))
+            coords = reader.coordinates(cells=cells) if parts else {}
             found += placed(parts, coords, f"header/{section}")
     return file_source(path, found, stamp=stamp)
-
-
-def _centres(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """The centres of the cells between positions."""
-    return (values[:-1] + values[1:]) / 2 if len(values) > 1 else values
-
-
-def _legacy_variable(
-    path: Path, array: _LegacyArray, space: tuple[int, ...], shared: bool
-) -> Variable:
-    if array.count != prod(space):
-        raise InputError(f"the array {array.name} has {array.count} values, the grid {prod(space)}")
-    shape = (*space, array.components)
-    return Variable(
-        name=f"{array.section}/{array.name}" if shared else array.name,
-        shape=shape,
-        dtype=array.dtype,
-        dimensions=AXES[1:],
-        read=StoredArray(path, shape, array.dtype, array.stored).read,
-    )
 
 
 class _LegacyReader:
@@ -467,32 +379,30 @@ class _LegacyReader:
 
     Attributes:
         sizes: points along x, y and z.
-        arrays: of points and cells.
+        arrays: of points and cells: their section ("POINT_DATA" and so on), name, and values
+            (count, components).
         time: of the grid; None without one.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.sizes = path, (0, 0, 0)
         self.time: float | None = None
-        self.arrays: list[_LegacyArray] = []
+        self.arrays: list[tuple[str, str, FlatArray]] = []
         self._lines: dict[str, npt.NDArray[np.float64]] = {}
-        self._origin, self._spacing = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
-        self._section, self._count = "", 0
+        self._origin, self._spacing = np.zeros(3), np.ones(3)
+        self._section, self._count = "", "0"
         with path.open("rb") as self._file:
             self._file.readline(MAX_LINE)
             title = decoded_text(self._file.readline(MAX_LINE))
             self._text = self._words()[:1] == ["ASCII"]
             kind = self._words()
-            if kind[:1] != ["DATASET"] or kind[1:2] not in (
-                ["STRUCTURED_POINTS"],
-                ["RECTILINEAR_GRID"],
-            ):
+            self._even = kind[1:2] == ["STRUCTURED_POINTS"]
+            if kind[:1] != ["DATASET"] or not (self._even or kind[1:2] == ["RECTILINEAR_GRID"]):
                 raise InputError(
                     f"it holds VTK data of the kind {' '.join(kind[1:2]) or '?'};"
                     " STRUCTURED_POINTS and RECTILINEAR_GRID can be read (in ParaView, the filter"
                     " ResampleToImage makes them of other data)"
                 )
-            self._even = kind[1] == "STRUCTURED_POINTS"
             while words := self._words():
                 self._take(words)
         match = re.search(r"time\s*[=:]\s*([-+0-9.eE]+)", title)
@@ -501,17 +411,22 @@ class _LegacyReader:
         if min(self.sizes) < 1:
             raise InputError(f"its dimensions are {self.sizes}")
 
-    def positions(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Positions of the points along x, y and z."""
-        if self._even:
-            return {
-                axis: lattice(axis, self._origin[n], self._spacing[n], self.sizes[n]).whole()
-                for n, axis in enumerate("xyz")
-            }
+    def coordinates(self, *, cells: bool) -> dict[str, Variable]:
+        """Coordinates of the points or of the centres of cells, and the time."""
+        coords = {}
         for n, axis in enumerate("xyz"):
-            if len(self._lines.get(axis, ())) != self.sizes[n]:
+            values = self._lines.get(axis, np.empty(0))
+            if self._even:
+                origin, step = float(self._origin[n]), float(self._spacing[n])
+                values = lattice(axis, origin, step, self.sizes[n]).whole()
+            if len(values) != self.sizes[n]:
                 raise InputError(f"its coordinates along {axis} are not {self.sizes[n]}")
-        return self._lines
+            if cells and len(values) > 1:
+                values = (values[:-1] + values[1:]) / 2
+            coords[axis] = positions(axis, values)
+        if self.time is not None:
+            coords["t"] = positions(AXIS_NAMES["t"], [self.time])
+        return coords
 
     def _words(self) -> list[str]:
         """The words of the next line that has any; none at the end."""
@@ -522,40 +437,34 @@ class _LegacyReader:
 
     def _take(self, words: Sequence[str]) -> None:
         """Read what a line begins."""
-        key = words[0].upper()
+        key, numbers = words[0].upper(), " ".join(words[1:4])
         if key == "DIMENSIONS":
-            x, y, z = (int(n) for n in _numbers(words, 3))
+            x, y, z = map(int, numbers_of(numbers, 3))
             self.sizes = (x, y, z)
         elif key == "ORIGIN":
-            self._origin = _numbers(words, 3)
+            self._origin = numbers_of(numbers, 3)
         elif key in ("SPACING", "ASPECT_RATIO"):
-            self._spacing = _numbers(words, 3)
+            self._spacing = numbers_of(numbers, 3)
         elif key.endswith("_COORDINATES") and len(words) == 3:
-            array = self._array(words[0], int(words[1]), 1, words[2])
-            self._lines[key[0].lower()] = _whole(array)
+            self._lines[key[0].lower()] = _whole(self._array("", words[1], "1", words[2]))
         elif key in ("POINT_DATA", "CELL_DATA"):
-            self._section, self._count = key, int(_numbers(words, 1)[0])
+            self._section, self._count = key, " ".join(words[1:2])
         elif key == "FIELD" and len(words) == 3:
             self._fields(int(words[2]))
         elif key == "METADATA":
             while self._file.readline(MAX_LINE).strip():
                 pass  # up to an empty line
         elif key == "SCALARS" and len(words) in (3, 4):
-            count = int(words[3]) if len(words) == 4 else 1
             place = self._file.tell()
             if self._words()[:1] != ["LOOKUP_TABLE"]:
                 self._file.seek(place)
-            self._keep(self._array(words[1], self._count, count, words[2]))
+            self._array(words[1], self._count, [*words, "1"][3], words[2])
         elif key in ("VECTORS", "NORMALS", "TENSORS") and len(words) == 3:
-            count = 9 if key == "TENSORS" else 3
-            self._keep(self._array(words[1], self._count, count, words[2]))
+            self._array(words[1], self._count, "9" if key == "TENSORS" else "3", words[2])
         elif key == "LOOKUP_TABLE" and len(words) == 3:
-            self._array(words[1], int(words[2]), 4, "float" if self._text else "unsigned_char")
+            self._array("", words[2], "4", "float" if self._text else "unsigned_char")
         else:
             raise InputError(f"it has the line {' '.join(words)[:60]!r}, which is not known")
-
-    def _keep(self, array: _LegacyArray) -> None:
-        self.arrays.append(array)
 
     def _fields(self, count: int) -> None:
         for _ in range(count):
@@ -565,49 +474,27 @@ class _LegacyReader:
                 words = self._words()
             if len(words) != 4:
                 raise InputError(f"a field begins with {' '.join(words)[:60]!r}")
-            array = self._array(words[0], int(words[2]), int(words[1]), words[3])
-            if self._section:
-                self._keep(array)
-            elif words[0] in LEGACY_TIMES and array.count * array.components == 1:
+            array = self._array(words[0], words[2], words[1], words[3])
+            if not self._section and words[0] in LEGACY_TIMES and array.shape == (1, 1):
                 self.time = float(_whole(array)[0])
 
-    def _array(self, name: str, count: int, parts: int, kind: str) -> _LegacyArray:
-        """An array whose values begin here; the file is behind them then."""
-        short = LEGACY_TYPES.get(kind.lower())
+    def _array(self, name: str, count: str, parts: str, kind: str) -> FlatArray:
+        """An array whose values begin here, which is kept where it has a name and a section."""
+        short, shape = LEGACY_TYPES.get(kind.lower()), (int(count), int(parts))
         if short is None:
             raise InputError(f"the array {name} is of type {kind}, no numbers")
-        if count < 0 or parts < 1:
+        if shape[0] < 0 or shape[1] < 1:
             raise InputError(f"the array {name} has {count} values of {parts} parts")
-        dtype, start = np.dtype(f">{short}"), self._file.tell()
-        size = count * parts * dtype.itemsize
-        stored: StoredBytes
-        if self._text:
-            stop = _end_of_numbers(self._file)
-            stored = NumbersInText(self.path, dtype, start=start, size=size, stop=stop)
-        else:
-            stored = PlainFile(self.path, start=start, size=size)
-            self._file.seek(start + size)
-        return _LegacyArray(
-            section=self._section,
-            name=name.replace("%20", " "),
-            count=count,
-            components=parts,
-            dtype=dtype,
-            stored=stored,
-        )
+        dtype = np.dtype(f">{short}")
+        array = _values_at(self.path, self._file, shape, dtype, is_text=self._text)
+        if name and self._section:
+            self.arrays.append((self._section, name.replace("%20", " "), array))
+        return array
 
 
-def _whole(array: _LegacyArray) -> npt.NDArray[np.float64]:
+def _whole(array: FlatArray) -> npt.NDArray[np.float64]:
     """All values of an array, which is small."""
-    found = np.empty(array.count * array.components, array.dtype)
-    array.stored.readinto(0, found.view(np.uint8).data)
-    return found.astype(np.float64)
-
-
-def _numbers(words: Sequence[str], count: int) -> list[float]:
-    """The numbers behind the first word of a line."""
-    numbers: list[float] = numbers_of(" ".join(words[1 : count + 1]), count).tolist()
-    return numbers
+    return array.read((slice(None), slice(None))).ravel().astype(np.float64)
 
 
 SEGY_SUFFIXES = (".sgy", ".segy")
@@ -628,15 +515,10 @@ def open_segy(path: Path, request: Request) -> Source:
     """
     source, stamp = str(path), Stamp.of(path)
     segyio = library(source, "SEG-Y", "segyio", "fhash[segy]")
-    with naming(source):
-        file = segyio.open(source, ignore_geometry=True)
-    try:
-        with naming(source):
-            found = _traces(path, file)
-    except BaseException:
-        file.close()
-        raise
-    return file_source(path, found, stamp=stamp, close=file.close)
+    with naming(source), ExitStack() as opened:
+        file = opened.enter_context(segyio.open(source, ignore_geometry=True))
+        found, close = _traces(path, file), opened.pop_all().close
+    return file_source(path, found, stamp=stamp, close=close)
 
 
 def _traces(path: Path, file: Any) -> list[Variable]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.cf import role_of_name
 from fhash_formats.readers.file_series import (
     ENDIANS,
@@ -24,17 +24,17 @@ from fhash_formats.readers.file_series import (
     refusing,
 )
 from fhash_formats.readers.stored_bytes import (
-    MAX_FILES,
+    KINDS,
+    TYPES,
     CompressedFile,
     FlatArray,
+    ManyFiles,
     NumbersInText,
     PlainFile,
-    StoredArray,
     StoredBytes,
     axis_steps,
-    in_files,
     lattice,
-    numbered_files,
+    numbers_of,
 )
 from fhash_formats.readers.variables import (
     Source,
@@ -47,90 +47,203 @@ from fhash_formats.readers.variables import (
 from fhash_formats.series import AXES, AXIS_NAMES
 from fhash_formats.support.values import decoded_text
 
-TYPE_NAMES = {
-    "i1": "signed char|int8|int8_t",
-    "u1": "uchar|unsigned char|uint8|uint8_t",
-    "i2": "short|short int|signed short|signed short int|int16|int16_t",
-    "u2": "ushort|unsigned short|unsigned short int|uint16|uint16_t",
-    "i4": "int|signed int|int32|int32_t",
-    "u4": "uint|unsigned int|uint32|uint32_t",
-    "i8": "longlong|long long|long long int|signed long long|signed long long int|int64|int64_t",
-    "u8": "ulonglong|unsigned long long|unsigned long long int|uint64|uint64_t",
-    "f4": "float",
-    "f8": "double",
-}
-
-NRRD_TYPES = {name: short for short, names in TYPE_NAMES.items() for name in names.split("|")}
-"""Number types by their names in the header."""
-
 MAX_HEADER = 64 * 2**20
 """Bytes of the longest header; own ones list every coordinate."""
 
 MAX_DIMENSIONS = 16
 """Dimensions of NRRD."""
 
-ALIASES = {
-    "datafile": "data file",
-    "sampleunits": "sample units",
-    "axismins": "axis mins",
-    "spacedirections": "space directions",
-    "spaceorigin": "space origin",
-    "spacedimension": "space dimension",
-    "lineskip": "line skip",
-    "byteskip": "byte skip",
-    "centers": "centerings",
-}
-"""Names of fields without blanks, and the usual names."""
+MAX_FILES = 1 << 20
+"""Files of one array."""
+
+NUMBERED = re.compile(r"([^%\s]*%0?[0-9]{0,2})[du]([^%\s]*)")
+"""A pattern of C for the names of files; a wider number would be a name of gigabytes."""
+
+ENCODINGS = {"raw": "raw", "txt": "text", "text": "text", "ascii": "text"}
+ENCODINGS |= {"gz": "deflate", "gzip": "deflate", "bz2": "bzip2", "bzip2": "bzip2"}
+"""Ways to store values by the names of NRRD: as they are, as text, or by a key of KINDS."""
 
 Fields = Mapping[str, str]
 
-MAGIC = b"NRRD000"
+
+def _opened(
+    path: Path, request: Request, header: Callable[[Path], tuple[Fields, Fields, int]]
+) -> Source:
+    """The array or its components by the fields of NRRD; `header` gives them as `read_header` does.
+
+    Raises InputError where the values cannot be divided among the files, MissingInputError for a
+    file that is not there.
+    """
+    stamp = Stamp.of(path)
+    with naming(str(path)):
+        fields, pairs, end = header(path)
+        sizes, dimension = sizes_of(fields, "sizes"), fields.get("dimension", "")
+        if dimension != str(len(sizes)) or len(sizes) > MAX_DIMENSIONS:
+            raise InputError(f"it has {len(sizes)} sizes and the dimension {dimension!r}")
+        axes, dtype = _axes(fields, sizes), dtype_of(fields)
+        size = prod(sizes) * dtype.itemsize
+        files = []
+        for name in _names(fields, prod(sizes)):
+            files.append(path.parent / name)
+            request.require_inside(path, files[-1])
+            if not files[-1].is_file():
+                raise MissingInputError(f"its values are in {files[-1]}, which is not there")
+        if files and size % len(files):
+            raise InputError(f"its {size} bytes cannot be divided among {len(files)} files")
+        parts = [_part(file, fields, dtype, 0, size // len(files)) for file in files]
+        if not parts:
+            parts = [_part(path, fields, dtype, end, size)]
+        stored = ManyFiles(parts) if len(parts) > 1 else parts[0]
+        name = fields.get("content", "").strip('" ') or path.stem
+        units = fields.get("sample units", "").strip('" ')
+        array = FlatArray(path, tuple(reversed(sizes)), dtype, stored=stored)
+        whole = array.variable(name, [AXIS_NAMES.get(axis) for axis in reversed(axes)])
+        arrays = [replace(whole, attributes={"units": units} if units else {})]
+        if "" in axes:
+            arrays = components(arrays[0], len(sizes) - 1 - axes.index(""))
+        found = placed(arrays, _coordinates(fields, pairs, sizes, axes))
+        others = list(dict.fromkeys(files))
+    return file_source(path, found, stamp=stamp, files=others, close=stored.close)
+
+
+def _names(fields: Fields, most: int) -> Iterator[str]:
+    """Names of the files of values: of a pattern of C and three numbers, of a list, or of one file.
+
+    There are none where the values are behind the header. most: files that there can be.
+    """
+    data = fields.get("data file", "")
+    form, *words = data.split() or [""]
+    if form == "LIST":
+        names = [name.strip() for name in fields["list"].splitlines() if name.strip()]
+        if not 0 < len(names) <= MAX_FILES:
+            raise InputError(f"its list of files is empty, or longer than {MAX_FILES}")
+        yield from names
+        return
+    if "%" not in form or len(words) not in (3, 4):
+        yield from [data] if data or "data file" in fields else []
+        return
+    match, told = NUMBERED.fullmatch(form), f"its pattern of files is {data[:80]!r}"
+    if match is None or not all(re.fullmatch(r"-?[0-9]{1,9}", word) for word in words[:3]):
+        raise InputError(
+            f"{told}; a name with one %d or %03d (two digits at most), the first number, the last"
+            " and the stride are needed"
+        )
+    first, last, stride = map(int, words[:3])
+    if stride == 0 or not 0 <= (last - first) // stride < min(most, MAX_FILES):
+        raise InputError(f"{told}; 1 to {min(most, MAX_FILES)} numbers are possible here")
+    for number in range(first, last + (1 if stride > 0 else -1), stride):
+        yield f"{match[1]}d{match[2]}" % number
+
+
+def _part(path: Path, fields: Fields, dtype: np.dtype[Any], start: int, size: int) -> StoredBytes:
+    """The bytes of one file, from `start` or what the header skips."""
+    encoding = fields.get("encoding", "").lower()
+    if encoding not in ENCODINGS:
+        raise InputError(f"its encoding is {encoding!r}; raw, gzip, bzip2 and text can be read")
+    kind, skip, lines = ENCODINGS[encoding], whole(fields, "byte skip"), whole(fields, "line skip")
+    if lines > 0:
+        with path.open("rb") as file:
+            file.seek(start)
+            if not all(file.readline(MAX_HEADER) for _ in range(lines)):
+                raise InputError(f"{path} has fewer than the {lines} lines to skip")
+            start = file.tell()
+    if skip < 0 and kind != "raw":
+        raise InputError("bytes to skip that are -1 belong to raw values")
+    start = path.stat().st_size - size if skip < 0 else start + skip
+    if kind in KINDS:
+        return CompressedFile(path, kind, start=start, size=size)
+    if kind == "text":
+        return NumbersInText(path, dtype, start=start, size=size)
+    return PlainFile(path, start=start, size=size)
+
+
+def _lines(file: BinaryIO) -> Iterator[str]:
+    """The lines of a header."""
+    while line := file.readline(MAX_HEADER):
+        if file.tell() > MAX_HEADER:
+            raise InputError(f"its header is longer than {MAX_HEADER} bytes")
+        yield decoded_text(line).rstrip("\r\n")
+
+
+def _parted(line: str, separator: str) -> tuple[str, str]:
+    """The key and the value of a line."""
+    key, found, value = line.partition(separator)
+    if not found:
+        raise InputError(f"its header has the line {line[:60]!r}")
+    return key.strip(), value.strip()
+
+
+def sizes_of(fields: Fields, name: str) -> tuple[int, ...]:
+    """Lengths of the dimensions, the fastest first."""
+    words = fields.get(name, "").split()
+    if not words or not all(re.fullmatch("0{0,9}[1-9][0-9]{0,17}", word) for word in words):
+        raise InputError(
+            f"it has the {name} {fields.get(name, '')[:80]!r}; whole numbers above 0 are needed"
+        )
+    return tuple(map(int, words))
+
+
+def dtype_of(fields: Fields) -> np.dtype[Any]:
+    """The type of the values in the file."""
+    kind = TYPES.get(" ".join(fields.get("type", "").lower().split()))
+    if kind is None:
+        raise InputError(f"its values are of the type {fields.get('type')!r}, which has no numbers")
+    order = fields.get("endian", "little").lower()
+    if order not in ENDIANS:
+        raise InputError(f"its byte order is {order!r}")
+    return np.dtype(ENDIANS[order] + kind)
+
+
+def whole(fields: Fields, name: str, default: int = 0, least: int = -1) -> int:
+    """A whole number from `least` on; `default` without the field."""
+    text = fields.get(name, str(default))
+    if not re.fullmatch(r"[-+]?[0-9]{1,18}", text) or int(text) < least:
+        raise InputError(f"its {name} is {text[:80]!r}")
+    return int(text)
+
+
+NRRD_SUFFIXES = (".nrrd", ".nhdr")
+
+NAMES = "data file|sample units|axis mins|space directions|space origin|line skip|byte skip"
+ALIASES = {name.replace(" ", ""): name for name in NAMES.split("|")} | {"centers": "centerings"}
+"""Names of fields without blanks, and the usual names."""
+
+SPATIAL = ("domain", "space", "none", "???")
+"""Kinds of axes that are positions, or say nothing."""
+
+COLOURS = ("RGB-color", "RGBA-color", "HSV-color", "XYZ-color")
 
 
 def read_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
-    """Fields, key/value pairs, and the first byte behind the header."""
+    """Fields, key/value pairs, and the first byte behind the header.
+
+    The field `list` holds the lines of a list of files.
+    """
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
     with path.open("rb") as file:
-        lines = [file.readline(MAX_HEADER)]
-        if not re.fullmatch(rb"NRRD000[1-5]\r?\n", lines[0]):
-            raise InputError(f"it begins with {lines[0][:20]!r}; NRRD0001 to NRRD0005 can be read")
-        while line := file.readline(MAX_HEADER):
-            text = decoded_text(line).rstrip("\r\n")
-            if file.tell() > MAX_HEADER:
-                raise InputError(f"its header is longer than {MAX_HEADER} bytes")
-            if not text:
+        first = file.readline(MAX_HEADER)
+        if not re.fullmatch(rb"NRRD000[1-5]\r?\n", first):
+            raise InputError(f"it begins with {first[:20]!r}; NRRD0001 to NRRD0005 can be read")
+        for line in _lines(file):
+            if not line:
                 break
-            if text.startswith("#"):
+            key, separator, value = line.partition(":=")
+            if line.startswith("#"):
                 continue
-            key, separator, value = text.partition(":=")
             if separator and ": " not in key:
                 pairs[key] = value
                 continue
-            key, separator, value = text.partition(":")
-            if not separator:
-                raise InputError(f"its header has the line {text[:60]!r}")
-            key = re.sub(r"[ _-]", "", key.strip().lower())
-            key = ALIASES.get(key, key)
-            fields[key] = value.strip()
-            if key == "data file" and value.split()[:1] == ["LIST"]:
-                rest = decoded_text(file.read(MAX_HEADER))
-                fields["list"] = rest
+            key, value = _parted(line, ":")
+            key = re.sub(r"[ _-]", "", key.lower())
+            fields[ALIASES.get(key, key)] = value
+            if ALIASES.get(key) == "data file" and value.split()[:1] == ["LIST"]:
+                fields["list"] = decoded_text(file.read(MAX_HEADER))
                 break
+        packed = ENCODINGS.get(fields.get("encoding", "").lower()) in KINDS
+        if packed and whole(fields, "byte skip"):
+            raise InputError("it skips decompressed bytes, which is not supported")
         return fields, pairs, file.tell()
-
-
-def sizes_of(fields: Fields) -> tuple[int, ...]:
-    """Lengths of the dimensions, the fastest first."""
-    words = fields.get("sizes", "").split()
-    dimension = fields.get("dimension", "")
-    if not words or not all(re.fullmatch("0{0,9}[1-9][0-9]{0,17}", word) for word in words):
-        raise InputError(
-            f"its sizes are {fields.get('sizes', '')!r}; whole numbers above 0 are needed"
-        )
-    if dimension != str(len(words)) or len(words) > MAX_DIMENSIONS:
-        raise InputError(f"it has {len(words)} sizes and the dimension {dimension!r}")
-    return tuple(map(int, words))
 
 
 def words_of(fields: Fields, name: str, count: int, default: str) -> list[str]:
@@ -155,59 +268,15 @@ def vectors(text: str) -> list[tuple[float, ...] | None]:
     """Vectors such as (1,0,0); None for "none", and for one of NaN, as pynrrd writes it."""
     found: list[tuple[float, ...] | None] = []
     for word in re.findall(r"\([^)]*\)|\S+", text):
-        if word == "none":
-            found.append(None)
-            continue
-        try:
-            found.append(tuple(float(part) for part in word.strip("()").split(",")))
-        except ValueError as error:
-            raise InputError(f"{word!r} is no vector") from error
-    return [None if each is not None and np.isnan(each).all() else each for each in found]
-
-
-def dtype_of(fields: Fields) -> np.dtype[Any]:
-    """The type of the values in the file."""
-    kind = NRRD_TYPES.get(" ".join(fields.get("type", "").lower().split()))
-    if kind is None:
-        raise InputError(f"its values are of the type {fields.get('type')!r}, which has no numbers")
-    order = fields.get("endian", "little").lower()
-    if order not in ("little", "big"):
-        raise InputError(f"its byte order is {order!r}")
-    return np.dtype(("<" if order == "little" else ">") + kind)
-
-
-def whole(fields: Fields, name: str) -> int:
-    """A whole number from -1 on, 0 without the field."""
-    text = fields.get(name, "0")
-    try:
-        number = int(text)
-    except ValueError as error:
-        raise InputError(f"its {name} is {text!r}") from error
-    if number < -1:
-        raise InputError(f"its {name} is {number}")
-    return number
-
-
-def number_of(text: str) -> float:
-    """A number in any notation, NaN too."""
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"{text!r} stands where a number is needed") from error
-
-
-NRRD_SUFFIXES = (".nrrd", ".nhdr")
-
-
-SPATIAL = ("domain", "space", "none", "???")
-"""Kinds of axes that are positions, or say nothing."""
-
-COLOURS = ("RGB-color", "RGBA-color", "HSV-color", "XYZ-color")
+        parts = "nan" if word == "none" else word.strip("()")
+        numbers = numbers_of(parts.replace(",", " "), parts.count(",") + 1)
+        found.append(None if np.isnan(numbers).all() else tuple(numbers.tolist()))
+    return found
 
 
 def is_nrrd(head: bytes, path: Path) -> bool:
     """Whether this is NRRD."""
-    return head.startswith(MAGIC)
+    return head.startswith(b"NRRD000")
 
 
 def open_nrrd(path: Path, request: Request) -> Source:
@@ -216,38 +285,17 @@ def open_nrrd(path: Path, request: Request) -> Source:
     Raises InputError for colours, turned grids, more than four dimensions, and files that are cut;
     MissingInputError for a file of values that is not there.
     """
-    source, stamp = str(path), Stamp.of(path)
-    with naming(source):
-        fields, pairs, end = read_header(path)
-        sizes = sizes_of(fields)
-        kinds = words_of(fields, "kinds", len(sizes), "domain")
-        axes, vector = _axes(fields, pairs, sizes, kinds)
-        dtype = dtype_of(fields)
-        stored, files = _nrrd_values(path, fields, end, sizes, dtype, request)
-        units = fields.get("sample units", "").strip('" ')
-        shape = tuple(reversed(sizes))
-        whole = Variable(
-            name=_content(fields, path),
-            shape=shape,
-            dtype=dtype,
-            dimensions=tuple(AXIS_NAMES.get(axis) for axis in reversed(axes)),
-            attributes={"units": units} if units else {},
-            read=StoredArray(path, shape, dtype, stored).read,
-        )
-        arrays = [whole] if vector is None else components(whole, len(sizes) - 1 - vector)
-        found = placed(arrays, _nrrd_coordinates(fields, pairs, sizes, axes))
-    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
+    return _opened(path, request, read_header)
 
 
-def _axes(
-    fields: Fields, pairs: Mapping[str, str], sizes: Sequence[int], kinds: Sequence[str]
-) -> tuple[list[str], int | None]:
-    """The axis of each dimension (fastest first), "" for components, and where those are.
+def _axes(fields: Fields, sizes: Sequence[int]) -> list[str]:
+    """The axis of each dimension (fastest first), "" for that of components.
 
     The file's kinds, labels and space directions say which dimension is time or components; the
     others are x, y and z in their order.
     """
     directions = directions_of(fields, len(sizes))
+    kinds = words_of(fields, "kinds", len(sizes), "domain")
     axes = [""] * len(sizes)
     vector = None
     labels = re.findall(r'"((?:[^"\\]|\\.)*)"', fields.get("labels", ""))
@@ -276,168 +324,58 @@ def _axes(
         )
     for place, axis in zip(free, letters, strict=False):
         axes[place] = axis
-    return axes, vector
+    return axes
 
 
-def _content(fields: Fields, path: Path) -> str:
-    return fields.get("content", "").strip('" ') or path.stem
-
-
-def _nrrd_values(
-    path: Path,
-    fields: Fields,
-    end: int,
-    sizes: Sequence[int],
-    dtype: np.dtype[Any],
-    request: Request,
-) -> tuple[StoredBytes, list[Path]]:
-    """The bytes of the values, and the other files that hold them."""
-    size = prod(sizes) * dtype.itemsize
-    if "data file" not in fields:
-        return _nrrd_file(path, fields, end, size, dtype), []
-    files = _data_files(path, fields, sizes)
-    request.require_inside(path, *files)
-    stored = in_files(files, size, lambda file, part: _nrrd_file(file, fields, 0, part, dtype))
-    return stored, list(dict.fromkeys(files))
-
-
-def _data_files(path: Path, fields: Fields, sizes: Sequence[int]) -> list[Path]:
-    """The files of values: one, a list, or a pattern with its first and last number and stride."""
-    text = fields["data file"]
-    words = text.split() or [""]
-    if words[:1] == ["LIST"]:
-        listed = fields.get("list", "")
-        if listed.count("\n") > MAX_FILES:
-            raise InputError(f"its list is longer than {MAX_FILES} files")
-        names = [line.strip() for line in listed.splitlines() if line.strip()]
-        if not names:
-            raise InputError("its list of files is empty")
-        return [path.parent / name for name in names]
-    if "%" in words[0] and len(words) in (4, 5):
-        return numbered_files(path.parent, words[0], words[1:4], prod(sizes))
-    return [path.parent / text]
-
-
-def _nrrd_file(
-    path: Path, fields: Fields, start: int, size: int, dtype: np.dtype[Any]
-) -> StoredBytes:
-    """The bytes of one file, from `start` or what the header skips."""
-    encoding = fields.get("encoding", "").lower()
-    skip = whole(fields, "byte skip")
-    start = _after_lines(path, start, whole(fields, "line skip"))
-    if encoding == "raw":
-        place = path.stat().st_size - size if skip == -1 else start + skip
-        return PlainFile(path, start=place, size=size)
-    if skip < 0:
-        raise InputError("a byte skip of -1 belongs to the encoding raw")
-    if encoding in ("txt", "text", "ascii"):
-        return NumbersInText(path, dtype, start=start + skip, size=size)
-    kind = {"gz": "deflate", "gzip": "deflate", "bz2": "bzip2", "bzip2": "bzip2"}.get(encoding)
-    if kind is None:
-        raise InputError(f"its encoding is {encoding!r}; raw, gzip, bzip2 and text can be read")
-    if skip:
-        raise InputError("it skips decompressed bytes, which is not supported")
-    return CompressedFile(path, kind, start=start, size=size)
-
-
-def _after_lines(path: Path, start: int, lines: int) -> int:
-    if lines < 1:
-        return start
-    with path.open("rb") as file:
-        file.seek(start)
-        for _ in range(lines):
-            if not file.readline(MAX_HEADER):
-                raise InputError(f"{path} has fewer than the {lines} lines to skip")
-        return file.tell()
-
-
-def _nrrd_coordinates(
-    fields: Fields,
-    pairs: Mapping[str, str],
-    sizes: Sequence[int],
-    axes: Sequence[str],
+def _coordinates(
+    fields: Fields, pairs: Fields, sizes: Sequence[int], axes: Sequence[str]
 ) -> dict[str, Variable]:
     """Coordinates of the axes that the header places."""
     coords = _even(fields, sizes, axes)
     units = re.findall(r'"([^"]*)"', fields.get("units", ""))
     if not units:  # those of space count no other dimension
         units = re.findall(r'"([^"]*)"', fields.get("spaceunits", ""))
-        units += [""] * (len(sizes) - len(units))
     for axis, unit in zip(axes, units, strict=False):
         if axis in coords and unit:
             coords[axis] = replace(coords[axis], attributes={"units": unit})
-    for axis in AXES:
-        length = sizes[axes.index(axis)] if axis in axes else 1
+    for axis in AXES:  # those that a file of this project lists, with their names and units
         if f"coordinates_{axis}" in pairs:
-            coords[axis] = _exact(pairs, axis, length)
+            length = sizes[axes.index(axis)] if axis in axes else 1
+            values = numbers_of(pairs[f"coordinates_{axis}"], length)
+            told = {key: pairs.get(f"{key}_{axis}") for key in ("units", "calendar")}
+            extra = {key: text for key, text in told.items() if text is not None}
+            name = pairs.get(f"name_{axis}") or AXIS_NAMES[axis]
+            coords[axis] = positions(name, values, extra)
     return coords
-
-
-def _exact(pairs: Mapping[str, str], axis: str, length: int) -> Variable:
-    """A coordinate that a file of this project lists, with its name and units."""
-    try:
-        values = np.array([float(word) for word in pairs[f"coordinates_{axis}"].split()])
-    except ValueError:
-        values = np.empty(0)
-    if values.shape != (length,):
-        raise InputError(f"coordinates_{axis} are not {length} numbers")
-    extra = {
-        key: pairs[f"{key}_{axis}"] for key in ("units", "calendar") if f"{key}_{axis}" in pairs
-    }
-    return positions(pairs.get(f"name_{axis}") or AXIS_NAMES[axis], values, extra)
 
 
 def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str, Variable]:
     """Coordinates from directions and origin, else from spacings and minima."""
     coords: dict[str, Variable] = {}
-    directions = directions_of(fields, len(sizes))
     count = len(sizes)
-    spacings = [number_of(word) for word in words_of(fields, "spacings", count, "nan")]
-    minima = [number_of(word) for word in words_of(fields, "axis mins", count, "nan")]
-    centred = [word == "cell" for word in words_of(fields, "centerings", count, "???")]
-    for place, axis in enumerate(axes):
-        if axis and (np.isfinite(spacings[place]) or np.isfinite(minima[place])):
-            step = spacings[place] if np.isfinite(spacings[place]) else 1.0
-            origin = minima[place] if np.isfinite(minima[place]) else 0.0
-            first = 0.5 if centred[place] and np.isfinite(minima[place]) else 0.0
-            coords[axis] = lattice(axis, origin, step, sizes[place], first=first)
+    spacings = numbers_of(fields.get("spacings", "nan " * count), count)
+    minima = numbers_of(fields.get("axis mins", "nan " * count), count)
+    centres = words_of(fields, "centerings", count, "???")
+    for axis, step, low, length, centre in zip(axes, spacings, minima, sizes, centres, strict=True):
+        if axis and np.isfinite([step, low]).any():
+            first = 0.5 if centre == "cell" and np.isfinite(low) else 0.0
+            start, by = low if np.isfinite(low) else 0.0, step if np.isfinite(step) else 1.0
+            coords[axis] = lattice(axis, start, by, length, first=first)
+    directions = directions_of(fields, count)
     if directions is None:
         return coords
-    placed = [(axes[place], each) for place, each in enumerate(directions) if each is not None]
-    matrix = np.array([each for _, each in placed if len(each) == len(placed)])
-    if matrix.shape != (len(placed), len(placed)):
+    given = [(axis, each) for axis, each in zip(axes, directions, strict=True) if each is not None]
+    given.sort(key=lambda pair: "xyzt".find(pair[0]))
+    origins = (vectors(fields.get("space origin", "")) or [None])[0] or (0.0,) * len(given)
+    if {len(each) for _, each in given} != {len(given)} or len(origins) != len(given):
         raise InputError(f"its space directions {fields['space directions']!r} fit no grid")
-    order = sorted(range(len(placed)), key=lambda number: "xyzt".find(placed[number][0]))
-    steps = axis_steps(matrix[order])
-    origins = (vectors(fields.get("space origin", "")) or [None])[0] or (0.0,) * len(placed)
-    if len(origins) != len(placed):
-        raise InputError(f"its space origin {fields['space origin']!r} fits no grid")
-    for number, step, origin in zip(order, steps, origins, strict=True):
-        axis = placed[number][0]
-        coords[axis] = lattice(axis, float(origin), float(step), sizes[axes.index(axis)])
+    steps = axis_steps(np.array([each for _, each in given]))
+    for (axis, _), step, origin in zip(given, steps, origins, strict=True):
+        coords[axis] = lattice(axis, origin, float(step), sizes[axes.index(axis)])
     return coords
 
 
 METAIMAGE_SUFFIXES = (".mha", ".mhd")
-
-METAIMAGE_TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
-"""Number types by their names in the header; MetaIO's long has four bytes on every machine."""
-
-METAIMAGE_MAX_HEADER = 2**20
-"""Bytes of the longest header."""
 
 
 def is_metaimage(head: bytes, path: Path) -> bool:
@@ -453,157 +391,69 @@ def open_metaimage(path: Path, request: Request) -> Source:
     Raises InputError for turned grids, other types than numbers, and files that are cut;
     MissingInputError for a file of values that is not there.
     """
-    source, stamp = str(path), Stamp.of(path)
-    with naming(source):
-        fields, lines, end = _header(path)
-        sizes = _sizes(fields)
-        channels = _whole(fields, "ElementNumberOfChannels", 1)
-        dtype = _dtype(fields)
-        stored, files = _metaimage_values(
-            path, fields, lines, end, (*sizes, channels), dtype, request
-        )
-        shape = (*reversed(sizes), channels)
-        names = [AXIS_NAMES[axis] for axis in AXES[-len(sizes) :]]
-        whole = Variable(
-            name=fields.get("Name", "") or path.stem,
-            shape=shape,
-            dtype=dtype,
-            dimensions=(*names, None),
-            read=StoredArray(path, shape, dtype, stored).read,
-        )
-        arrays = components(whole, len(sizes))
-        found = placed(arrays, _metaimage_coordinates(fields, sizes))
-    return file_source(path, found, stamp=stamp, files=files, close=stored.close)
+    return _opened(path, request, _metaimage_header)
 
 
-def _header(path: Path) -> tuple[dict[str, str], list[str], int]:
-    """Fields, the file names that follow a LIST, and the first byte behind the header."""
+def _metaimage_header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
+    """The header in the fields of NRRD, no pairs, and the first byte behind it."""
     fields: dict[str, str] = {}
     with path.open("rb") as file:
-        while line := file.readline(METAIMAGE_MAX_HEADER):
-            text = decoded_text(line).strip()
-            if file.tell() > METAIMAGE_MAX_HEADER:
-                raise InputError(f"its header is longer than {METAIMAGE_MAX_HEADER} bytes")
-            if not text:
-                continue
-            key, equals, value = text.partition("=")
-            if not equals:
-                raise InputError(f"its header has the line {text[:60]!r}")
-            fields[key.strip()] = value.strip()
-            if key.strip() == "ElementDataFile":
-                names = []
+        for line in _lines(file):
+            key, value = _parted(line, "=") if line.strip() else ("", "")
+            fields[key] = value
+            if key == "ElementDataFile":
                 if value.split()[:1] == ["LIST"]:
-                    rest = decoded_text(file.read(METAIMAGE_MAX_HEADER))
-                    names = [name.strip() for name in rest.splitlines() if name.strip()]
-                return fields, names, file.tell()
-    raise InputError("its header has no ElementDataFile; the file is cut or no MetaImage")
-
-
-def _sizes(fields: Fields) -> tuple[int, ...]:
-    """Lengths, x first."""
+                    fields["list"] = decoded_text(file.read(MAX_HEADER))
+                break
+        end = file.tell()
+    if "ElementDataFile" not in fields:
+        raise InputError("its header has no ElementDataFile; the file is cut or no MetaImage")
     if fields.get("ObjectType", "Image") != "Image":
         raise InputError(f"its ObjectType is {fields['ObjectType']!r}; Image can be read")
-    words = fields.get("DimSize", "").split()
-    if not all(re.fullmatch("0{0,9}[1-9][0-9]{0,17}", word) for word in words):
-        raise InputError(f"its DimSize is {fields['DimSize']!r}; whole numbers above 0 are needed")
-    if len(words) not in (2, 3, 4) or fields.get("NDims") != str(len(words)):
+    count = len(fields.get("DimSize", "").split())
+    if count not in (2, 3, 4) or fields.get("NDims") != str(count):
         raise InputError(
             f"it has NDims = {fields.get('NDims')} and DimSize = {fields.get('DimSize')};"
             " 2, 3 or 4 dimensions can be read"
         )
-    return tuple(map(int, words))
-
-
-def _whole(fields: Fields, name: str, default: int) -> int:
-    text = fields.get(name, str(default))
-    if not re.fullmatch(r"-?[0-9]{1,18}", text) or (name != "HeaderSize" and int(text) < 1):
-        raise InputError(f"its {name} is {text!r}")
-    return int(text)
-
-
-def _flag(fields: Fields, *names: str) -> bool:
-    text = next((fields[name] for name in names if name in fields), "False")
-    return text.lower() in ("true", "1", "yes")
-
-
-def _dtype(fields: Fields) -> np.dtype[Any]:
-    kind = METAIMAGE_TYPES.get(fields.get("ElementType", "").removesuffix("_ARRAY"))
-    if kind is None:
-        raise InputError(f"its ElementType is {fields.get('ElementType')!r}; numbers can be read")
-    big = _flag(fields, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
-    return np.dtype((">" if big else "<") + kind)
-
-
-def _metaimage_values(
-    path: Path,
-    fields: Fields,
-    listed: Sequence[str],
-    end: int,
-    lengths: Sequence[int],
-    dtype: np.dtype[Any],
-    request: Request,
-) -> tuple[StoredBytes, list[Path]]:
-    """The bytes of the values, and the other files that hold them.
-
-    lengths: of the dimensions, with that of the channels at the end.
-    """
-    size = prod(lengths) * dtype.itemsize
+    spacing = numbers_of(_first(fields, "ElementSpacing ElementSize", "1 " * count), count)
+    origin = numbers_of(_first(fields, "Offset Position Origin", "0 " * count), count)
+    identity = " ".join(map(str, np.eye(count).ravel()))
+    matrix = _first(fields, "TransformMatrix Rotation Orientation", identity)
+    turn = numbers_of(matrix, count * count).reshape(count, count)
+    if not np.isfinite([*spacing, *origin, *turn.ravel()]).all():
+        raise InputError("its spacing, its origin or its matrix is not finite")
+    channels = whole(fields, "ElementNumberOfChannels", 1, 1)
+    big = _is_true(fields, "BinaryDataByteOrderMSB ElementByteOrderMSB")
+    plain = "raw" if _is_true(fields, "BinaryData", "True") else "text"
     data = fields["ElementDataFile"]
-    if data.upper() == "LOCAL":
-        return _metaimage_file(path, fields, end, size, dtype), []
-    words = data.split()
-    if words[:1] == ["LIST"] and not listed:
-        raise InputError("its list of files is empty")
-    if len(words) >= 4 and "%" in words[0]:
-        files = numbered_files(path.parent, words[0], words[1:4], prod(lengths[:-1]))
-    else:
-        files = [path.parent / name for name in (listed if words[:1] == ["LIST"] else [data])]
-    request.require_inside(path, *files)
-    stored = in_files(files, size, lambda file, part: _metaimage_file(file, fields, 0, part, dtype))
-    return stored, list(dict.fromkeys(files))
-
-
-def _metaimage_file(
-    path: Path, fields: Fields, start: int, size: int, dtype: np.dtype[Any]
-) -> StoredBytes:
-    """The bytes of one file, from `start` or what HeaderSize says."""
-    skip = _whole(fields, "HeaderSize", 0)
-    start = path.stat().st_size - size if skip == -1 else start + skip
-    if _flag(fields, "CompressedData"):
-        if skip == -1:
-            raise InputError("a HeaderSize of -1 belongs to values that are not compressed")
-        return CompressedFile(path, "deflate", start=start, size=size)
-    if not _flag({"BinaryData": "True", **fields}, "BinaryData"):
-        return NumbersInText(path, dtype, start=start, size=size)
-    return PlainFile(path, start=start, size=size)
-
-
-def _metaimage_coordinates(fields: Fields, sizes: Sequence[int]) -> dict[str, Variable]:
-    """Positions of the vertices; those of a plane's z are left to their index."""
-    count = len(sizes)
-    spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), [1.0] * count)
-    origin = _numbers(fields, ("Offset", "Position", "Origin"), [0.0] * count)
-    identity = np.eye(count).ravel().tolist()
-    matrix = _numbers(fields, ("TransformMatrix", "Rotation", "Orientation"), identity)
-    steps = spacing * axis_steps(matrix.reshape(count, count))
-    return {
-        axis: lattice(axis, float(start), float(step), length)
-        for axis, start, step, length in zip("xyzt", origin, steps, sizes, strict=False)
+    found = {
+        "content": fields.get("Name", ""),
+        "dimension": str(count + 1),
+        "sizes": f"{channels} {fields['DimSize']}",
+        "kinds": " ".join(["vector", "domain", "domain", "domain", "time"][: count + 1]),
+        "type": fields.get("ElementType", "").removesuffix("_ARRAY"),
+        "endian": "big" if big else "little",
+        "encoding": "gzip" if _is_true(fields, "CompressedData") else plain,
+        "byte skip": fields.get("HeaderSize", "0"),
+        "space directions": " ".join(["none", *map(_vector, spacing[:, None] * turn)]),
+        "space origin": _vector(origin),
+        "list": fields.get("list", ""),
     }
+    return found | ({} if data.upper() == "LOCAL" else {"data file": data}), {}, end
 
 
-def _numbers(
-    fields: Fields, names: Sequence[str], default: Sequence[float]
-) -> npt.NDArray[np.float64]:
-    """Numbers of the first field that is there, as many as by default."""
-    text = next((fields[name] for name in names if name in fields), None)
-    try:
-        numbers = np.array(default if text is None else [float(word) for word in text.split()])
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.shape != (len(default),):
-        raise InputError(f"its {names[0]} is {text!r}; {len(default)} numbers are needed")
-    return numbers
+def _vector(numbers: npt.NDArray[np.float64]) -> str:
+    return f"({','.join(map(repr, numbers.tolist()))})"
+
+
+def _first(fields: Fields, names: str, default: str) -> str:
+    """The first field of several names that is there."""
+    return next((fields[name] for name in names.split() if name in fields), default)
+
+
+def _is_true(fields: Fields, names: str, default: str = "False") -> bool:
+    return _first(fields, names, default).lower() in ("true", "1", "yes")
 
 
 RAW_NAME = re.compile(
@@ -640,24 +490,17 @@ def open_raw(path: Path, request: Request) -> Source:
     request.refuse_var(source)
     name, named = layout_of_name(path.stem)
     given = request.raw or RawLayout()
-    lengths, dtype_name, endian = (
-        given.shape or named.shape,
-        given.dtype or named.dtype,
-        given.endian or named.endian or "little",
-    )
+    lengths, dtype_name = given.shape or named.shape, given.dtype or named.dtype
+    endian = given.endian or named.endian or "little"
     if lengths is None or dtype_name is None:
         missing = " and ".join(
             word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None
         )
-        header = path.with_suffix(".nhdr")
-        if header.is_file():
-            raise InputError(
-                f"{source}: the {missing} of the raw values is not known; {header} may say it: give"
-                " that file instead, or --shape x=..,y=..,z=.. and --dtype"
-            )
+        header, form = path.with_suffix(".nhdr"), f"name the file {RAW_FORM}, or give"
+        advice = f"{header} may say it: give that file instead, or" if header.is_file() else form
         raise InputError(
-            f"{source}: the {missing} of the raw values is not known; name the file {RAW_FORM}, or"
-            " give --shape x=..,y=..,z=.. and --dtype"
+            f"{source}: the {missing} of the raw values is not known; {advice}"
+            " --shape x=..,y=..,z=.. and --dtype"
         )
     axes = tuple(axis for axis in AXES if axis in lengths)
     if request.axes is not None:
@@ -671,18 +514,13 @@ def open_raw(path: Path, request: Request) -> Source:
     shape = tuple(lengths[axis] for axis in axes)
     array = FlatArray(path, shape, dtype.newbyteorder(ENDIANS[endian]))
     if array.end != stamp.size:
-        layout = "x".join(str(length) for length in shape)
-        needed = f"{layout} ({','.join(axes)}) of {dtype.name} need exactly {array.end}"
+        frames = "t" not in lengths and stamp.size % array.end == 0
+        advice = f"; with t={stamp.size // array.end} the size would fit" if frames else ""
+        layout = f"{'x'.join(map(str, shape))} ({','.join(axes)}) of {dtype.name}"
         raise InputError(
-            f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}"
+            f"{source} has {stamp.size} bytes; {layout} need exactly {array.end}{advice}"
         )
-    values = Variable(name=name, shape=shape, dtype=array.dtype, dimensions=axes, read=array.read)
-    return file_source(path, [values], stamp=stamp)
-
-
-def _advice(lengths: Mapping[str, int], size: int, needed: int) -> str:
-    frames = "t" not in lengths and size % needed == 0
-    return f"; with t={size // needed} the size would fit" if frames else ""
+    return file_source(path, [array.variable(name, axes)], stamp=stamp)
 
 
 NPY_MAGIC = b"\x93NUMPY"
@@ -720,12 +558,12 @@ def open_npy(path: Path, request: Request) -> Source:
         )
     if dtype.names is None and dtype.kind != "c":
         request.refuse_var(source)
-    values = Variable(
-        name=path.stem,
-        shape=shape,
-        dtype=dtype,
-        read=(lambda places: array.read(places[::-1]).transpose()) if fortran else array.read,
-        # time as the fastest dimension: all steps are read together
-        chunks=shape if fortran else None,
-    )
+    values = array.variable(path.stem)
+    if fortran:  # time is the fastest dimension: all steps are read together
+        values = replace(
+            values,
+            shape=shape,
+            read=lambda places: array.read(places[::-1]).transpose(),
+            chunks=shape,
+        )
     return file_source(path, [values], stamp=stamp)

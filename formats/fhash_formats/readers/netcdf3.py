@@ -9,9 +9,8 @@ unlimited dimension are interleaved record by record. Names and texts are UTF-8,
 from __future__ import annotations
 
 import mmap
-import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -36,79 +35,32 @@ ATTRIBUTES = 12
 """Tag of a list of attributes."""
 TYPES = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")
 """numpy's names of the types, the first with number 1; those from number 7 on are of CDF-5."""
-STREAMING = 0xFFFFFFFF
-"""Number of records in a file whose writer did not know it."""
 PADDED = 4
 """Bytes to whose multiple names, attributes and arrays are filled up."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Header:
-    """The header of a classic file.
+def _read(
+    path: Path,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    begin: int,
+    strides: tuple[int, ...],
+    places: tuple[slice | int, ...],
+) -> npt.NDArray[Any]:
+    """Values at a range or an index along each dimension, in the machine's byte order.
 
-    Attributes:
-        lengths: of each dimension, None for the unlimited one.
-        records: length of the unlimited dimension.
-        attributes: of the file.
-        variables: by name.
+    The file is open no longer than that.
     """
-
-    lengths: dict[str, int | None]
-    records: int
-    attributes: dict[str, Any]
-    variables: dict[str, ClassicArray]
-
-
-class ClassicArray:
-    """An array of a classic file, read as it is indexed; the file is open no longer than that.
-
-    Attributes:
-        dimensions: their names.
-        attributes: numbers as numpy scalars or arrays, texts as str.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        dtype: str,
-        dimensions: tuple[str, ...],
-        attributes: dict[str, Any],
-        shape: tuple[int, ...],
-        begin: int,
-        record: int | None,
-    ) -> None:
-        """Describe the array at byte `begin`, its records (if it has any) `record` bytes apart."""
-        self.path, self.dimensions, self.attributes = path, dimensions, attributes
-        self.dtype, self.shape, self.begin = np.dtype(dtype), shape, begin
-        inner = [self.dtype.itemsize * prod(shape[i + 1 :]) for i in range(len(shape))]
-        self.strides = tuple(inner if record is None else (record, *inner[1:]))
-
-    @property
-    def end(self) -> int:
-        """The byte after the last one, padding not counted."""
-        if 0 in self.shape:
-            return self.begin
-        last = sum((n - 1) * stride for n, stride in zip(self.shape, self.strides, strict=True))
-        return self.begin + last + self.dtype.itemsize
-
-    def __getitem__(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
-        """The stored numbers at integers and slices, big-endian."""
-        if 0 in self.shape:
-            return np.empty(self.shape, self.dtype)[key]
-        with (
-            self.path.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped,
-        ):
-            stored: npt.NDArray[Any] = np.ndarray(
-                self.shape, self.dtype, mapped, self.begin, self.strides
-            )
-            copied: npt.NDArray[Any] = stored[key].copy()
-            del stored  # the map cannot be closed before
-        return copied
-
-    def native(self, key: tuple[int | slice, ...]) -> npt.NDArray[Any]:
-        """The stored numbers at integers and slices, in the machine's byte order."""
-        return self[key].astype(self.dtype.newbyteorder("="), copy=False)
+    if 0 in shape:
+        return np.empty(shape, dtype.newbyteorder("="))[places]
+    with (
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped,
+    ):
+        stored: npt.NDArray[Any] = np.ndarray(shape, dtype, mapped, begin, strides)
+        copied: npt.NDArray[Any] = stored[places].astype(dtype.newbyteorder("="))
+        del stored  # the map cannot be closed before
+    return copied
 
 
 class _Bytes:
@@ -133,16 +85,13 @@ class _Bytes:
         """A count or a length, of 8 bytes in CDF-5."""
         return self.integer(8 if self.wide else 4)
 
-    def name(self) -> str:
-        return decoded_text(self.take(self.count()))
-
     def members(self, tag: int) -> Iterator[str]:
         """The name of each member of a list, before the rest of the member is read."""
         found, count = self.integer(), self.count()
         if found not in (tag, 0) or (not found and count):
             raise ValueError(f"its header has the tag {found} in place of {tag}")
         for _ in range(count):
-            yield self.name()
+            yield decoded_text(self.take(self.count()))
 
     def type(self) -> str:
         number = self.integer()
@@ -164,22 +113,25 @@ class _Bytes:
         return found
 
 
-def read_header(path: Path) -> Header:
-    """The header of a classic file; raises ValueError for one that is damaged or cut off."""
+def read_header(path: Path) -> tuple[dict[str, Any], list[Variable]]:
+    """Attributes and variables of a classic file.
+
+    Raises ValueError for a header that is damaged or cut off.
+    """
+    size = path.stat().st_size
     with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
-            length = 1 << 16
-            while True:  # a header is small, and the file may be large
-                try:
-                    return _parsed(path, mapped[:length], size)
-                except ValueError:
-                    if length >= size:
-                        raise
-                length *= 16
+        data = file.read(1 << 16)
+        while True:  # a header is small, and the file may be large
+            try:
+                return _parsed(path, data, size)
+            except ValueError:
+                more = file.read(15 * len(data))
+                if not more:
+                    raise
+            data += more
 
 
-def _parsed(path: Path, data: bytes, size: int) -> Header:
+def _parsed(path: Path, data: bytes, size: int) -> tuple[dict[str, Any], list[Variable]]:
     version = data[3]
     header = _Bytes(data, wide=version == 5)
     records = header.count()
@@ -207,23 +159,36 @@ def _parsed(path: Path, data: bytes, size: int) -> Header:
     ]
     # one array alone has its records next to each other
     record = sizes[0] if len(sizes) == 1 else sum(n + -n % PADDED for n in sizes)
-    if records == (2**64 - 1 if version == 5 else STREAMING):
+    if records == (1 << (64 if version == 5 else 32)) - 1:  # whose writer did not know it
         first = min((begin for *_, begin in along), default=size)
         records = max(0, size - first) // record if record else 0
-    variables = {}
+    variables = []
     for name, dims, own, dtype, begin in described:
-        recorded = bool(dims) and lengths[dims[0]] is None
         if any(lengths[d] is None for d in dims[1:]):
             raise ValueError(f"{name!r:.40} has the unlimited dimension elsewhere than first")
         shape = tuple(records if lengths[d] is None else lengths[d] or 0 for d in dims)
-        array = ClassicArray(path, dtype, dims, own, shape, begin, record if recorded else None)
-        if array.end > size:
+        kind = np.dtype(dtype)
+        inner = [kind.itemsize * prod(shape[i + 1 :]) for i in range(len(shape))]
+        strides = (record, *inner[1:]) if dims and lengths[dims[0]] is None else tuple(inner)
+        end = (
+            begin + kind.itemsize + sum((n - 1) * by for n, by in zip(shape, strides, strict=True))
+        )
+        if end > size and 0 not in shape:
             raise ValueError(
-                f"{name!r:.40} ends at byte {array.end:,}, and the file has {size:,}: it was cut"
-                " off, or never written to its end"
+                f"{name!r:.40} ends at byte {end:,}, and the file has {size:,}: it was cut off, or"
+                " never written to its end"
             )
-        variables[name] = array
-    return Header(lengths=lengths, records=records, attributes=attributes, variables=variables)
+        variables.append(
+            Variable(
+                name=name,
+                shape=shape,
+                dtype=kind.newbyteorder("="),
+                dimensions=dims,
+                attributes=own,
+                read=partial(_read, path, kind, shape, begin, strides),
+            )
+        )
+    return attributes, variables
 
 
 def matches(head: bytes, path: Path) -> bool:
@@ -235,24 +200,13 @@ def open_classic(path: Path, request: Request) -> Source:
     """The variables of a classic file."""
     stamp = Stamp.of(path)
     with refusing(f"{path} cannot be read as classic NetCDF"):
-        header = read_header(path)
-    if {"image", "image-min", "image-max"} <= header.variables.keys():
+        attributes, variables = read_header(path)
+    if {"image", "image-min", "image-max"} <= {each.name for each in variables}:
         raise InputError(f"{path} is MINC1; mincconvert -2 makes MINC2 of it, which can be read")
-    variables = [
-        Variable(
-            name=name,
-            shape=array.shape,
-            dtype=array.dtype.newbyteorder("="),
-            dimensions=array.dimensions,
-            attributes=array.attributes,
-            read=array.native,
-        )
-        for name, array in header.variables.items()
-    ]
     return file_source(
         path,
         variables,
-        groups={"": header.attributes},
+        groups={"": attributes},
         stamp=stamp,
         naming=True,
         default_fill=default_fill,

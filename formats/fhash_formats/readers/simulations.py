@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from math import prod
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Request, Stamp, library, naming
 from fhash_formats.readers.layout import Read
-from fhash_formats.readers.stored_bytes import FlatArray, lattice, numbers_of
+from fhash_formats.readers.stored_bytes import TYPES, FlatArray, lattice, numbers_of
 from fhash_formats.readers.variables import (
     Behind,
     Source,
@@ -114,9 +114,8 @@ def _box(first: npt.NDArray[Any], last: npt.NDArray[Any]) -> tuple[slice, ...]:
     return tuple(slice(low, high) for low, high in zip(first.tolist(), last.tolist(), strict=True))
 
 
-def _require_one_level(levels: npt.NDArray[Any] | int) -> None:
-    """Raise InputError for levels of refinement that differ, or for their number beyond 1."""
-    count = levels if isinstance(levels, int) else len(np.unique(levels))
+def _require_one_level(count: int) -> None:
+    """Raise InputError for another number of levels of refinement than 1."""
     if count != 1:
         raise InputError(
             f"it has {count} levels of refinement, which have no grid of their own; make one by"
@@ -169,7 +168,7 @@ def athena_variables(
     """
     known = {each.name: each for each in variables}
     levels = _table(known, "Levels")
-    _require_one_level(levels)
+    _require_one_level(len(np.unique(levels)))
     sizes = np.atleast_1d(attributes["MeshBlockSize"])[::-1].astype(np.int64)
     corners = _table(known, "LogicalLocations")[:, ::-1].astype(np.int64)
     _require_small(corners, sizes)
@@ -183,26 +182,20 @@ def athena_variables(
             )
     coords = {}
     for axis, letter in enumerate(AXES[1:]):
-        number = 3 - axis
-        centres = _table(known, f"x{number}v").reshape(len(corners), sizes[axis])
+        centres = _table(known, f"x{3 - axis}v").reshape(len(corners), sizes[axis])
         coords[letter] = positions(letter, blocks.line(axis, centres))
     coords["t"] = positions(AXIS_NAMES["t"], [float(attributes["Time"])])
-    names = _texts(attributes["VariableNames"])
+    names = list(map(text_of, np.atleast_1d(attributes["VariableNames"]).tolist()))
     found = []
     counts = np.atleast_1d(attributes["NumVariables"]).tolist()
-    for dataset, count in zip(_texts(attributes["DatasetNames"]), counts, strict=True):
-        whole = known[dataset]
+    for dataset, count in zip(np.atleast_1d(attributes["DatasetNames"]), counts, strict=True):
+        whole = known[text_of(dataset)]
         if whole.shape != (count, len(corners), *sizes.tolist()) or len(names) < count:
             raise InputError(f"{whole} does not hold {count} variables of {len(corners)} blocks")
         for number, name in enumerate(names[:count]):
             found.append(_grid(whole, name, blocks, range(len(corners)), number))
         names = names[count:]
     return in_place_of(variables, placed(found, coords))
-
-
-def _texts(value: Any) -> list[str]:
-    """The texts of an attribute that has one or several."""
-    return [text_of(each) for each in np.atleast_1d(value).tolist()]
 
 
 LEAF = 1
@@ -216,7 +209,7 @@ def flash_variables(variables: Sequence[Variable]) -> list[Variable]:
     """
     known = {each.name: each for each in variables}
     leaves = np.flatnonzero(_table(known, "node type") == LEAF)
-    _require_one_level(_table(known, "refine level").ravel()[leaves])
+    _require_one_level(len(np.unique(_table(known, "refine level").ravel()[leaves])))
     # four letters, which blanks fill, in the names of the arrays, too
     names = [text_of(each) for each in _table(known, "unknown names").ravel().tolist()]
     boxes = _table(known, "bounding box")[leaves].astype(np.float64)
@@ -259,10 +252,9 @@ FAB = re.compile(rf"FAB \(\(\d+, \([\d ]+\)\),\((\d+), \(([\d ]+)\)\)\){BOX} (\d
 
 def is_plotfile(head: bytes, path: Path) -> bool:
     """Whether this is the folder of a plotfile of AMReX."""
-    header = path / "Header"
-    if not path.is_dir() or not header.is_file():
+    if not (path / "Header").is_file():
         return False
-    with header.open("rb") as file:
+    with (path / "Header").open("rb") as file:
         return file.read(64).startswith(PLOTFILES)
 
 
@@ -285,7 +277,7 @@ def open_plotfile(path: Path, request: Request) -> Source:
         cells = _within(path, f"{rest[10 + boxes * len(axes)].strip()}_H")
         domain = _boxes(rest[3])
         fabs, firsts, sizes = _fabs(path, cells, count)
-        blocks, dtype = Blocks(firsts, sizes), fabs[0][0].dtype
+        blocks = Blocks(firsts, sizes)
         corner = tuple(firsts.min(axis=0))
         if [(tuple(first), tuple(size)) for first, size in domain] != [(corner, blocks.shape)]:
             raise InputError(f"its boxes are {blocks.shape} at {corner}, and its domain another")
@@ -298,9 +290,9 @@ def open_plotfile(path: Path, request: Request) -> Source:
             Variable(
                 name=name.strip(),
                 shape=blocks.shape,
-                dtype=dtype,
+                dtype=fabs[0][0].dtype,
                 dimensions=tuple(reversed(axes)),
-                read=blocks.read(partial(_of_fab, fabs, number), dtype),
+                read=blocks.read(partial(_of_fab, fabs, number), fabs[0][0].dtype),
                 behind=lambda: Behind(folder=path),
             )
             for number, name in enumerate(names)
@@ -380,10 +372,6 @@ def _of_fab(fabs: Sequence[Fab], component: int, box: int, places: tuple[slice, 
 
 
 ADIOS_SUFFIXES = (".bp", ".bp4", ".bp5")
-ADIOS_TYPES = {"float": "f4", "double": "f8"}
-ADIOS_TYPES |= {
-    f"{kind}{8 * n}_t": f"{kind[0]}{n}" for kind in ("int", "uint") for n in (1, 2, 4, 8)
-}
 
 
 def is_adios(head: bytes, path: Path) -> bool:
@@ -400,7 +388,7 @@ def open_adios(path: Path, request: Request) -> Source:
     adios2 = library(source, "ADIOS2 BP", "adios2", "fhash[adios]")
     index = path / "md.idx"
     stamp = Stamp.of(index if index.is_file() else path)
-    with naming(source):
+    with naming(source), ExitStack() as opened:
         if index.is_file():
             _require_whole(path)
         io = adios2.Adios().declare_io(source)
@@ -408,27 +396,24 @@ def open_adios(path: Path, request: Request) -> Source:
         io.set_parameters({"OpenTimeoutSecs": "1", "Profile": "Off"})
         io.add_transport("File", {"Library": "stdio"})
         file = adios2.FileReader(io, source)
-    try:
-        with naming(source):
-            told = file.available_variables()
-            steps = max((int(each["AvailableStepsCount"]) for each in told.values()), default=0)
-            attributes: dict[str, dict[str, Any]] = {name: {} for name in told}
-            for name in file.available_attributes():
-                owner, _, key = name.rpartition("/")
-                attributes.setdefault(owner, {})[key] = file.read_attribute(name)
-            found = [
-                _of_adios(path, file, name, steps, each, attributes[name])
-                for name, each in told.items()
-                if each["Type"] in ADIOS_TYPES and (each["Shape"] or each["SingleValue"] == "true")
-            ]
-    except BaseException:
-        _close(file)
-        raise
+        opened.callback(_close, file)
+        told = file.available_variables()
+        steps = max((int(each["AvailableStepsCount"]) for each in told.values()), default=0)
+        attributes: dict[str, dict[str, Any]] = {name: {} for name in told}
+        for name in file.available_attributes():
+            owner, _, key = name.rpartition("/")
+            attributes.setdefault(owner, {})[key] = file.read_attribute(name)
+        found = [
+            _of_adios(path, file, name, steps, each, attributes[name])
+            for name, each in told.items()
+            if each["Type"] in TYPES and (each["Shape"] or each["SingleValue"] == "true")
+        ]
+        close = opened.pop_all().close
     return file_source(
         path,
         found,
         groups={name.strip("/"): each for name, each in attributes.items()},
-        close=partial(_close, file),
+        close=close,
         stamp=stamp,
         folder=path if path.is_dir() else None,
     )
@@ -463,7 +448,7 @@ def _of_adios(
 ) -> Variable:
     """A variable; steps: of the file."""
     own = tuple(int(length) for length in told["Shape"].split(",") if length.strip())
-    count, dtype = int(told["AvailableStepsCount"]), np.dtype(ADIOS_TYPES[told["Type"]])
+    count, dtype = int(told["AvailableStepsCount"]), np.dtype(TYPES[told["Type"]])
     shape = (count, *own) if count > 1 else own
 
     def get(ranges: list[range]) -> npt.NDArray[Any]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import bz2
-import re
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -13,9 +12,27 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.variables import Variable, positions
+from fhash_formats.errors import InputError
+from fhash_formats.readers.file_series import naming
+from fhash_formats.readers.variables import Variable, by_ranges, positions
 from fhash_formats.series import AXIS_NAMES
+from fhash_formats.support.values import is_number
+
+TYPE_NAMES = {
+    "i1": "signed char|int8|int8_t|met_char",
+    "u1": "uchar|unsigned char|uint8|uint8_t|met_uchar",
+    "i2": "short|short int|signed short|signed short int|int16|int16_t|met_short",
+    "u2": "ushort|unsigned short|unsigned short int|uint16|uint16_t|met_ushort",
+    "i4": "int|signed int|int32|int32_t|met_int|met_long",
+    "u4": "uint|unsigned int|uint32|uint32_t|met_uint|met_ulong",
+    "i8": "longlong|long long|long long int|signed long long|signed long long int|int64|int64_t"
+    "|met_long_long",
+    "u8": "ulonglong|unsigned long long|unsigned long long int|uint64|uint64_t|met_ulong_long",
+    "f4": "float|float32|met_float",
+    "f8": "double|float64|met_double",
+}
+TYPES = {name: short for short, names in TYPE_NAMES.items() for name in names.split("|")}
+"""Number types by their names in headers; MetaIO's long has four bytes on every machine."""
 
 BLOCK_BYTES = 8 * 2**20
 """Bytes read at once where the requested values are scattered, as with time fastest."""
@@ -28,13 +45,20 @@ class FlatArray:
     """An array of `shape` (slowest dimension first) and `dtype` from byte `offset` of a file on.
 
     It is read with seek and read: a memory map would kill the process if the file were cut
-    meanwhile.
+    meanwhile. stored: the bytes, where they are not simply those of the file.
     """
 
     def __init__(
-        self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], *, offset: int = 0
+        self,
+        path: Path,
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        *,
+        offset: int = 0,
+        stored: StoredBytes | None = None,
     ) -> None:
         self.path, self.shape, self.dtype, self.offset = path, shape, dtype, offset
+        self.stored = stored
 
     @property
     def end(self) -> int:
@@ -46,48 +70,36 @@ class FlatArray:
 
         Raises InputError where the file ends too early.
         """
-        if any(isinstance(each, int) for each in places):
-            whole = [slice(each, each + 1) if isinstance(each, int) else each for each in places]
-            kept = tuple(0 if isinstance(each, int) else slice(None) for each in places)
-            return self.read(whole)[kept]
-        ranges = tuple(
-            slice(*each.indices(length)[:2])
-            for each, length in zip(places, self.shape, strict=True)
-            if isinstance(each, slice)
+        return by_ranges(self.shape, self._box)(tuple(places))
+
+    def variable(self, name: str, dimensions: Sequence[str | None] = ()) -> Variable:
+        """The array as a variable."""
+        return Variable(
+            name=name,
+            shape=self.shape,
+            dtype=self.dtype,
+            dimensions=tuple(dimensions),
+            read=self.read,
         )
-        parts = [
-            place
-            for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
-            if part != slice(0, length)
-        ]
-        if len(parts) > 1:
-            return self._read_box(ranges, parts[0])
+
+    def _box(self, ranges: list[range]) -> npt.NDArray[Any]:
+        """Values in ranges; whatever lies behind an index along the slowest of several parts is an
+        array of its own."""
+        parts = [n for n, length in enumerate(self.shape) if len(ranges[n]) != length]
         place = parts[0] if parts else 0
-        part = ranges[place]
-        rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
-        result = np.empty((rows, (part.stop - part.start) * inner), self.dtype)
+        outer, inner = self.shape[: place + 1], self.shape[place + 1 :]
+        result = np.empty([len(part) for part in ranges], self.dtype)
+        if len(parts) > 1:
+            for where in np.ndindex(*result.shape[: place + 1]):
+                index = [part[n] for part, n in zip(ranges, where, strict=False)]
+                number = int(np.ravel_multi_index(index, outer))
+                offset = self.offset + number * prod(inner) * self.dtype.itemsize
+                array = FlatArray(self.path, inner, self.dtype, offset=offset, stored=self.stored)
+                result[where] = array._box(ranges[place + 1 :])
+            return result
+        rows = result.reshape(prod(outer[:-1]), len(ranges[place]) * prod(inner))
         with self.path.open("rb") as file:
-            self._fill(file, result, self.shape[place] * inner, part.start * inner)
-        return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
-
-    def _read_box(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
-        """Values in ranges of which several are parts; `place` is the slowest of these.
-
-        Whatever lies behind an index along it is an array of its own.
-        """
-        inner = self.shape[place + 1 :]
-        bytes_inside = prod(inner) * self.dtype.itemsize
-        slow = [range(part.start, part.stop) for part in ranges[: place + 1]]
-        result = np.empty([len(part) for part in slow] + _lengths(ranges[place + 1 :]), self.dtype)
-        strides = [prod(self.shape[deeper + 1 : place + 1]) for deeper in range(place + 1)]
-        for where in np.ndindex(*(len(part) for part in slow)):
-            number = sum(
-                part[index] * stride
-                for part, index, stride in zip(slow, where, strides, strict=True)
-            )
-            offset = self.offset + number * bytes_inside
-            array = FlatArray(self.path, inner, self.dtype, offset=offset)
-            result[where] = array.read(ranges[place + 1 :])
+            self._fill(file, rows, outer[-1] * prod(inner), ranges[place].start * prod(inner))
         return result
 
     def _fill(self, file: BinaryIO, result: npt.NDArray[Any], stride: int, first: int) -> None:
@@ -106,8 +118,12 @@ class FlatArray:
             result[row : row + count] = block.reshape(count, stride)[:, first : first + run]
 
     def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
-        file.seek(self.offset + start * self.dtype.itemsize)
-        _read_whole(self.path, file, into.view(np.uint8).data, f", {self.end} are needed")
+        place, view = self.offset + start * self.dtype.itemsize, into.view(np.uint8).data
+        if self.stored is not None:
+            self.stored.readinto(place, view)
+            return
+        file.seek(place)
+        _read_whole(self.path, file, view, f", {self.end} are needed")
 
 
 def _read_whole(path: Path, file: BinaryIO, view: memoryview, told: str) -> None:
@@ -118,10 +134,6 @@ def _read_whole(path: Path, file: BinaryIO, view: memoryview, told: str) -> None
         if not count:
             raise InputError(f"{path} ends after {file.tell()} bytes{told}")
         done += count
-
-
-def _lengths(ranges: tuple[slice, ...]) -> list[int]:
-    return [part.stop - part.start for part in ranges]
 
 
 INFLATED_BYTES = 2**20
@@ -135,12 +147,6 @@ DEFLATE_RATIO = 1032
 
 BZIP2_RATIO = 2_000_000
 """Factor above the largest by which bzip2 can shrink data: 46 MB of zeros to 40 bytes."""
-
-MAX_FILES = 1 << 20
-"""Files of one array."""
-
-NUMBERED = re.compile(r"([^%\s]*%0?[0-9]{0,2})[du]([^%\s]*)")
-"""A pattern of C for the names of files; a wider number would be a name of gigabytes."""
 
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip member; zlib begins with others."""
@@ -199,25 +205,19 @@ class NumbersInText:
     def readinto(self, place: int, view: memoryview) -> None:
         """Fill a view with the bytes from `place` on."""
         if self._values is None:
-            self._values = self._parsed()
+            with self.path.open("rb") as file:
+                file.seek(self.start)
+                words = file.read(self._count).replace(b",", b" ").split()
+            count = self.size // self.dtype.itemsize
+            if len(words) != count:
+                raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
+            with naming(str(self.path)):
+                self._values = numbers_of_words(words, self.dtype).view(np.uint8)
         view[:] = self._values[place : place + len(view)].data
 
     def close(self) -> None:
         """Forget the values."""
         self._values = None
-
-    def _parsed(self) -> npt.NDArray[np.uint8]:
-        with self.path.open("rb") as file:
-            file.seek(self.start)
-            words = file.read(self._count).replace(b",", b" ").split()
-        count = self.size // self.dtype.itemsize
-        if len(words) != count:
-            raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
-        try:
-            values = numbers_of_words(words, self.dtype)
-        except ValueError as error:
-            raise InputError(f"{self.path}: {error}") from error
-        return values.view(np.uint8)
 
 
 class ManyFiles:
@@ -245,83 +245,12 @@ class ManyFiles:
         self.parts[self._open].close()
 
 
-def in_files(
-    files: Sequence[Path], size: int, open_part: Callable[[Path, int], StoredBytes]
-) -> StoredBytes:
-    """Values that are spread evenly over one or several files.
-
-    Args:
-        files: at least one, in the order of their values.
-        size: bytes of all values.
-        open_part: opens one file, given the bytes of the values in it.
-
-    Raises MissingInputError for a file that is not there, and InputError where the values cannot be
-    divided among the files.
-    """
-    for file in files:
-        if not file.is_file():
-            raise MissingInputError(f"its values are in {file}, which is not there")
-    if size % len(files):
-        raise InputError(f"its {size} bytes cannot be divided among {len(files)} files")
-    parts = [open_part(file, size // len(files)) for file in files]
-    return parts[0] if len(parts) == 1 else ManyFiles(parts)
-
-
-def numbered_files(folder: Path, form: str, words: Sequence[str], most: int) -> list[Path]:
-    """Files of a pattern of C such as `slice_%03d.raw`, numbered from, to and by three words.
-
-    most: files that there can be. Raises InputError for other patterns, and MissingInputError for
-    the first file that is not there.
-    """
-    match = NUMBERED.fullmatch(form)
-    if match is None or not all(re.fullmatch(r"-?[0-9]{1,9}", word) for word in words):
-        raise InputError(
-            f"its pattern of files is {' '.join([form, *words])[:80]!r}; a name with one %d or %03d"
-            " (two digits at most), the first number, the last and the stride are needed"
-        )
-    first, last, stride = map(int, words)
-    if stride == 0 or not 0 <= (last - first) // stride < min(most, MAX_FILES):
-        raise InputError(
-            f"its pattern of files is {' '.join([form, *words])!r}; 1 to {min(most, MAX_FILES)}"
-            " numbers are possible here"
-        )
-    files = []
-    for number in range(first, last + (1 if stride > 0 else -1), stride):
-        files.append(folder / (f"{match[1]}d{match[2]}" % number))
-        if not files[-1].is_file():
-            raise MissingInputError(f"its values are in {files[-1]}, which is not there")
-    return files
-
-
-class StoredArray(FlatArray):
-    """An array of `shape` (slowest dimension first) and `dtype`, from a stored byte `offset` on."""
-
-    def __init__(
-        self,
-        path: Path,
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-        stored: StoredBytes,
-        *,
-        offset: int = 0,
-    ) -> None:
-        super().__init__(path, shape, dtype, offset=offset)
-        self.stored = stored
-
-    def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
-        place = self.offset + start * self.dtype.itemsize
-        self.stored.readinto(place, into.view(np.uint8).data)
-
-
 def numbers_of(text: str, count: int) -> npt.NDArray[np.float64]:
     """So many numbers of a line, in any notation; raises InputError for another text."""
-    try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.shape != (count,):
+    words = text.split()
+    if len(words) != count or not all(map(is_number, words)):
         raise InputError(f"{text[:60]!r} stands where {count} numbers are needed")
-    return numbers
+    return np.array([float(word) for word in words])
 
 
 def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
@@ -336,47 +265,43 @@ def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArra
     return np.array(numbers, dtype)
 
 
-class _Inflate:
-    """Decompression of zlib or gzip, whichever the data begin with.
+def _inflated(path: Path, kind: str, start: int) -> Generator[bytes]:
+    """The true bytes of a file that is compressed from byte `start` on, some at a time.
 
-    The members of one gzip file follow each other.
+    The members of one gzip file follow each other; what follows else belongs to nothing. Raises
+    InputError for a stream that is damaged, or cut before its checksum.
     """
-
-    def __init__(self) -> None:
-        self.inner = zlib.decompressobj(wbits=47)
-        self.gzip: bool | None = None
-        self.complete = False
-
-    def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
-        if self.gzip is None and stored:
-            self.gzip = stored[:1] == GZIP[:1]
-        if self.complete and stored:
-            if not self.gzip or stored[:1] != GZIP[:1]:
-                return b"", b"", True  # what follows belongs to nothing
-            self.inner, self.complete = zlib.decompressobj(wbits=47), False
-        if self.complete:
-            return b"", b"", False
-        data = self.inner.decompress(stored, limit)
-        self.complete = self.inner.eof
-        rest = self.inner.unused_data if self.complete else self.inner.unconsumed_tail
-        return data, rest, self.complete and not self.gzip
-
-
-class _Bunzip:
-    """Decompression of bzip2."""
-
-    def __init__(self) -> None:
-        self.inner = bz2.BZ2Decompressor()
-        self.complete = False
-
-    def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
-        data = self.inner.decompress(stored, limit)
-        self.complete = self.inner.eof
-        return data, b"", self.complete
+    done = 0
+    with path.open("rb") as file:
+        file.seek(start)
+        stored = file.read(STORED_BYTES)
+        while True:
+            inner: Any = KINDS[kind]()
+            members = kind == "deflate" and stored[:1] == GZIP[:1]
+            while not inner.eof:
+                hungry = getattr(inner, "needs_input", True)
+                stored = stored or (file.read(STORED_BYTES) if hungry else b"")
+                ended = hungry and not stored
+                try:
+                    data = inner.decompress(stored, INFLATED_BYTES)
+                except (zlib.error, OSError, EOFError) as error:
+                    raise InputError(f"{path} cannot be decompressed: {error}") from error
+                stored = getattr(inner, "unconsumed_tail", b"")
+                done += len(data)
+                if data:
+                    yield data
+                elif ended and not inner.eof:
+                    raise InputError(f"{path} is cut after {done} decompressed bytes")
+            stored = inner.unused_data or file.read(STORED_BYTES)
+            if not members or stored[:1] != GZIP[:1]:
+                return
 
 
-KINDS: dict[str, Callable[[], Any]] = {"deflate": _Inflate, "bzip2": _Bunzip}
-"""Decompressors: (stored bytes, limit) -> (true bytes, stored bytes left, whether it ended)."""
+KINDS: dict[str, Callable[[], Any]] = {
+    "deflate": lambda: zlib.decompressobj(wbits=47),
+    "bzip2": bz2.BZ2Decompressor,
+}
+"""Decompressors; that of zlib takes gzip, too."""
 
 
 class CompressedFile:
@@ -398,78 +323,49 @@ class CompressedFile:
                 f"{path} promises {size} bytes, which its {stored} compressed ones cannot hold; it"
                 " is cut or damaged"
             )
-        self._file: BinaryIO | None = None
-        self._begin()
+        self._chunks: Generator[bytes] | None = None
+        self._place, self._rest = 0, memoryview(b"")
 
     def readinto(self, place: int, view: memoryview) -> None:
         """Fill a view with the true bytes from `place` on; raises InputError where they end."""
+        if place < self._place:
+            self.close()
+        if self._chunks is None:
+            self._chunks = _inflated(self.path, self.kind, self.start)
         try:
-            self._fill(place, view)
+            while self._place < place:
+                self._next(self._chunks, place - self._place)
+            done = 0
+            while done < len(view):
+                data = self._next(self._chunks, len(view) - done)
+                view[done : done + len(data)] = data
+                done += len(data)
+            # the end of the stream is read, too, for its checksum
+            if self._place == self.size and (self._rest or next(self._chunks, b"")):
+                raise InputError(
+                    f"{self.path} cannot be decompressed: it holds more than the {self.size} bytes"
+                    " that its header promises"
+                )
         except BaseException:
             self.close()
             raise
 
-    def _fill(self, place: int, view: memoryview) -> None:
-        if place < self._place or self._file is None:
-            self._begin()
-        while self._place < place:
-            self._need(min(INFLATED_BYTES, place - self._place))
-        done = 0
-        while done < len(view):
-            data = self._need(min(INFLATED_BYTES, len(view) - done))
-            view[done : done + len(data)] = data
-            done += len(data)
-        # One byte more reads the checksum behind the last one.
-        if self._place == self.size and not self._next.complete and self._some(1):
+    def _next(self, chunks: Iterator[bytes], most: int) -> memoryview:
+        """The next true bytes, at least one."""
+        rest = self._rest or memoryview(next(chunks, b""))
+        if not rest:
             raise InputError(
-                f"{self.path} cannot be decompressed: it holds more than the {self.size} bytes"
-                " that its header promises"
+                f"{self.path} ends after {self._place} decompressed bytes, {self.size} are needed"
             )
+        data, self._rest = rest[:most], rest[most:]
+        self._place += len(data)
+        return data
 
     def close(self) -> None:
         """Close the file; a further read opens it again."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def _begin(self) -> None:
-        self.close()
-        self._next = KINDS[self.kind]()
-        self._place, self._stored, self._ended = 0, b"", False
-
-    def _need(self, limit: int) -> bytes:
-        """The next true bytes, at least one and at most `limit`."""
-        if self._file is None:
-            self._file = self.path.open("rb")
-            self._file.seek(self.start)
-        data = self._some(limit)
-        if data:
-            self._place += len(data)
-            return data
-        raise InputError(
-            f"{self.path} ends after {self._place} decompressed bytes, {self.size} are needed"
-        )
-
-    def _some(self, limit: int) -> bytes:
-        """The next true bytes; none where they end.
-
-        Raises InputError for a stream that is damaged, or cut before its checksum.
-        """
-        assert self._file is not None
-        while not self._ended:
-            hungry = getattr(self._next.inner, "needs_input", True)
-            stored = self._stored or (self._file.read(STORED_BYTES) if hungry else b"")
-            try:
-                data, self._stored, self._ended = self._next(stored, limit)
-            except (zlib.error, OSError, EOFError) as error:
-                raise InputError(f"{self.path} cannot be decompressed: {error}") from error
-            if data:
-                return bytes(data)
-            if hungry and not stored:
-                if not self._next.complete:
-                    raise InputError(f"{self.path} is cut after {self._place} decompressed bytes")
-                break
-        return b""
+        if self._chunks is not None:
+            self._chunks.close()
+        self._chunks, self._place, self._rest = None, 0, memoryview(b"")
 
 
 IDENTITY_TOLERANCE = 1e-9

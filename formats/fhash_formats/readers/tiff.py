@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import importlib
 import logging
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from logging.handlers import BufferingHandler
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -20,17 +22,19 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.file_series import Request, Stamp, condense, library, naming
-from fhash_formats.readers.stored_bytes import PlainFile, lattice
+from fhash_formats.readers.stored_bytes import FlatArray, lattice
 from fhash_formats.readers.stored_parts import StoredParts
 from fhash_formats.readers.variables import (
     Behind,
     Source,
     Variable,
+    by_ranges,
     components,
     file_source,
     placed,
 )
 from fhash_formats.series import AXES, AXIS_NAMES
+from fhash_formats.support.values import is_number
 
 SUFFIXES = (".tif", ".tiff")
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -50,28 +54,14 @@ def matches(head: bytes, path: Path) -> bool:
     return head[:4] in MAGIC or path.suffix.lower() in SUFFIXES
 
 
-def _tifffile(source: str) -> Any:
-    return library(source, "TIFF", "tifffile", "fhash[formats]")
-
-
-class _Complaints(logging.Handler):
-    """Keeps the errors that tifffile logs."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.ERROR)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.texts.append(record.getMessage())
-
-
 @contextmanager
 def _strictly() -> Iterator[None]:
     """Raise InputError for what tifffile only logs: pages that are missing or damaged.
 
     It would go on with the pages before them.
     """
-    logger, complaints = logging.getLogger("tifffile"), _Complaints()
+    logger, complaints = logging.getLogger("tifffile"), BufferingHandler(sys.maxsize)
+    complaints.setLevel(logging.ERROR)
     shown = logger.propagate
     logger.addHandler(complaints)
     logger.propagate = False
@@ -80,8 +70,9 @@ def _strictly() -> Iterator[None]:
     finally:
         logger.removeHandler(complaints)
         logger.propagate = shown
-    if complaints.texts:
-        raise InputError(f"it is cut or damaged: {condense(Exception(complaints.texts[0]))}")
+    if complaints.buffer:
+        text = condense(Exception(complaints.buffer[0].getMessage()))
+        raise InputError(f"it is cut or damaged: {text}")
 
 
 def open_tiff(path: Path, request: Request) -> Source:
@@ -90,17 +81,14 @@ def open_tiff(path: Path, request: Request) -> Source:
     Raises InputError for colours and for axes beyond time, z, channel, y and x.
     """
     source, stamp = str(path), Stamp.of(path)
-    tifffile = _tifffile(source)
-    with naming(source), _strictly():
-        # the metadata of OME name further files
-        file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
-    try:
-        with naming(source), _strictly():
-            found = _variables(path, file)
-    except BaseException:
-        file.close()
-        raise
-    return file_source(path, found, stamp=stamp, close=file.close)
+    tifffile = library(source, "TIFF", "tifffile", "fhash[formats]")
+    with naming(source), ExitStack() as opened:
+        with _strictly():
+            # the metadata of OME name further files
+            file = tifffile.TiffFile(path, _multifile=False if request.no_external else None)
+            found = _variables(path, opened.enter_context(file))
+        close = opened.pop_all().close
+    return file_source(path, found, stamp=stamp, close=close)
 
 
 def _variables(path: Path, file: Any) -> list[Variable]:
@@ -130,10 +118,10 @@ def _variables(path: Path, file: Any) -> list[Variable]:
         behind=lambda: Behind(parts=_stored_parts(series, kept)),
     )
     lengths = {axis: shape[n] for n, axis in enumerate(axes) if axis}
-    channel = [axes[n] for n in kept].index(CHANNEL) if CHANNEL in axes else None
     arrays = [whole]
-    if channel is not None:
-        arrays = components(whole, channel, _channel_names(file), interleaved=False)
+    if CHANNEL in axes:
+        place = kept.index(axes.index(CHANNEL))
+        arrays = components(whole, place, _channel_names(file), interleaved=False)
     return placed(arrays, _coordinates(file, lengths))
 
 
@@ -149,12 +137,9 @@ def _stored_parts(series: Any, kept: Sequence[int]) -> StoredParts | None:
         return None
     inner = [1] * (len(series.shape) - len(outer))
     share = np.clip(np.reshape(shares, (*outer, *inner)), 0, 1).astype(np.float32)
-    edges = tuple(
-        np.arange(length + 1) if n < len(outer) else np.array([0, length])
-        for n, length in enumerate(series.shape)
-    )
+    lengths = [(series.shape[n], 1 if n < len(outer) else series.shape[n]) for n in kept]
     return StoredParts(
-        edges=tuple(edges[n] for n in kept),
+        edges=tuple(np.arange(0, length + 1, each) for length, each in lengths),
         share=share.reshape([share.shape[n] for n in kept]),
         fill=np.dtype(series.dtype).type(series.keyframe.nodata),
     )
@@ -182,49 +167,34 @@ def _roles(letters: str, shape: Sequence[int]) -> list[str]:
 
 def _check_size(path: Path, series: Any) -> None:
     """Raise InputError where pages lie beyond the end of the file, or promise too much."""
-    size = path.stat().st_size
-    stored = 0
+    ends = [0]
     for page in series.pages:
-        if page is None:
-            continue
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):
-            if offset + count > size:
-                raise InputError(f"a page lies beyond its end at byte {size}; it is cut")
-            stored += count
-        if page.compression == 1 and series.dataoffset is not None:
+        if page is not None:
+            ends += map(sum, zip(page.dataoffsets, page.databytecounts, strict=False))
+        if series.dataoffset is not None:  # all values lie in a row
+            needed = prod(series.shape) * np.dtype(series.dtype).itemsize
+            ends.append(series.dataoffset + needed)
             break
-    needed = prod(series.shape) * np.dtype(series.dtype).itemsize
-    if series.dataoffset is not None and series.dataoffset + needed > size:
-        raise InputError(f"it needs {series.dataoffset + needed} bytes and has {size}; it is cut")
+    if max(ends) > path.stat().st_size:
+        raise InputError(f"its pages end at byte {max(ends)}, beyond its own end; it is cut")
 
 
 def _pages(series: Any, index: Sequence[slice | int]) -> npt.NDArray[Any]:
     """The values at an index or a range along each dimension of the file."""
-    per_page = prod(series.keyframe.shape)
+    if series.dataoffset is not None:  # all in a row, as in ImageJ's large files
+        dtype = np.dtype(series.dtype).newbyteorder(series.parent.byteorder)
+        path, shape = Path(series.parent.filehandle.path), tuple(series.shape)
+        return FlatArray(path, shape, dtype, offset=series.dataoffset).read(index)
     outer = 0
-    while prod(series.shape[outer:]) > per_page:
+    while prod(series.shape[outer:]) > prod(series.keyframe.shape):
         outer += 1
     numbers = np.arange(prod(series.shape[:outer])).reshape(series.shape[:outer])
     chosen = numbers[tuple(index[:outer])]
-    pages = [_page(series, int(page)) for page in np.ravel(chosen)]
-    stack = np.stack(pages).reshape(*np.shape(chosen), *series.shape[outer:])
-    return stack[(..., *index[outer:])]
-
-
-def _page(series: Any, number: int) -> npt.NDArray[Any]:
-    """One page; where all values lie in a row, as in ImageJ's large files, by its place in it."""
-    if series.dataoffset is None:
-        page = series.pages[number]
-        if page is None:
-            raise InputError(f"page {number} is missing")
-        return np.asarray(page.asarray())
-    shape = series.keyframe.shape
-    dtype = np.dtype(series.dtype).newbyteorder(series.parent.byteorder)
-    values = np.empty(shape, dtype)
-    path = Path(series.parent.filehandle.path)
-    stored = PlainFile(path, start=series.dataoffset + number * values.nbytes, size=values.nbytes)
-    stored.readinto(0, values.reshape(-1).view(np.uint8).data)
-    return values
+    pages = [series.pages[number] for number in np.ravel(chosen).tolist()]
+    if None in pages:
+        raise InputError("a page is missing")
+    stack = np.stack([page.asarray() for page in pages])
+    return stack.reshape(*np.shape(chosen), *series.shape[outer:])[(..., *index[outer:])]
 
 
 def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Variable]:
@@ -236,15 +206,16 @@ def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Variable]:
         unit = str(found.get("unit", "") or "").replace("\\u00B5", "µ")
         for axis in "xy":
             if axis in resolution and unit and unit != "pixel":
-                steps[axis] = (1 / resolution[axis][0], unit)
+                steps[axis] = (resolution[axis][0], unit)
         steps["z"] = (_number(found.get("spacing")), unit)
         steps["t"] = (_number(found.get("finterval")), "s")
     elif file.is_ome:
-        steps = _ome_steps(file)
+        pixels = _ome_pixels(file)
+        for axis, unit in zip("xyzt", ["µm", "µm", "µm", "s"], strict=True):
+            name = "TimeIncrement" if axis == "t" else f"PhysicalSize{axis.upper()}"
+            steps[axis] = (_number(pixels.get(name)), str(pixels.get(f"{name}Unit", unit)))
     else:
-        steps = {
-            axis: (1 / per_unit, unit) for axis, (per_unit, unit) in resolution.items() if unit
-        }
+        steps = {axis: each for axis, each in resolution.items() if each[1]}
     return {
         axis: lattice(axis, 0.0, step, lengths[axis], units=unit)
         for axis, (step, unit) in steps.items()
@@ -270,35 +241,20 @@ def _channel_names(file: Any) -> list[str]:
     return [str(each.get("Name", "")) for each in channels if isinstance(each, dict)]
 
 
-def _ome_steps(file: Any) -> dict[str, tuple[float, str]]:
-    pixels = _ome_pixels(file)
-    names = {axis: f"PhysicalSize{axis.upper()}" for axis in "xyz"} | {"t": "TimeIncrement"}
-    return {
-        axis: (
-            _number(pixels.get(name)),
-            str(pixels.get(f"{name}Unit", "s" if axis == "t" else "µm")),
-        )
-        for axis, name in names.items()
-    }
-
-
 def _resolution(page: Any) -> dict[str, tuple[float, str]]:
-    """Pixels per unit along x and y, and the unit, "" for none."""
+    """Length of a pixel along x and y, and its unit, "" for none."""
     found = {}
     code = page.tags.get("ResolutionUnit")
     unit = CENTIMETRE.get(int(code.value) if code is not None else 2, "")
     for axis, name in (("x", "XResolution"), ("y", "YResolution")):
         tag = page.tags.get(name)
         if tag is not None and len(tag.value) == 2 and tag.value[0] > 0 and tag.value[1] > 0:
-            found[axis] = (tag.value[0] / tag.value[1], unit)
+            found[axis] = (1 / (tag.value[0] / tag.value[1]), unit)
     return found
 
 
 def _number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return float("nan")
+    return float(value) if is_number(str(value)) else float("nan")
 
 
 def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source | None:
@@ -308,7 +264,7 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source 
     a step, as in any pattern. Raises InputError where the axes are not given, and for files that
     differ from the first.
     """
-    tifffile = _tifffile(pattern)
+    tifffile = library(pattern, "TIFF", "tifffile", "fhash[formats]")
     with naming(str(paths[0])), _strictly(), tifffile.TiffFile(paths[0]) as file:
         if len(file.series) != 1 or len(paths) == 1:
             return None
@@ -326,26 +282,20 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> Source 
         )
     request.refuse_var(pattern)
 
-    def read(places: tuple[slice | int, ...]) -> npt.NDArray[Any]:
-        chosen = paths[places[0]]
-        if isinstance(chosen, Path):
-            return _plane(tifffile, chosen, shape, dtype)[places[1:]]
-        planes = np.stack([_plane(tifffile, path, shape, dtype) for path in chosen])
-        return planes[(slice(None), *places[1:])]
+    def get(ranges: list[range]) -> npt.NDArray[Any]:
+        rows, columns = (slice(each.start, each.stop) for each in ranges[1:])
+        planes = [_plane(tifffile, paths[n], shape, dtype)[rows, columns] for n in ranges[0]]
+        return np.stack(planes)
 
     whole = Variable(
         name=paths[0].stem.rstrip("0123456789_-. ") or paths[0].stem,
         shape=(len(paths), *shape),
         dtype=dtype,
         dimensions=tuple(AXIS_NAMES[axis] for axis in request.axes),
-        read=read,
+        read=by_ranges((len(paths), *shape), get),
     )
-    return Source(
-        name=pattern,
-        variables=placed([whole], coords),
-        stamp=Stamp.of(paths[0]),
-        files=paths,
-    )
+    found, stamp = placed([whole], coords), Stamp.of(paths[0])
+    return Source(name=pattern, variables=found, stamp=stamp, files=paths)
 
 
 def _plane(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
@@ -14,11 +17,10 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.file_series import FileSeries, Request, Stamp, naming
-from fhash_formats.readers.hdf5 import Attributes, is_hdf5, require_filters
+from fhash_formats.readers.hdf5 import is_hdf5, open_hdf5
 from fhash_formats.readers.joined import JoinedSeries
 from fhash_formats.readers.select import open_selected
 from fhash_formats.readers.stored_bytes import axis_steps, lattice, numbers_of
-from fhash_formats.readers.stored_parts import Hdf5Sources
 from fhash_formats.readers.variables import (
     HEADER,
     Behind,
@@ -29,10 +31,10 @@ from fhash_formats.readers.variables import (
     placed,
     positions,
 )
-from fhash_formats.readers.vtk_document import Element, VtkArrays, parse
+from fhash_formats.readers.vtk_document import Document, Element, VtkArrays
 from fhash_formats.series import AXIS_NAMES, Coordinate
 from fhash_formats.support.arrays import Values
-from fhash_formats.support.values import json_attributes, text_of
+from fhash_formats.support.values import is_number
 
 XML_SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")
@@ -43,6 +45,9 @@ PLACES = ("PointData", "CellData")
 GHOSTS = ("vtkGhostType", "vtkValidPointMask")
 """Arrays that say which values count, and are none themselves."""
 
+EVEN = ("0 0 0", "1 1 1", "1 0 0 0 1 0 0 0 1")
+"""Origin, spacing and direction where a file does not say them."""
+
 Extent = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
 """First and last point (z, y, x)."""
 
@@ -52,23 +57,6 @@ def is_vtk_xml(head: bytes, path: Path) -> bool:
     return path.suffix.lower() in XML_SUFFIXES or any(
         b'<VTKFile type="' + kind.encode() in head for kind in (*KINDS, *PARALLEL_KINDS)
     )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Array:
-    """One array of the grid.
-
-    Attributes:
-        place: "PointData" or "CellData".
-        number: its place among the arrays there, the same in every piece.
-        name: in the file, "" without one.
-        components: values at one place.
-    """
-
-    place: str
-    number: int
-    name: str
-    components: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,9 +79,9 @@ class _Grid:
 
     element: Element
     extent: Extent
-    pieces: tuple[_Piece, ...]
-    holders: tuple[tuple[Element, VtkArrays], ...]
-    files: tuple[Path, ...] = ()
+    pieces: Sequence[_Piece]
+    holders: Sequence[tuple[Element, VtkArrays]]
+    files: Sequence[Path]
 
 
 def open_vtk(path: Path, request: Request) -> Source:
@@ -119,7 +107,7 @@ def _grid(
     path: Path, request: Request, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)
 ) -> _Grid:
     """The grid of a file, which must be of one of some kinds."""
-    document = parse(path)
+    document = Document(path)
     root = document.root
     kind = root.attributes.get("type", root.name)
     element = root.first(kind) if root.name == "VTKFile" and kind in kinds else None
@@ -138,7 +126,11 @@ def _grid(
         if kind in KINDS:
             pieces.append(_Piece(extent=own, element=piece, arrays=arrays))
             continue
-        files.append(_file(path, piece))
+        if not piece.attributes.get("Source"):
+            raise InputError("a piece names no file")
+        files.append(path.parent / piece.attributes["Source"])
+        if not files[-1].is_file():
+            raise MissingInputError(f"{path} lists {files[-1]}, which is not there")
         if files[-1] in files[:-1]:
             raise InputError(f"it lists {files[-1].name} twice")
         request.require_inside(path, files[-1])
@@ -147,31 +139,13 @@ def _grid(
         pieces += listed.pieces
         holders += listed.holders
     for part in pieces:
-        inside = zip(part.extent, extent, strict=True)
-        if not all(low <= first and last <= high for (first, last), (low, high) in inside):
-            raise InputError(
-                f"a piece with the extent {part.extent} lies outside the grid {extent}"
-            )
+        for (first, last), (low, high) in zip(part.extent, extent, strict=True):
+            if first < low or last > high:
+                told = f"a piece with the extent {part.extent} lies outside the grid {extent}"
+                raise InputError(told)
     if not pieces or any(last < first for first, last in extent):
         raise InputError("it holds an empty grid")
-    return _Grid(
-        element=element,
-        extent=extent,
-        pieces=tuple(pieces),
-        holders=tuple(holders),
-        files=tuple(dict.fromkeys(files)),
-    )
-
-
-def _file(path: Path, piece: Element) -> Path:
-    """The file of a piece that a parallel file lists."""
-    source = piece.attributes.get("Source", "")
-    if not source:
-        raise InputError("a piece names no file")
-    file = path.parent / source
-    if not file.is_file():
-        raise MissingInputError(f"{path} lists {file}, which is not there")
-    return file
+    return _Grid(element=element, extent=extent, pieces=pieces, holders=holders, files=files)
 
 
 def _extent(text: str) -> Extent:
@@ -194,100 +168,89 @@ def _shape(extent: Extent, place: str) -> tuple[int, int, int]:
 def _arrays(source: str, grid: _Grid, place: str) -> list[Variable]:
     """The arrays of points or of cells; their place precedes a name that both have."""
     first = grid.pieces[0]
-    held = {
-        where: [each for holder in first.element.all(where) for each in holder.all("DataArray")]
-        for where in PLACES
-    }
-    names = [each.attributes.get("Name", "values") for one in held.values() for each in one]
+    names = [_named(each) for where in PLACES for each in first.element.arrays(where)]
     found: list[Variable] = []
-    for number, element in enumerate(held[place]):
-        name = element.attributes.get("Name", "values")
-        components_text = element.attributes.get("NumberOfComponents", "1")
-        if not (components_text.isascii() and components_text.isdigit()) or not (
-            0 < int(components_text) < 1000
-        ):
-            raise InputError(f"the array {name} has {components_text!r} components")
-        count = int(components_text)
-        array = _Array(
-            place=place, number=number, name=element.attributes.get("Name", ""), components=count
-        )
+    for number, element in enumerate(first.element.arrays(place)):
+        name, text = _named(element), element.attributes.get("NumberOfComponents", "1")
+        if not re.fullmatch("0*[1-9][0-9]{0,2}", text):
+            raise InputError(f"the array {name} has {text!r} components")
         whole = Variable(
             name=name if names.count(name) == 1 else f"{place}/{name}",
-            shape=(*_shape(grid.extent, place), count),
+            shape=(*_shape(grid.extent, place), int(text)),
             dtype=first.arrays.dtype(element),
             dimensions=SPACE,
             attributes=_units(element),
             auxiliary=name in GHOSTS,
-            read=partial(_read, source, grid, array),
-            require=partial(_check, source, grid, array),
+            read=partial(_read, source, grid, place, number),
+            require=partial(_check, source, grid, place, number),
         )
-        parts = [element.attributes.get(f"ComponentName{i}") for i in range(count)]
+        parts = [element.attributes.get(f"ComponentName{i}") for i in range(int(text))]
         found += components(whole, len(SPACE), parts)
     return found
 
 
-def _read(
-    source: str, grid: _Grid, array: _Array, places: tuple[slice | int, ...]
-) -> npt.NDArray[Any]:
-    with naming(source):
-        return _frame(grid, array)[places]
+def _named(element: Element) -> str:
+    return element.attributes.get("Name", "values")
 
 
-def _check(source: str, grid: _Grid, array: _Array) -> None:
+def _parts(
+    grid: _Grid, place: str, number: int
+) -> Iterator[tuple[_Piece, Element, tuple[int, ...]]]:
+    """Each piece with its element of an array, and the shape of that (z, y, x, components).
+
+    place: "PointData" or "CellData". number: of the array there, the same in every piece.
+    """
+    first = grid.pieces[0].element.arrays(place)[number]
+    count = first.attributes.get("NumberOfComponents", "1")
+    for piece in grid.pieces:
+        held = piece.element.arrays(place)
+        if number >= len(held):
+            raise InputError(f"a piece has {len(held)} arrays of {place}, another has more")
+        own = held[number].attributes.get("NumberOfComponents", "1")
+        if (_named(held[number]), own) != (_named(first), count):
+            raise InputError(
+                f"a piece has the array {_named(held[number])!r} of {own} components where another"
+                f" has {_named(first)!r} of {count}"
+            )
+        yield piece, held[number], (*_shape(piece.extent, place), int(count))
+
+
+def _check(source: str, grid: _Grid, place: str, number: int) -> None:
     """Raise InputError unless the pieces hold the values of an array, as their sizes tell."""
     with naming(source):
-        there = 0
-        for piece in grid.pieces:
-            count = prod(_shape(piece.extent, array.place))
-            piece.arrays.check(_element(piece.element, array), count * array.components)
-            there += count
-        needed = prod(_shape(grid.extent, array.place))
-        if there < needed:
-            raise InputError(f"its pieces leave at least {needed - there} values of the grid open")
+        open_values = prod(_shape(grid.extent, place))
+        for piece, element, shape in _parts(grid, place, number):
+            piece.arrays.check(element, prod(shape))
+            open_values -= prod(shape[:3])
+        if open_values > 0:
+            raise InputError(f"its pieces leave at least {open_values} values of the grid open")
 
 
-def _element(piece: Element, array: _Array) -> Element:
-    """The element of an array in a piece."""
-    holder = piece.first(array.place)
-    elements = [] if holder is None else list(holder.all("DataArray"))
-    if array.number >= len(elements):
-        raise InputError(f"a piece has {len(elements)} arrays of {array.place}, another has more")
-    element = elements[array.number]
-    own = element.attributes.get("Name", "")
-    components = element.attributes.get("NumberOfComponents", "1")
-    if (own, components) != (array.name, str(array.components)):
-        raise InputError(
-            f"a piece has the array {own!r} of {components} components where another has"
-            f" {array.name!r} of {array.components}"
-        )
-    return element
-
-
-def _frame(grid: _Grid, array: _Array) -> npt.NDArray[Any]:
-    """An array over the whole grid, (z, y, x, components)."""
-    shape = (*_shape(grid.extent, array.place), array.components)
-    parts = []
-    for piece in grid.pieces:
-        own = _shape(piece.extent, array.place)
-        element = _element(piece.element, array)
-        values = piece.arrays.read(element, prod(own) * array.components)
-        parts.append((piece.extent, values.reshape(*own, array.components)))
-    if len(parts) == 1 and parts[0][1].shape == shape:
-        return parts[0][1]
-    whole = np.empty(shape, parts[0][1].dtype)
-    filled = np.zeros(shape, bool)
-    for extent, part in parts:
-        if part.dtype != whole.dtype:
-            raise InputError(f"its pieces hold values of the types {whole.dtype} and {part.dtype}")
-        place = tuple(
-            slice(first - low, first - low + length)
-            for (first, _), (low, _), length in zip(extent, grid.extent, part.shape, strict=False)
-        )
-        whole[place], filled[place] = part, True
-    if not filled.all():
-        missing = int((~filled[..., 0]).sum())
-        raise InputError(f"its pieces leave {missing} values of the grid open")
-    return whole
+def _read(
+    source: str, grid: _Grid, place: str, number: int, places: tuple[slice | int, ...]
+) -> npt.NDArray[Any]:
+    """Values of an array over the whole grid, (z, y, x, components)."""
+    with naming(source):
+        parts = [
+            (piece.extent, piece.arrays.read(element, prod(shape)).reshape(shape))
+            for piece, element, shape in _parts(grid, place, number)
+        ]
+        whole = parts[0][1]
+        shape = (*_shape(grid.extent, place), whole.shape[-1])
+        if len(parts) > 1 or whole.shape != shape:
+            whole = np.empty(shape, whole.dtype)
+            filled = np.zeros(shape[:3], bool)
+            for extent, part in parts:
+                if part.dtype != whole.dtype:
+                    told = f"the types {whole.dtype} and {part.dtype}"
+                    raise InputError(f"its pieces hold values of {told}")
+                corner = [own[0] - low for own, (low, _) in zip(extent, grid.extent, strict=True)]
+                z, y, x = (slice(n, n + m) for n, m in zip(corner, part.shape, strict=False))
+                whole[z, y, x], filled[z, y, x] = part, True
+            if not filled.all():
+                missing = int((~filled).sum())
+                raise InputError(f"its pieces leave {missing} values of the grid open")
+        return whole[places]
 
 
 def _positions(grid: _Grid, place: str) -> dict[str, Variable]:
@@ -295,19 +258,21 @@ def _positions(grid: _Grid, place: str) -> dict[str, Variable]:
     if grid.element.name.endswith("ImageData"):
         # A parallel file may leave out what its pieces say, such as the direction.
         attributes = {**grid.holders[-2][0].attributes, **grid.element.attributes}
-        origin, spacing, direction = (
-            numbers_of(attributes.get(name, default), len(default.split()))
-            for name, default in (
-                ("Origin", "0 0 0"),
-                ("Spacing", "1 1 1"),
-                ("Direction", "1 0 0 0 1 0 0 0 1"),
-            )
-        )
-        coords = _even(grid.extent, place, origin, spacing, direction)
+        told = zip(("Origin", "Spacing", "Direction"), EVEN, strict=True)
+        given = [numbers_of(attributes.get(k, d), len(d.split())) for k, d in told]
+        coords = _even(grid.extent, place, *given)
     else:
         coords = _listed(grid, cells=place == "CellData")
-    time = _time(grid)
-    return coords if time is None else {**coords, "t": time}
+    for parent, arrays in grid.holders:
+        for element in parent.arrays("FieldData"):
+            if (
+                element.attributes.get("Name") == "TimeValue"
+                and element.attributes.get("NumberOfTuples", "1") == "1"
+                and arrays.dtype(element).kind in "iuf"
+            ):
+                values = arrays.read(element, 1).astype(np.float64)
+                return {**coords, "t": positions(AXIS_NAMES["t"], values, _units(element))}
+    return coords
 
 
 def _even(
@@ -319,11 +284,11 @@ def _even(
     """
     spacing = spacing * axis_steps(direction.reshape(3, 3))
     coords = {}
-    lengths = _shape(extent, place)
-    for axis, (first, last), length in zip(SPACE, extent, lengths, strict=True):
-        number = "xyz".index(axis)
+    for n, axis in enumerate("xyz"):
+        first, last = extent[2 - n]
         start = first + (0.5 if place == "CellData" and last > first else 0.0)
-        coords[axis] = lattice(axis, origin[number], spacing[number], length, first=start)
+        length = _shape(extent, place)[2 - n]
+        coords[axis] = lattice(axis, origin[n], spacing[n], length, first=start)
     return coords
 
 
@@ -334,8 +299,7 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Variable]:
         values = np.full(high - low + 1, np.nan)
         for piece in grid.pieces:
             first, last = piece.extent[SPACE.index(axis)]
-            holder = piece.element.first("Coordinates")
-            elements = [] if holder is None else list(holder.all("DataArray"))
+            elements = piece.element.arrays("Coordinates")
             if len(elements) != 3:
                 raise InputError(f"it has {len(elements)} arrays of coordinates, not 3")
             element = elements["xyz".index(axis)]
@@ -346,25 +310,6 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Variable]:
             values = (values[:-1] + values[1:]) / 2
         coords[axis] = positions(AXIS_NAMES[axis], values)
     return coords
-
-
-def _time(grid: _Grid) -> Variable | None:
-    """The field array TimeValue as the coordinate of the one step; None without it."""
-    fields = (
-        (element, arrays)
-        for parent, arrays in grid.holders
-        for holder in parent.all("FieldData")
-        for element in holder.all("DataArray")
-    )
-    for element, arrays in fields:
-        if (
-            element.attributes.get("Name") == "TimeValue"
-            and element.attributes.get("NumberOfTuples", "1") == "1"
-            and arrays.dtype(element).kind in "iuf"
-        ):
-            values = arrays.read(element, 1).astype(np.float64)
-            return positions(AXIS_NAMES["t"], values, _units(element))
-    return None
 
 
 def _units(element: Element) -> dict[str, Any]:
@@ -398,149 +343,107 @@ def open_vtkhdf(path: Path, request: Request) -> Source:
 
     Raises InputError for other types, turned grids, and sizes that do not fit together.
     """
-    import h5py
-
-    source, stamp = str(path), Stamp.of(path)
-    with naming(source):
-        file = h5py.File(path, "r")
-    try:
-        with naming(source):
-            found = _datasets_of(source, path, file)
-    except BaseException:
-        file.close()
-        raise
-    return file_source(path, found, stamp=stamp, close=file.close)
+    opened = open_hdf5(path, replace(request, var=None))
+    with naming(str(path)), ExitStack() as stack:
+        stack.callback(opened.close)
+        found = _datasets_of(opened)
+        stack.pop_all()
+    return replace(opened, variables=found, groups={}, spread=False)
 
 
-def _datasets_of(source: str, path: Path, file: Any) -> list[Variable]:
-    import h5py
-
-    root = file.get("VTKHDF")
-    kind = text_of(root.attrs.get("Type", b"")) if isinstance(root, h5py.Group) else "none"
+def _datasets_of(opened: Source) -> list[Variable]:
+    inside = [each for each in opened.variables if each.name.startswith("VTKHDF/")]
+    known = {each.name.removeprefix("VTKHDF/"): each for each in inside}
+    told = opened.groups.get("VTKHDF", {})
+    kind = told.get("Type", "none")
     if kind != "ImageData":
         raise InputError(f"it holds VTKHDF data of the type {kind or '?'}; ImageData can be read")
-    extent = _extent(" ".join(f"{end:.0f}" for end in _row(root, "WholeExtent", 6)))
-    times = _times(root)
+    extent = _extent(" ".join(f"{end:.0f}" for end in _row(told, "WholeExtent", 6)))
+    given = [_row(told, "Origin", 3), _row(told, "Spacing", 3)]
+    given.append(_row(told, "Direction", 9) if "Direction" in told else np.eye(3).ravel())
+    steps, times, time = opened.groups.get("VTKHDF/Steps"), None, known.get("FieldData/TimeValue")
+    if steps is not None:
+        time = times = known["Steps/Values"]
+        length = prod(times.shape)
+        count = int(np.asarray(steps.get("NSteps", length)).ravel()[0])
+        if times.shape != (count,) or count < 1:
+            raise InputError(f"it promises {count} steps and has the times of {length}")
+    along = {}
+    if time is not None and (times is not None or prod(time.shape) == 1):
+        extra = {
+            key: time.attributes[key] for key in ("units", "calendar") if key in time.attributes
+        }
+        values = time.whole().astype(np.float64).ravel()
+        along = {"t": positions(AXIS_NAMES["t"], values, extra)}
     return [
         each
         for place in PLACES
         for each in placed(
-            _hdf_arrays(source, root, place, extent, times),
-            _hdf_positions(root, extent, place, times),
+            _hdf_arrays(known, place, _shape(extent, place), times),
+            {**_even(extent, place, *given), **along},
             f"{HEADER}/{place}",
         )
     ]
 
 
-def _times(root: Any) -> npt.NDArray[np.float64] | None:
-    """Times of the steps; None for a file without a group of steps."""
-    steps = root.get("Steps")
-    if steps is None:
-        return None
-    times = np.asarray(steps["Values"][()], dtype=np.float64)
-    count = int(np.asarray(steps.attrs.get("NSteps", times.size)).ravel()[0])
-    if times.shape != (count,) or count < 1:
-        raise InputError(f"it promises {count} steps and has the times of {times.size}")
-    return times
-
-
 def _hdf_arrays(
-    source: str, root: Any, place: str, extent: Extent, times: npt.NDArray[np.float64] | None
+    known: Mapping[str, Variable], place: str, space: tuple[int, ...], times: Variable | None
 ) -> list[Variable]:
     """Arrays of points or of cells; the place precedes a name that both have."""
-    import h5py
-
-    held = [root[each] for each in PLACES if isinstance(root.get(each), h5py.Group)]
-    names = [name for group in held for name in group]
-    space, leading = _shape(extent, place), int(times is not None)
+    names = [each.rpartition("/")[2] for each in known if each.rpartition("/")[0] in PLACES]
     found: list[Variable] = []
-    for name in root[place] if isinstance(root.get(place), h5py.Group) else ():
-        dataset = root[place][name]
-        if not isinstance(dataset, h5py.Dataset):
+    for path, stored in known.items():
+        where, _, name = path.rpartition("/")
+        if where != place:
             continue
-        shape: tuple[int, ...] = dataset.shape or ()
-        fits = shape[leading : leading + 3] == space and len(shape) - leading in (3, 4)
-        full = f"{place}/{name}" if names.count(name) > 1 else name
-        if not fits:
+        shape, full = stored.shape, path if names.count(name) > 1 else name
+        inner = shape if times is None else shape[1:]
+        if inner[:3] != space or len(inner) not in (3, 4):
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
-            found.append(Variable(name=full, shape=shape, dtype=dataset.dtype, error=error))
+            found.append(Variable(name=full, shape=shape, dtype=stored.dtype, error=error))
             continue
-        entries = None if times is None else _entries(root, place, dataset, full, times)
-        dims = (*([AXIS_NAMES["t"]] if leading else []), *SPACE)
-        vector = len(shape) > len(dims)
-        whole = Variable(
-            name=full,
-            shape=((len(times), *shape[1:]) if times is not None else shape),
-            dtype=dataset.dtype,
-            dimensions=dims,
-            attributes=Attributes(dataset),
-            read=partial(_hdf_read, dataset, entries),
-            chunks=dataset.chunks,
-            auxiliary=name in GHOSTS,
-            behind=partial(_hdf_behind, source, full, dataset, entries),
-            require=partial(require_filters, source, full, dataset),
-        )
+        dims = SPACE if times is None else (AXIS_NAMES["t"], *SPACE)
+        whole = replace(stored, name=full, dimensions=dims, auxiliary=name in GHOSTS, scales={})
+        if times is not None:
+            offsets = known.get(f"Steps/{place}Offsets/{name}")
+            entries = np.arange(times.shape[0]) if offsets is None else offsets.whole()
+            if entries.shape != times.shape or entries.min() < 0 or entries.max() >= shape[0]:
+                raise InputError(f"the offsets of {full} do not fit its {shape[0]} entries")
+            whole = replace(
+                whole,
+                shape=(len(entries), *inner),
+                read=partial(_hdf_read, stored, entries.astype(np.int64)),
+                behind=partial(_hdf_behind, stored, entries),
+            )
+        vector = len(inner) > len(space)
         found += components(whole, len(dims), interleaved=False) if vector else [whole]
     return found
 
 
 def _hdf_read(
-    dataset: Any, entries: npt.NDArray[np.int64] | None, places: tuple[slice | int, ...]
+    stored: Variable, entries: npt.NDArray[np.int64], places: tuple[slice | int, ...]
 ) -> npt.NDArray[Any]:
     """Values of the entries that belong to some steps."""
-    if entries is None or isinstance(places[0], int):
-        return np.asarray(dataset[places if entries is None else (entries[places[0]], *places[1:])])
-    steps = entries[places[0]]
-    first = int(steps[0])
-    if np.array_equal(steps, np.arange(first, first + len(steps))):
-        return np.asarray(dataset[(slice(first, first + len(steps)), *places[1:])])
-    return np.stack([dataset[(int(step), *places[1:])] for step in steps])
+    steps = entries[places[0]].tolist()
+    if isinstance(steps, int):
+        return stored.read((steps, *places[1:]))
+    if steps == list(range(steps[0], steps[0] + len(steps))):
+        return stored.read((slice(steps[0], steps[0] + len(steps)), *places[1:]))
+    return np.stack([stored.read((step, *places[1:])) for step in steps])
 
 
-def _hdf_behind(
-    source: str, name: str, dataset: Any, entries: npt.NDArray[np.int64] | None
-) -> Behind:
-    with Hdf5Sources(source) as sources:
-        parts = sources.parts(name, dataset)
-        files = list(sources.files)
-    if parts is not None and entries is not None:
-        # an entry may serve several steps, and some serve none
-        borders = np.arange(len(entries) + 1)
-        share = parts.share[np.searchsorted(parts.edges[0], entries, side="right") - 1]
-        parts = replace(parts, edges=(borders, *parts.edges[1:]), share=share)
-    return Behind(parts=parts, files=files)
+def _hdf_behind(stored: Variable, entries: npt.NDArray[np.int64]) -> Behind:
+    """Parts that somebody wrote; an entry may serve several steps, and some serve none."""
+    behind = stored.behind()
+    if (parts := behind.parts) is None:
+        return behind
+    share = parts.share[np.searchsorted(parts.edges[0], entries, side="right") - 1]
+    edges = (np.arange(len(entries) + 1), *parts.edges[1:])
+    return replace(behind, parts=replace(parts, edges=edges, share=share))
 
 
-def _entries(
-    root: Any, place: str, dataset: Any, name: str, times: npt.NDArray[np.float64]
-) -> npt.NDArray[np.int64]:
-    """The entry of the dataset that belongs to each step."""
-    own = dataset.name.rpartition("/")[2]
-    offsets = root["Steps"].get(f"{place}Offsets/{own}")
-    entries = np.arange(len(times)) if offsets is None else np.asarray(offsets[()], np.int64)
-    if entries.shape != times.shape or entries.min() < 0 or entries.max() >= len(dataset):
-        raise InputError(f"the offsets of {name} do not fit its {len(dataset)} entries")
-    return entries
-
-
-def _hdf_positions(
-    root: Any, extent: Extent, place: str, times: npt.NDArray[np.float64] | None
-) -> dict[str, Variable]:
-    origin, spacing = _row(root, "Origin", 3), _row(root, "Spacing", 3)
-    direction = _row(root, "Direction", 9) if "Direction" in root.attrs else np.eye(3).ravel()
-    coords = _even(extent, place, origin, spacing, direction)
-    stored = root["Steps/Values"] if times is not None else root.get("FieldData/TimeValue")
-    if times is None and stored is not None and stored.size == 1:
-        times = np.asarray(stored[()], dtype=np.float64).ravel()
-    if times is not None:
-        extra = json_attributes(stored.attrs)
-        kept = {key: value for key, value in extra.items() if key in ("units", "calendar")}
-        coords["t"] = positions(AXIS_NAMES["t"], times, kept)
-    return coords
-
-
-def _row(root: Any, name: str, count: int) -> npt.NDArray[np.float64]:
-    values = np.asarray(root.attrs.get(name, ()), dtype=np.float64).ravel()
+def _row(told: Mapping[str, Any], name: str, count: int) -> npt.NDArray[np.float64]:
+    values = np.asarray(told.get(name, ()), dtype=np.float64).ravel()
     if values.size != count or not np.isfinite(values).all():
         raise InputError(f"the attribute {name} has not {count} numbers")
     return values
@@ -591,11 +494,10 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
     """
     stamp = Stamp.of(path)
     with naming(str(path)):
-        entries = _listed_json(path) if path.suffix.lower() == ".series" else _listed_xml(path)
+        entries = _entries(path)
         if not entries:
             raise InputError("it lists no file")
         request.require_inside(path, *(file for _, file in entries))
-        entries.sort(key=lambda entry: entry[0])
         times = np.array([time for time, _ in entries])
         if not np.isfinite(times).all():
             raise InputError("it lists a time that is no finite number")
@@ -611,46 +513,38 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
                 raise MissingInputError(f"{path} lists {file}, which is not there")
             with file.open("rb") as opened:
                 if not is_vtk_xml(opened.read(4096), file):
-                    *most, last = XML_SUFFIXES
-                    kinds = f"{', '.join(most)} and {last}"
-                    raise InputError(f"it lists {file.name}; {kinds} can be read")
+                    told = ".vti, .vtr, .pvti and .pvtr can be read"
+                    raise InputError(f"it lists {file.name}; {told}")
     return CollectionSeries(path, stamp, entries, request)
 
 
-def _listed_xml(path: Path) -> list[Entry]:
-    """Times and files of a .pvd; files without a time are numbered."""
-    collection = parse(path).root.first("Collection")
-    if collection is None:
-        raise InputError("it holds no collection")
+def _entries(path: Path) -> list[Entry]:
+    """Times and files of a .pvd, or of a .series file of ParaView; those without one are numbered.
+
+    The order is that of the times.
+    """
+    if path.suffix.lower() == ".series":
+        if path.stat().st_size > MAX_LIST:
+            raise InputError(f"it is larger than {MAX_LIST} bytes")
+        told = json.loads(path.read_text(encoding="utf-8"))
+        rows = told.get("files") if isinstance(told, dict) else None
+        if not isinstance(rows, list) or not all(
+            isinstance(row, dict) and isinstance(row.get("name"), str) for row in rows
+        ):
+            raise InputError("it is not a list of files as ParaView writes it")
+        listed = [(row["name"], row.get("time")) for row in rows]
+    else:
+        collection = Document(path).root.first("Collection")
+        if collection is None:
+            raise InputError("it holds no collection")
+        found = [each.attributes for each in collection.all("DataSet")]
+        listed = [(row.get("file", ""), row.get("timestep")) for row in found]
     entries = []
-    for number, row in enumerate(collection.all("DataSet")):
-        file = row.attributes.get("file", "")
-        if not file:
+    for number, (name, time) in enumerate(listed):
+        text = str(number if time is None else time)
+        if not name:
             raise InputError("an entry names no file")
-        entries.append(
-            (_listed_time(row.attributes.get("timestep", str(number))), path.parent / file)
-        )
-    return entries
-
-
-def _listed_json(path: Path) -> list[Entry]:
-    """Times and files of a .series file of ParaView."""
-    if path.stat().st_size > MAX_LIST:
-        raise InputError(f"it is larger than {MAX_LIST} bytes")
-    rows = json.loads(path.read_text(encoding="utf-8"))
-    rows = rows.get("files") if isinstance(rows, dict) else None
-    if not isinstance(rows, list) or not all(
-        isinstance(row, dict) and isinstance(row.get("name"), str) for row in rows
-    ):
-        raise InputError("it is not a list of files as ParaView writes it")
-    return [
-        (_listed_time(str(row.get("time", number))), path.parent / row["name"])
-        for number, row in enumerate(rows)
-    ]
-
-
-def _listed_time(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"the time {text!r} is no number") from error
+        if not is_number(text):
+            raise InputError(f"the time {text!r} is no number")
+        entries.append((float(text), path.parent / name))
+    return sorted(entries, key=lambda entry: entry[0])

@@ -17,7 +17,6 @@ from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.images import (
     directions_of,
     dtype_of,
-    number_of,
     read_header,
     sizes_of,
     vectors,
@@ -54,20 +53,18 @@ def test_other_versions(tmp_path: Path, first: str) -> None:
 
 
 def test_numbers_of_fields() -> None:
-    assert sizes_of({"sizes": "3 4", "dimension": "2"}) == (3, 4)
+    assert sizes_of({"sizes": "3 4"}, "sizes") == (3, 4)
     assert words_of({}, "kinds", 2, "domain") == ["domain", "domain"]
     assert dtype_of({"type": "unsigned  Short int", "endian": "BIG"}).str == ">u2"
     assert vectors("none (1,-2e3) (nan,nan)") == [None, (1, -2000), None]
     assert directions_of({}, 3) is None
     assert (whole({"byte skip": "-1"}, "byte skip"), whole({}, "line skip")) == (-1, 0)
-    assert number_of("-inf") == -float("inf")
     for wrong in (
         lambda: whole({"byte skip": "-2"}, "byte skip"),
         lambda: vectors("(1,x)"),
         lambda: directions_of({"space directions": "(1,0)"}, 2),
         lambda: dtype_of({"type": "string"}),
-        lambda: sizes_of({}),
-        lambda: number_of("x"),
+        lambda: sizes_of({}, "sizes"),
     ):
         with pytest.raises(InputError):
             wrong()
@@ -193,7 +190,7 @@ def test_text_and_bytes_that_are_skipped(tmp_path: Path) -> None:
         ({"DimSize": "6 5 30000000"}, "its header promises"),
         ({"DimSize": "60000 60000 60000", "CompressedData": True}, "ones cannot hold"),
         ({"NDims": 4}, "NDims = 4 and DimSize = 6 5 3"),
-        ({"ElementType": "MET_STRING"}, "'MET_STRING'; numbers can be read"),
+        ({"ElementType": "MET_STRING"}, "'MET_STRING', which has no numbers"),
         ({"ObjectType": "Tube"}, "'Tube'; Image can be read"),
         ({"ElementNumberOfChannels": "many"}, "ElementNumberOfChannels is 'many'"),
         ({"data": "%d.raw 1 x 1"}, "its pattern of files is"),
@@ -374,7 +371,7 @@ def test_bytes_and_lines_that_are_skipped(tmp_path: Path) -> None:
         ("type: block", "'block', which has no numbers"),
         ("encoding: hex", "'hex'; raw, gzip, bzip2 and text can be read"),
         ("endian: middle", "byte order is 'middle'"),
-        ("spacings: a b c d", "'a' stands where a number is needed"),
+        ("spacings: a b c d", "'a b c d' stands where 4 numbers are needed"),
         ("byte skip: x", "its byte skip is 'x'"),
         ("no colon", "the line 'no colon'"),
     ],

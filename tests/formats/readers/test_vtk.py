@@ -21,7 +21,7 @@ from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers import vtk_document
 from fhash_formats.readers.registry import open_series
 from fhash_formats.readers.variables import SeveralVariablesError
-from fhash_formats.readers.vtk_document import Document, VtkArrays, parse
+from fhash_formats.readers.vtk_document import Document, VtkArrays
 from fhash_formats.series import Coordinate
 from fhash_formats.writers.common import Region
 from fhash_formats.writers.registry import save_region
@@ -509,7 +509,7 @@ def arrays(folder: Path, stored: bytes, compressor: str = "", encoding: str = "r
     head += f'<AppendedData encoding="{encoding}">_'
     data = base64.b64encode(stored) if encoding == "base64" else stored
     (folder / "a.vti").write_bytes(head.encode() + data + b"</AppendedData></VTKFile>")
-    return VtkArrays(folder / "a.vti", parse(folder / "a.vti"))
+    return VtkArrays(folder / "a.vti", Document(folder / "a.vti"))
 
 
 def read(found: VtkArrays, count: int = 6) -> np.ndarray:
@@ -565,12 +565,12 @@ def test_base64_that_is_damaged(tmp_path: Path) -> None:
     place = data.index(b">_") + 5
     found.path.write_bytes(data[:place] + b"\xff" + data[place + 1 :])
     with pytest.raises(InputError, match="base64 text is damaged"):
-        read(VtkArrays(found.path, parse(found.path)))
+        read(VtkArrays(found.path, Document(found.path)))
 
 
 def parsed(folder: Path, text: str) -> Document:
     (folder / "a.vti").write_bytes(text.encode())
-    return parse(folder / "a.vti")
+    return Document(folder / "a.vti")
 
 
 @pytest.mark.parametrize(
